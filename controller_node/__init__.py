@@ -1,0 +1,1 @@
+"""The controller: owns the model x_c and the control input."""

@@ -1,0 +1,19 @@
+"""The controller's process."""
+
+import sys
+from collections.abc import Sequence
+
+from controller_node.controller import controller_of
+from noack.errors import ExitStatus
+from noack.io import node
+
+
+def main(arguments: Sequence[str] | None = None) -> ExitStatus:
+    """Run the controller in the run that a recorder or launcher has opened."""
+    return node.main(
+        "controller", lambda member: member.run_messages(controller_of(member.scenario)), arguments
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What sees the whole run: launching, recording, viewing, the command line."""

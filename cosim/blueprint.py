@@ -1,0 +1,195 @@
+"""The layout of a run's recording: which panels a person sees, in which order and colours.
+
+Entities of the recording, all on the timeline ``t`` (simulated time since the run's epoch):
+
+========================  =================================================================
+``about``                 Markdown text about the run (static)
+``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
+``error/norm``            ‖e_s‖, threshold, ‖e_c‖ (3 scalars)
+``error/log10``           the same three as decimal logarithms
+``input``                 u = K x_c (m scalars)
+``event/interval``        t_i − t_{i−1} in seconds, at every broadcast
+``event/stem``            its stem: 0, interval, NaN
+``reception/interval``    the same between deliveries the loss model let through
+``reception/forced``      the same for deliveries forced by the bound on successive dropouts
+``reception/stem``        the stems of both
+``drop``                  0 at every dropped update
+``lateness/<process>``    lateness in microseconds
+``log``                   text
+========================  =================================================================
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+TIMELINE = "t"
+
+ABOUT = "about"
+ERROR = "error/norm"
+ERROR_LOG10 = "error/log10"
+INPUT = "input"
+EVENT, EVENT_STEM = "event/interval", "event/stem"
+RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
+DROP = "drop"
+LOG = "log"
+
+# One colour, one meaning in every panel; all readable on a light and on a dark background.
+PLANT = (150, 150, 158)
+SENSOR = (38, 132, 255)
+CONTROLLER = (255, 128, 14)
+THRESHOLD = (225, 60, 75)
+FORCED_COLOUR = (200, 70, 200)
+DROPPED = (225, 60, 75)
+SERIES = (
+    (38, 132, 255),
+    (255, 128, 14),
+    (40, 165, 90),
+    (200, 70, 200),
+    (150, 110, 80),
+    (20, 175, 190),
+    (150, 150, 158),
+)
+
+_PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
+
+
+def state_path(name: str) -> str:
+    """Entity of one state coordinate, its name escaped."""
+    return f"state/{rr.escape_entity_path_part(name)}"
+
+
+def lateness_path(process: str) -> str:
+    """Entity of one process's lateness, its name escaped."""
+    return f"lateness/{rr.escape_entity_path_part(process)}"
+
+
+def styles(
+    state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
+) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
+    """Name, colour and width of every series, by entity; logged once as static data."""
+    triple = rr.SeriesLines(
+        names=["x plant", "x_s sensor model", "x_c controller model"],
+        colors=[PLANT, SENSOR, CONTROLLER],
+        widths=[4.5, 1.5, 1.5],
+    )
+    error = rr.SeriesLines(
+        names=["‖e_s‖ sensor", "threshold", "‖e_c‖ controller"],
+        colors=[SENSOR, THRESHOLD, CONTROLLER],
+        widths=[1.5, 2.0, 1.5],
+    )
+    found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
+        state_path(name): triple for name in state_names
+    }
+    found[ERROR] = found[ERROR_LOG10] = error
+    m = len(input_names)
+    found[INPUT] = rr.SeriesLines(
+        names=list(input_names),
+        colors=[SERIES[i % len(SERIES)] for i in range(m)],
+        # Inputs often coincide: the first ones, wider, stay visible beneath the last.
+        widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
+    )
+    found[EVENT_STEM] = _stem("broadcast", SENSOR)
+    found[EVENT] = _mark("broadcast", SENSOR, "circle", 4.0)
+    found[RECEPTION_STEM] = _stem("received", CONTROLLER)
+    found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
+    found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
+    found[DROP] = _mark("dropped", DROPPED, "cross", 5.0)
+    for i, process in enumerate(processes):
+        found[lateness_path(process)] = rr.SeriesLines(
+            names=process,
+            colors=SERIES[i % len(SERIES)],
+            widths=1.5,
+            aggregation_policy="Max",
+        )
+    return found
+
+
+def _stem(name: str, colour: tuple[int, int, int]) -> rr.SeriesLines:
+    return rr.SeriesLines(names=name, colors=colour, widths=1.5, aggregation_policy="Off")
+
+
+def _mark(
+    name: str,
+    colour: tuple[int, int, int],
+    marker: Literal["circle", "cross", "diamond"],
+    size: float,
+) -> rr.SeriesPoints:
+    return rr.SeriesPoints(names=name, colors=colour, markers=marker, marker_sizes=size)
+
+
+def layout(
+    state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
+) -> rrb.Blueprint:
+    """Lay out the panels: states above the two kinds of interval, the rest at the side."""
+    intervals = rrb.Horizontal(
+        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP]),
+        _plot(
+            "Receiving intervals [s]",
+            "reception",
+            [RECEPTION_STEM, RECEPTION, FORCED, DROP],
+        ),
+    )
+    main = rrb.Vertical(_states(state_names), intervals, row_shares=[2, 1])
+    side = rrb.Vertical(
+        rrb.Tabs(
+            _plot("Error norms, log10", ERROR_LOG10),
+            _plot("Error norms", ERROR),
+        ),
+        _plot("Control input u = K x_c", INPUT),
+        rrb.Tabs(
+            rrb.TextDocumentView(origin=ABOUT, name="About this run"),
+            _plot("Lateness [µs]", "lateness", ["$origin/**"]),
+            rrb.TextLogView(
+                origin=LOG,
+                name="Log",
+                # The column of times is as narrow as its title, "t": the text says the time.
+                columns=rrb.TextLogColumns(
+                    timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
+                    text_log_columns=["loglevel", "body"],
+                ),
+                format_options=rrb.TextLogFormat(monospace_body=True),
+            ),
+        ),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(main, side, column_shares=[2, 1]),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        collapse_panels=True,
+    )
+
+
+def _states(names: Sequence[str]) -> rrb.Container:
+    """One panel for each coordinate: all at once up to four, in tabs of equal size beyond."""
+    most = _PAGE_OF_FEW if len(names) <= _MANY else _PAGE_OF_MANY
+    size = math.ceil(len(names) / math.ceil(len(names) / most))
+    pages = [names[i : i + size] for i in range(0, len(names), size)]
+    return _page(pages[0]) if len(pages) == 1 else rrb.Tabs(*map(_page, pages))
+
+
+def _page(names: Sequence[str]) -> rrb.Container:
+    title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+    crowded = len(names) > _PAGE_OF_FEW
+    panels = [
+        _plot(f"State {name}", state_path(name), legend=i == 0 or not crowded)
+        for i, name in enumerate(names)
+    ]
+    if len(panels) < _PAGE_OF_FEW:
+        return rrb.Vertical(*panels, name=title)
+    return rrb.Grid(*panels, grid_columns=3 if crowded else 2, name=title)
+
+
+def _plot(
+    name: str, origin: str, contents: Sequence[str] = ("$origin",), *, legend: bool = True
+) -> rrb.TimeSeriesView:
+    """One time series; all share the time axis, so that zooming one zooms all."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=[path if path.startswith("$") else f"/{path}" for path in contents],
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
+    )

@@ -1,0 +1,259 @@
+"""The command line ``noack``."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import click
+import typer
+from rich.console import Console
+
+from noack.errors import CallerError, ExitStatus, NoackError
+from noack.scenario import Scenario
+from noack.scenario_file import dumps as scenario_toml
+from noack.scenario_file import json_schema, load
+from noack.topology import RECORDER, ROLES
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    help="A laboratory for event-triggered control over lossy networks, without acknowledgements: "
+    "real processes, real UDP sockets, at most M − 1 packets lost in a row.",
+)
+
+_RUNS = "Runs"
+_PROCESSES = "One process each, for a person with five terminals"
+_FILES = "Scenario files"
+
+ScenarioArgument = Annotated[
+    str, typer.Argument(help="Scenario file (TOML), or the name of a shipped scenario.")
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Replace a value of the scenario, e.g. trigger.beta=0.3."
+    ),
+]
+RunsOption = Annotated[Path, typer.Option("--runs", help="Where run directories are made.")]
+LiveOption = Annotated[bool, typer.Option("--live", help="Show the run in the rerun viewer.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")
+]
+SessionOption = Annotated[
+    str, typer.Option("--session", help="Name of the session that the processes meet in.")
+]
+
+DEFAULT_RUNS = Path("runs")
+
+
+def find_scenario(name: str) -> Path:
+    """Return the path of a scenario given by path, or by the name of a shipped one."""
+    path = Path(name)
+    if path.exists() or path.suffix == ".toml":
+        return path
+    here = Path(__file__).parent
+    for folder in (here.parent / "scenarios", here / "scenarios"):
+        if (shipped := folder / f"{name}.toml").is_file():
+            return shipped
+        if folder.is_dir() and not path.parent.name:
+            names = ", ".join(sorted(file.stem for file in folder.glob("*.toml")))
+            raise CallerError(f"{name}: no such file, nor a shipped scenario; there are {names}")
+    return path
+
+
+@app.command(rich_help_panel=_RUNS)
+def run(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Run a scenario: start all processes, watch them, record everything."""
+    loaded = load(find_scenario(scenario), settings or ())
+    return _run(loaded, runs, ROLES, None, live=live, json=json)
+
+
+@app.command(rich_help_panel=_RUNS)
+def demo(
+    zoh: Annotated[bool, typer.Option("--zoh", help="Hold the last update; no model.")] = False,
+    settings: SetOption = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Run the paper's lane-following example in real time."""
+    mode = ['mode="zoh"'] if zoh else []
+    loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
+    return _run(loaded, runs, ROLES, None, live=live, json=json)
+
+
+@app.command(rich_help_panel=_RUNS)
+def view(
+    recording: Annotated[
+        Path | None, typer.Argument(help="A run directory or .rrd file; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Open a recording in the rerun viewer."""
+    from cosim.launch import latest_run
+    from cosim.live_view import view_recording
+    from cosim.record import RECORDING_FILE
+
+    path = recording or latest_run(runs)
+    path = path / RECORDING_FILE if path.is_dir() else path
+    if json:
+        _print_json({"recording": str(path), "exists": path.is_file()})
+        return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
+    view_recording(path)
+    return ExitStatus.OK
+
+
+@app.command(rich_help_panel=_RUNS)
+def summary(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Show what became of a run; finishes the record of one that was cut short."""
+    from cosim.launch import latest_run, reopen
+    from cosim.terminal import print_outcome
+
+    outcome = reopen(run_dir or latest_run(runs))
+    if json:
+        _print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome)
+    return ExitStatus.OK
+
+
+@app.command(rich_help_panel=_PROCESSES)
+def record(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    session: SessionOption = "default",
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Open a run and record it; the other four processes join from other terminals."""
+    loaded = load(find_scenario(scenario), settings or ())
+    return _run(loaded, runs, (RECORDER,), session, live=live, json=json)
+
+
+@app.command(rich_help_panel=_PROCESSES)
+def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the plant: owns the true state, sends measurements."""
+    from plant_server.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@app.command(rich_help_panel=_PROCESSES)
+def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
+    from sensor_node.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@app.command(rich_help_panel=_PROCESSES)
+def controller(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the controller: runs x_c, sends u = K x_c."""
+    from controller_node.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@app.command(
+    rich_help_panel=_PROCESSES,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    add_help_option=False,
+)
+def netem(context: typer.Context) -> int:
+    """Join the open run as the lossy network; or serve any UDP program (`noack netem --help`)."""
+    from netem.__main__ import main
+
+    return main(context.args)
+
+
+@app.command(rich_help_panel=_FILES)
+def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
+    """Check a scenario and print it resolved: defaults, named models and draws made explicit."""
+    from noack.resolve import resolve
+
+    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    if json:
+        _print_json(resolved.model_dump(mode="json"))
+    else:
+        print(scenario_toml(resolved), end="")
+    return ExitStatus.OK
+
+
+@app.command(rich_help_panel=_FILES)
+def schema(json: JsonOption = False) -> int:
+    """Print the JSON Schema of scenario files, for editors."""
+    _print_json(json_schema())
+    return ExitStatus.OK
+
+
+def _run(
+    scenario: Scenario,
+    runs: Path,
+    spawn: Sequence[str],
+    session: str | None,
+    *,
+    live: bool,
+    json: bool,
+) -> int:
+    from cosim.launch import launch
+    from cosim.terminal import print_outcome, progress_line
+
+    with progress_line(Console(stderr=True), scenario) as watcher:
+        outcome = launch(scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher)
+    if json:
+        _print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome)
+    return outcome.status
+
+
+def _process_arguments(session: str, *, json: bool) -> list[str]:
+    return ["--session", session, *(["--json"] if json else [])]
+
+
+def _print_json(document: object) -> None:
+    from cosim.terminal import print_json
+
+    print_json(document)
+
+
+def main() -> NoReturn:
+    """Entry point; a mistake becomes one line and a non-zero exit status."""
+    try:
+        status = app(standalone_mode=False)
+    except NoackError as error:
+        status = _failed(str(error), error.exit_status)
+    except click.UsageError as error:
+        error.show()
+        status = _failed("", ExitStatus.CALLER)
+    except click.exceptions.Abort:
+        status = ExitStatus.INTERRUPTED
+    sys.exit(int(status or 0))
+
+
+def _failed(message: str, status: ExitStatus) -> ExitStatus:
+    if "--json" in sys.argv:
+        _print_json({"error": message, "exit": {"status": int(status), "reason": message}})
+    for line in message.splitlines():
+        print(f"noack: {line}", file=sys.stderr)
+    return status
+
+
+if __name__ == "__main__":
+    main()

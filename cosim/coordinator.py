@@ -1,0 +1,100 @@
+"""The coordinator: admits the processes to a run, starts them together, and names who dies."""
+
+import json
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import zenoh
+from zenoh.handlers import FifoChannel, RingChannel
+
+from noack.io.plane import Plane
+from noack.io.ticket import Ticket
+from noack.topology import COORDINATOR, LOOP_ROLES, ROLES
+
+_START_DELAY_NS = 150_000_000
+"""From the last arrival to the common epoch: time for everyone to hear of it."""
+
+_LEAVE_GRACE_S = 0.3
+"""A process says that it leaves; its word may come a little after its liveliness token vanishes."""
+
+
+class Coordinator:
+    """Start barrier, liveliness and stop of one run.
+
+    Args:
+        ticket: the run's ticket; its endpoint is listened on.
+
+    Raises:
+        PeerError: the endpoint cannot be listened on.
+    """
+
+    def __init__(self, ticket: Ticket) -> None:
+        self.plane = Plane(ticket.run_id, COORDINATOR, ticket.endpoint, listen=True)
+        session, key = self.plane.session, self.plane.key
+        self._joins = session.declare_queryable(key("join", "*"), FifoChannel(64))
+        self._lives = session.liveliness().declare_subscriber(key("alive", "*"), RingChannel(256))
+        self._leaves = session.declare_subscriber(key("left", "*"), RingChannel(256))
+        self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
+        self._waiting: dict[str, tuple[zenoh.Query, dict[str, Any]]] = {}
+        self._vanished_s: dict[str, float] = {}
+        self.left: dict[str, str] = {}
+        """Why each process that has left did so."""
+        self.epoch_ns: int | None = None
+        """Monotonic clock reading at simulated time 0, once the run has started."""
+
+    def close(self) -> None:
+        """Leave the control plane."""
+        self.plane.close()
+
+    def poll(self) -> None:
+        """Handle whatever has arrived; call often."""
+        while (query := self._joins.try_recv()) is not None:
+            role = _role(query.key_expr)
+            payload = query.payload.to_string() if query.payload is not None else "{}"
+            if role in ROLES and self.epoch_ns is None:
+                self._waiting[role] = (query, json.loads(payload))
+            else:
+                self.plane.refuse(query, f"{role} cannot join: the run has begun without it")
+        while (leave := self._leaves.try_recv()) is not None:
+            self.left[_role(leave.key_expr)] = leave.payload.to_string()
+        while (life := self._lives.try_recv()) is not None:
+            role = _role(life.key_expr)
+            if life.kind == zenoh.SampleKind.DELETE:
+                self._vanished_s.setdefault(role, time.monotonic())
+            else:
+                self._vanished_s.pop(role, None)
+        if self.epoch_ns is None and not self.missing():
+            self._start()
+
+    def missing(self) -> tuple[str, ...]:
+        """Roles that have not arrived at the start barrier."""
+        return tuple(role for role in ROLES if role not in self._waiting)
+
+    def vanished(self) -> Iterable[str]:
+        """Roles that disappeared without a word."""
+        now_s = time.monotonic()
+        for role, since_s in self._vanished_s.items():
+            if role in ROLES and role not in self.left and now_s - since_s > _LEAVE_GRACE_S:
+                yield role
+
+    def progress(self) -> dict[str, Any] | None:
+        """The recorder's newest account of the run, if there is a new one."""
+        sample = self._progress.try_recv()
+        if sample is None:
+            return None
+        account: dict[str, Any] = json.loads(sample.payload.to_string())
+        return account
+
+    def _start(self) -> None:
+        self.epoch_ns = time.monotonic_ns() + _START_DELAY_NS
+        start = {
+            "epoch_ns": self.epoch_ns,
+            "addresses": {role: self._waiting[role][1]["address"] for role in LOOP_ROLES},
+        }
+        for query, _ in self._waiting.values():
+            self.plane.answer(query, start)
+
+
+def _role(key_expr: object) -> str:
+    return str(key_expr).rpartition("/")[2]

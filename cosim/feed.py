@@ -1,0 +1,157 @@
+"""Feeds the view of a run from the tables of its record, as they grow or all at once."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.join import ControllerTrack, controller_track, initial_track, join
+from cosim.record import Rows
+from cosim.view import RunView
+from noack.clock import NS_PER_S
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+    tables,
+)
+from noack.resolve import loop_of
+from noack.scenario import Scenario
+from noack.wire import read_header
+
+_LAG_S = 0.2
+"""Wall time by which the joined view trails, so that all processes' batches are in."""
+
+Times = NDArray[np.int64]
+
+
+class ViewFeed:
+    """Joins growing tables and passes what is complete to the view.
+
+    Args:
+        scenario: the resolved scenario.
+        view: takes the joined batches.
+    """
+
+    def __init__(self, scenario: Scenario, view: RunView) -> None:
+        self._scenario = scenario
+        self._loop = loop_of(scenario)
+        self._view = view
+        self._pending: dict[str, list[Rows]] = {
+            table: [] for table in tables(self._loop.n, self._loop.m)
+        }
+        self._types = tables(self._loop.n, self._loop.m)
+        self._track: ControllerTrack = initial_track(scenario)
+        self._forced: set[int] = set()
+        self._last_event_ns: int | None = None
+        self._last_delivery_ns: int | None = None
+        self._reached_ns = -1
+
+    def add(self, table: str, rows: Rows) -> None:
+        """Take rows that follow those added before."""
+        if table in self._pending and len(rows):
+            self._pending[table].append(rows)
+
+    def log(self, notice: Mapping[str, Any]) -> None:
+        """Take a line of the run's log."""
+        text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
+        self._view.log(int(notice["t_ns"]), str(notice["level"]), str(text))
+
+    def advance(self, *, final: bool = False) -> None:
+        """Pass on what is complete; at the end, everything."""
+        steps = self._take(CONTROLLER_STEP, None)
+        deliveries = self._take(CONTROLLER_DELIVERY, None)
+        if len(steps) or len(deliveries):
+            self._track = controller_track(self._track, steps, deliveries)
+        reach_ns = int(self._track.model_ns[-1])
+        if final:
+            until_ns = None
+            reach_ns += self._scenario.controller_period_ns
+        else:
+            until_ns = reach_ns - int(_LAG_S * NS_PER_S * self._scenario.speed)
+        self._packets(self._take(NETEM_PACKET, None))
+        self._inputs(steps)
+        self._deliveries(deliveries)
+        self._lateness("plant", self._take(PLANT_STEP, None))
+        self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
+
+    def _take(self, table: str, until_ns: int | None) -> Rows:
+        waiting = self._pending[table]
+        rows = np.concatenate(waiting) if waiting else np.zeros(0, self._types[table])
+        if until_ns is None:
+            self._pending[table] = []
+            return rows
+        ready = int(np.searchsorted(rows["t_ns"], until_ns, side="right"))
+        self._pending[table] = [rows[ready:]] if ready < len(rows) else []
+        return rows[:ready]
+
+    def _measurements(self, rows: Rows, reach_ns: int) -> None:
+        if not len(rows):
+            return
+        joined = join(self._loop, rows, self._track, reach_ns)
+        self._view.samples(
+            joined.t_ns,
+            joined.x,
+            joined.x_s,
+            joined.x_c,
+            joined.e_s_norm,
+            joined.threshold,
+            joined.e_c_norm,
+        )
+        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
+        if len(event_ns):
+            self._view.broadcasts(event_ns, _intervals_s(event_ns, self._last_event_ns))
+            self._last_event_ns = int(event_ns[-1])
+        self._lateness("sensor", rows)
+        keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
+        self._track = self._track.since(keep)
+
+    def _deliveries(self, rows: Rows) -> None:
+        if not len(rows):
+            return
+        forced = np.array([int(sequence) in self._forced for sequence in rows["sequence"]])
+        event_ns = rows["t_ns"]
+        self._view.receptions(event_ns, _intervals_s(event_ns, self._last_delivery_ns), forced)
+        self._last_delivery_ns = int(event_ns[-1])
+
+    def _packets(self, rows: Rows) -> None:
+        if not len(rows):
+            return
+        sequence, event_ns = packet_headers(rows)
+        self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
+        dropped = rows["fate"] == Fate.DROPPED
+        if dropped.any():
+            self._view.drops(event_ns[dropped])
+        self._view.lateness("netem", event_ns, self._wall_us(rows["now_ns"] - event_ns))
+
+    def _inputs(self, steps: Rows) -> None:
+        if len(steps):
+            self._view.inputs(steps["t_ns"], steps["u"])
+            self._lateness("controller", steps)
+
+    def _lateness(self, process: str, rows: Rows) -> None:
+        if len(rows):
+            late_us = self._wall_us(rows["now_ns"] - rows["t_ns"])
+            self._view.lateness(process, rows["t_ns"], late_us)
+
+    def _wall_us(self, simulated_ns: Times) -> NDArray[np.float64]:
+        return np.asarray(simulated_ns / (1e3 * self._scenario.speed), dtype=np.float64)
+
+
+def packet_headers(packets: Rows) -> tuple[Times, Times]:
+    """Sequence number and event time of the update in each packet; (k,), (k,), −1 if not ours."""
+    headers: Iterable[Any] = [read_header(head.tobytes()) for head in packets["head"]]
+    sequence = [h.sequence if h else NO_SEQUENCE for h in headers]
+    event_ns = [h.t_ns if h else NO_SEQUENCE for h in headers]
+    return np.array(sequence, dtype=np.int64), np.array(event_ns, dtype=np.int64)
+
+
+def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:
+    """Time since the one before, NaN for the first of all."""
+    first = np.nan if before_ns is None else (t_ns[0] - before_ns) * 1e-9
+    return np.concatenate([[first], np.diff(t_ns) * 1e-9])

@@ -1,0 +1,386 @@
+"""Showing a recording: in a window where there is a display, else in the browser on loopback.
+
+A viewer and the recorder share nothing but the recording's file. A process of its own (this module
+run as a program) reads the file as it grows and serves it over HTTP, to each viewer at that
+viewer's pace. A viewer that stalls holds up its own download: the recorder never waits, the file
+is complete, and nothing has to be dropped.
+"""
+
+import contextlib
+import http.client
+import importlib.util
+import os
+import signal
+import socket
+import socketserver
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from types import FrameType
+from typing import Any, Self
+from urllib.parse import quote
+
+from noack.errors import CallerError, MachineError
+
+HOST = "127.0.0.1"
+RECORDING = "/recording.rrd"
+
+_BLOCK = 1 << 18
+_POLL_S = 0.1
+_START_S = 15.0
+_DRAIN_S = 2.0
+_PATIENCE_S = 5.0
+_WINDOW = "window"
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+class LiveView:
+    """Shows a recording while it is written.
+
+    Args:
+        native: open a window (True), serve a browser (False), or decide by the display (None);
+            where no window can be opened after all, a browser is served.
+
+    Attributes:
+        url: address to open in a browser; None for a window, and while nothing is shown.
+        status: where the recording is shown, or why it is not, as a line for a person.
+    """
+
+    def __init__(self, *, native: bool | None = None) -> None:
+        self.url: str | None = None
+        self.status = "no live view yet"
+        self._native = has_display() if native is None else native
+        self._host: subprocess.Popen[str] | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Process that serves the recording, and leads its process group; None if there is none."""
+        return None if self._host is None else self._host.pid
+
+    def show(self, path: Path) -> None:
+        """Start showing the file, which exists and may grow; a failure is told by ``status``."""
+        command = [sys.executable, "-m", "cosim.live_view", str(path)]
+        if self._native:
+            command.append("--native")
+        self._host = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            # Ctrl-C is for the run; the viewer ends when this process says so, or is gone.
+            start_new_session=True,
+        )
+        assert self._host.stdout is not None
+        answer = self._host.stdout.readline().strip()
+        if answer == _WINDOW:
+            self.status = "live view: in a window"
+        elif answer.startswith("http://"):
+            self.url = answer
+            self.status = f"live view: {answer}"
+        else:
+            self.close()
+            self.status = f"no live view: {answer or 'the viewer did not start'}"
+
+    def finish(self) -> None:
+        """Say that the file is complete: downloads in progress end at its end."""
+        self._say("finish")
+
+    def close(self, *, keep: bool = False) -> None:
+        """Stop serving; a window stays open and keeps what it has received.
+
+        Args:
+            keep: go on serving until the process ``pid`` is ended with SIGTERM.
+        """
+        if self._host is None:
+            return
+        self._say("keep" if keep else "finish")
+        for pipe in (self._host.stdin, self._host.stdout):
+            assert pipe is not None
+            with contextlib.suppress(OSError):
+                pipe.close()
+        if not keep:
+            _end(self._host, patience_s=_PATIENCE_S)
+            self._host = None
+            self.url = None
+            self.status = "the live view is closed"
+
+    def _say(self, word: str) -> None:
+        if self._host is None:
+            return
+        assert self._host.stdin is not None
+        # A viewer that died, or was ended by hand, is no concern of the run's.
+        with contextlib.suppress(OSError, ValueError):
+            self._host.stdin.write(word + "\n")
+            self._host.stdin.flush()
+
+
+def view_recording(path: Path) -> None:
+    """Show a finished recording until its window is closed, or in the browser until Ctrl-C.
+
+    Raises:
+        CallerError: there is no such file.
+        MachineError: the viewer cannot be started.
+    """
+    if not path.is_file():
+        raise CallerError(f"{path}: no such recording")
+    with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:
+        window = server.open_window() if has_display() else None
+        if window is not None:
+            window.wait()
+            return
+        print(f"Open {server.start_page()} in a browser. Ctrl-C ends.", flush=True)
+        threading.Event().wait()
+
+
+class RecordingServer:
+    """Serves one recording on a loopback port, and starts the viewers that ask for it.
+
+    The web viewer's page comes from the same port as the recording: one forwarded port is enough
+    to look from another machine, and pages of other origins cannot read the recording.
+
+    Args:
+        path: the recording.
+        follow: at the end of the file, wait for more until ``finish``.
+
+    Attributes:
+        requested: set when a viewer has asked for the recording.
+        downloaded: set when a viewer has received all of it.
+
+    Raises:
+        MachineError: no port can be had.
+    """
+
+    def __init__(self, path: Path, *, follow: bool) -> None:
+        self.path = path
+        self.assets_port = 0
+        self.finished = threading.Event()
+        self.requested = threading.Event()
+        self.downloaded = threading.Event()
+        self._downloads = 0
+        self._lock = threading.Lock()
+        self._assets: subprocess.Popen[bytes] | None = None
+        if not follow:
+            self.finished.set()
+        try:
+            self._http = _Server((HOST, 0), _Handler)
+        except OSError as error:
+            raise MachineError(f"cannot serve {path}: {error}") from None
+        self._http.recording = self
+        self.origin = f"http://{HOST}:{self._http.server_address[1]}"
+        threading.Thread(target=self._http.serve_forever, args=(0.2,), daemon=True).start()
+
+    def start_page(self) -> str:
+        """Start the web viewer and give the address at which it shows the recording.
+
+        Raises:
+            MachineError: it does not start.
+        """
+        self.assets_port = _free_port()
+        arguments = ["--serve-web", "--bind", HOST, "--web-viewer-port", str(self.assets_port)]
+        # Named a recording that a page can load by itself, the program serves the page and no
+        # more; named a file it spins, and named nothing it opens another port for data.
+        self._assets = _start_viewer([*arguments, self.origin + RECORDING])
+        deadline = time.monotonic() + _START_S
+        while self._assets.poll() is None and time.monotonic() < deadline:
+            with (
+                contextlib.suppress(OSError),
+                socket.create_connection((HOST, self.assets_port), timeout=1),
+            ):
+                return f"{self.origin}/?url={quote(self.origin + RECORDING, safe='')}"
+            time.sleep(0.02)
+        raise MachineError("rerun's web viewer did not start")
+
+    def open_window(self) -> subprocess.Popen[bytes] | None:
+        """Open a window on the recording; None if it closed before it asked for the recording."""
+        window = _start_viewer(
+            ["--port", "auto", "--bind", HOST, self.origin + RECORDING], start_new_session=True
+        )
+        deadline = time.monotonic() + _START_S
+        while not self.requested.wait(0.02) and time.monotonic() < deadline:
+            if window.poll() is not None:
+                return None
+        return window
+
+    def finish(self) -> None:
+        """Let downloads end at the end of the file."""
+        self.finished.set()
+
+    def drain(self) -> None:
+        """Give downloads in progress a moment to reach the end of the file."""
+        deadline = time.monotonic() + _DRAIN_S
+        while self._downloads and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+    def close(self) -> None:
+        """Stop serving; windows stay open."""
+        if self._assets is not None:
+            _end(self._assets)
+        self._http.shutdown()
+        self._http.server_close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @contextlib.contextmanager
+    def download(self) -> Iterator[None]:
+        """Count a download in progress."""
+        self.requested.set()
+        with self._lock:
+            self._downloads += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._downloads -= 1
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    daemon_threads = True
+    block_on_close = False
+    recording: RecordingServer
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def do_GET(self) -> None:
+        """Answer with the recording, or with a file of the web viewer."""
+        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):
+            self.send_error(403)  # a foreign name made to resolve to loopback
+        elif self.path == RECORDING:
+            self._send_recording(self.server.recording)
+        else:
+            self._send_asset(self.server.recording.assets_port)
+
+    def handle(self) -> None:
+        """Serve one connection; a viewer may break it at any time."""
+        with contextlib.suppress(ConnectionError):
+            super().handle()
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+    def _send_recording(self, recording: RecordingServer) -> None:
+        self.send_response(200)
+        self.send_header("Content-Type", "application/octet-stream")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        with recording.download(), recording.path.open("rb") as file:
+            while True:
+                # Asked before reading, so that what was written before it was set is still sent.
+                finished = recording.finished.is_set()
+                if block := file.read(_BLOCK):
+                    self.wfile.write(block)
+                elif finished:
+                    break
+                else:
+                    recording.finished.wait(_POLL_S)
+            recording.downloaded.set()
+
+    def _send_asset(self, port: int) -> None:
+        source = http.client.HTTPConnection(HOST, port, timeout=10)
+        with contextlib.closing(source):
+            try:
+                source.request("GET", self.path)
+                answer = source.getresponse()
+            except OSError:
+                self.send_error(404)
+                return
+            self.send_response(answer.status)
+            for name in ("Content-Type", "rerun-final-length"):
+                if (value := answer.getheader(name)) is not None:
+                    self.send_header(name, value)
+            self.end_headers()
+            while block := answer.read(_BLOCK):
+                self.wfile.write(block)
+
+
+def _end(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) -> None:
+    """End a process that was asked to end ``patience_s`` ago, by SIGTERM, then by SIGKILL."""
+    for wait_s, act in ((patience_s, process.terminate), (1.0, process.kill)):
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(wait_s)
+            return
+        act()
+    process.wait()
+
+
+def _start_viewer(
+    arguments: list[str], *, start_new_session: bool = False
+) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [_viewer_program(), *arguments],
+        env=os.environ | {"CI": "1"},  # it asks nothing and reports nothing
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=start_new_session,
+    )
+
+
+def _viewer_program() -> str:
+    """Path of rerun's own program: the ``rerun`` script only wraps it, and would orphan it."""
+    if chosen := os.environ.get("RERUN_CLI_PATH"):
+        return chosen
+    spec = importlib.util.find_spec("rerun_cli")
+    if spec is not None and spec.origin is not None:
+        folder = Path(spec.origin).parent
+        for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun", "rerun.exe"):
+            if (folder / name).is_file():
+                return str(folder / name)
+    raise MachineError("the viewer of the package rerun-sdk is not installed")
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
+    """Serve a growing file: say where it is shown, then obey ``commands`` until their end."""
+
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        sys.exit(0)
+
+    signal.signal(signal.SIGTERM, stop)
+    if hasattr(os, "nice"):
+        os.nice(10)  # the processes of the run come first
+    with RecordingServer(path, follow=True) as server:
+        window = server.open_window() if native else None
+        print(_WINDOW if window is not None else server.start_page(), flush=True)
+        keep = False
+        for command in commands:
+            server.finish()
+            keep = command.strip() == "keep"
+        server.finish()
+        if keep:
+            threading.Event().wait()
+        server.drain()
+
+
+def _main() -> int:
+    try:
+        _host(Path(sys.argv[1]), native="--native" in sys.argv[2:], commands=sys.stdin)
+    except MachineError as error:
+        print(error, flush=True)
+        return error.exit_status
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

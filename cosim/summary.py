@@ -1,0 +1,177 @@
+"""The summary of a run, computed from its record: counts, claims of completeness, timing."""
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.feed import packet_headers
+from cosim.join import identity_residual, join_all
+from cosim.record import Rows, RunRecord
+from noack.io.node import HORIZON
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    OWNER,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+)
+from noack.topology import LOOP_ROLES
+
+Summary = dict[str, Any]
+
+
+def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
+    """Return the content of ``summary.json``; ``docs/record.md`` documents the keys.
+
+    Args:
+        record: the run's record.
+        exit_status: the run's exit status.
+        reason: why the run ended.
+    """
+    scenario = record.scenario
+    sensor, packets = record[SENSOR_MEASUREMENT], record[NETEM_PACKET]
+    events = sensor[sensor["event"] != NO_SEQUENCE]
+    intervals_s = np.diff(events["t_ns"]) * 1e-9
+    joined = join_all(record)
+    residual = identity_residual(record, joined)
+    states = record[PLANT_STEP]["x"]
+    violations = [n for n in record.notices if n["level"] == "violation"]
+    reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
+    return {
+        "scenario": scenario.name,
+        "mode": scenario.mode,
+        "mansd": scenario.network.mansd,
+        "horizon_s": scenario.horizon_s,
+        "speed": scenario.speed,
+        "reached_s": _last_s(record[PLANT_STEP]),
+        "events": len(events),
+        "deliveries": len(record[CONTROLLER_DELIVERY]),
+        "drops": int((packets["fate"] == Fate.DROPPED).sum()),
+        "forced_deliveries": int((packets["fate"] == Fate.FORCED).sum()),
+        "longest_drop_run": int(packets["drop_run"].max(initial=0)),
+        "assumption_violations": [
+            {"t_s": n["t_ns"] * 1e-9, "process": n["process"], "what": n["text"]}
+            for n in violations
+        ],
+        "missing_samples": sum(_missing(record).values()),
+        "missing_by_table": {table: n for table, n in _missing(record).items() if n},
+        "lost_outside_netem": sum(_lost(record).values()),
+        "lost_by_leg": {leg: n for leg, n in _lost(record).items() if n},
+        "rejected_datagrams": {
+            role: report["channel"]["rejected"]
+            for role, report in record.reports.items()
+            if report["channel"].get("rejected")
+        },
+        "inter_event_min_s": _or_none(np.min, intervals_s),
+        "inter_event_median_s": _or_none(np.median, intervals_s),
+        "inter_delivery_median_s": _or_none(np.median, reception_s),
+        "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
+        "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
+        "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
+        "sup_e_c_norm": _or_none(np.nanmax, joined.e_c_norm[~np.isnan(joined.e_c_norm)]),
+        "identity_residual_max": _or_none(np.max, residual[~np.isnan(residual)]),
+        "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES},
+        "latency_us": _latency(record),
+        "realtime": {role: report["realtime"] for role, report in record.reports.items()},
+        "exit": {"status": exit_status, "reason": reason},
+    }
+
+
+def _last_s(rows: Rows) -> float:
+    return float(rows["t_ns"][-1]) * 1e-9 if len(rows) else 0.0
+
+
+def _or_none(statistic: Any, values: NDArray[np.float64]) -> float | None:
+    return float(statistic(values)) if len(values) else None
+
+
+def _missing(record: RunRecord) -> dict[str, int]:
+    """Rows that a process made and the record lacks, by table."""
+    missing: dict[str, int] = {}
+    for table in OWNER:
+        report = record.reports.get(OWNER[table])
+        if report is not None:
+            missing[table] = report["rows"][table] - len(record[table])
+    for role in LOOP_ROLES:
+        if role in record.reports:
+            continue
+        # The process died without a report: its inputs are numbered, so gaps still show.
+        inputs = np.concatenate(
+            [record[table]["input"] for table, owner in OWNER.items() if owner == role]
+        )
+        missing[role] = int(inputs.max() + 1 - len(inputs)) if len(inputs) else 0
+    return missing
+
+
+def _lost(record: RunRecord) -> dict[str, int]:
+    """Datagrams that were sent and did not arrive, other than by the emulator's decision."""
+    sensor, packets = record[SENSOR_MEASUREMENT], record[NETEM_PACKET]
+    every = record.scenario.plant.measure_every
+    sent = record[PLANT_STEP]["sequence"]
+    entered, _ = packet_headers(packets)
+    legs = {
+        "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
+        "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], entered),
+        "update to controller": (
+            entered[packets["fate"] != Fate.DROPPED],
+            record[CONTROLLER_DELIVERY]["sequence"],
+        ),
+        "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
+    }
+    whole = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
+    lost: dict[str, int] = {}
+    for leg, (out, arrived) in legs.items():
+        if not whole:  # what was under way when a process ended is nobody's loss
+            out = out[out <= arrived.max(initial=-1)]
+        lost[leg] = int(np.setdiff1d(out, arrived).size)
+    return lost
+
+
+def _quantiles(late_us: NDArray[np.float64]) -> dict[str, float | None]:
+    if not len(late_us):
+        return {"p50": None, "p99": None, "p999": None, "max": None}
+    p50, p99, p999 = np.quantile(late_us, [0.5, 0.99, 0.999])
+    return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(late_us.max())}
+
+
+def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
+    """Wall time by which a process acted after what it acts on was due.
+
+    The plant and the controller have deadlines of their own; the sensor's is the measurement's grid
+    time, the network's is the event's.
+    """
+    scenario = record.scenario
+    table, period_ns = {
+        "plant": (PLANT_STEP, scenario.plant_period_ns),
+        "sensor": (SENSOR_MEASUREMENT, scenario.plant_period_ns * scenario.plant.measure_every),
+        "controller": (CONTROLLER_STEP, scenario.controller_period_ns),
+        "netem": (NETEM_PACKET, scenario.plant_period_ns),
+    }[role]
+    rows = record[table]
+    due_ns = packet_headers(rows)[1] if role == "netem" else rows["t_ns"]
+    late_us = (rows["now_ns"] - due_ns) / (1e3 * scenario.speed)
+    late_steps = int((late_us * 1e3 * scenario.speed > period_ns).sum())
+    return {**_quantiles(late_us), "steps": len(rows), "late_steps": late_steps}
+
+
+def _latency(record: RunRecord) -> dict[str, float | int | None]:
+    """Wall time from the sensor's event to the controller's update, one way."""
+    sensor, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
+    events = sensor[sensor["event"] != NO_SEQUENCE]
+    _, at_sensor, at_controller = np.intersect1d(
+        events["event"], deliveries["sequence"], return_indices=True
+    )
+    taken_ns = deliveries["now_ns"][at_controller] - events["now_ns"][at_sensor]
+    latency_us = taken_ns / (1e3 * record.scenario.speed)
+    return {**_quantiles(latency_us), "updates": len(latency_us)}
+
+
+def dumps(summary: Summary) -> str:
+    """The summary as JSON."""
+    return json.dumps(summary, indent=2, allow_nan=False)

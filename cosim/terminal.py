@@ -1,0 +1,172 @@
+"""What a person sees in the terminal: the live progress line and the table at the end."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from cosim.launch import Outcome, Watcher
+from cosim.record import RECORDING_FILE
+from cosim.summary import Summary
+from noack.scenario import Scenario
+
+_PLAIN_LINES = 10
+"""Progress lines of a run whose terminal cannot redraw one."""
+
+
+@contextmanager
+def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
+    """Show a run's progress while the context lasts."""
+    live = console.is_terminal
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.fields[account]}"),
+        TimeRemainingColumn(elapsed_when_finished=True),
+    )
+    shown = 0
+    with Progress(*columns, console=console, disable=not live, transient=False) as progress:
+        task: TaskID | None = None
+
+        def waiting(roles: Sequence[str]) -> None:
+            if roles:
+                console.print(f"waiting for {', '.join(roles)}")
+
+        def started(run_dir: Path) -> None:
+            nonlocal task
+            task = progress.add_task(scenario.name, total=scenario.horizon_s, account="")
+
+        def account(account: dict[str, Any]) -> None:
+            nonlocal shown
+            text = _account(account)
+            if task is not None:
+                progress.update(task, completed=account["t_s"], account=text)
+            due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
+            if not live and due > shown:
+                shown = due
+                console.print(text, highlight=False, soft_wrap=True)
+
+        yield Watcher(waiting, started, account)
+
+
+def _account(account: dict[str, Any]) -> str:
+    norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.4f}"
+    return (
+        f"t {account['t_s']:7.3f} s  events {account['events']}  "
+        f"delivered {account['deliveries']}  longest drop run {account['longest_drop_run']}  "
+        f"‖x‖ {norm}"
+    )
+
+
+def print_outcome(console: Console, outcome: Outcome) -> None:
+    """Print the tables at the end of a run."""
+    summary = outcome.summary
+    console.print(_run_table(summary))
+    console.print(_timing_table(summary))
+    for violation in summary["assumption_violations"]:
+        console.print(
+            f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
+            f"seen by {violation['process']}: {violation['what']}"
+        )
+    if outcome.status:
+        console.print(f"[bold red]the run failed:[/] {outcome.reason}")
+    console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)
+    console.print(
+        f"look at it     noack view {outcome.run_dir / RECORDING_FILE}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _run_table(summary: Summary) -> Table:
+    table = Table(title=f"{summary['scenario']}, {_mode(summary)}, M = {summary['mansd'] + 1}")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    events, deliveries = summary["events"], summary["deliveries"]
+    arrived = summary["drops"] + deliveries
+    rows = (
+        ("events (transmissions)", str(events)),
+        ("deliveries", str(deliveries)),
+        ("  of these forced by MANSD", str(summary["forced_deliveries"])),
+        ("dropped by the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
+        ("longest drop run", f"{summary['longest_drop_run']} (at most {summary['mansd']})"),
+        ("assumption violations", str(len(summary["assumption_violations"]))),
+        ("shortest inter-event time", _seconds(summary["inter_event_min_s"])),
+        ("median inter-event time", _seconds(summary["inter_event_median_s"])),
+        ("median time between deliveries", _seconds(summary["inter_delivery_median_s"])),
+        ("‖x‖ at the start", _number(summary["initial_state_norm"])),
+        ("‖x‖ at the end", _number(summary["final_state_norm"])),
+        ("largest ‖e_s‖, ‖e_c‖",
+         f"{_number(summary['sup_e_s_norm'])}, {_number(summary['sup_e_c_norm'])}"),
+        ("identity (I1), largest residual", _number(summary["identity_residual_max"])),
+        ("missing samples", str(summary["missing_samples"])),
+        ("lost outside the emulator", str(summary["lost_outside_netem"])),
+    )  # fmt: skip
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _timing_table(summary: Summary) -> Table:
+    table = Table(title="timing, wall µs")
+    for heading in ("", "p50", "p99", "p99.9", "max", "steps", "late", "real-time settings"):
+        table.add_column(
+            heading, justify="left" if heading in ("", "real-time settings") else "right"
+        )
+    for role, late in summary["lateness_us"].items():
+        table.add_row(
+            f"{role} lateness",
+            *(_whole(late[key]) for key in ("p50", "p99", "p999", "max")),
+            str(late["steps"]),
+            str(late["late_steps"]),
+            _settings(summary["realtime"].get(role)),
+        )
+    latency = summary["latency_us"]
+    table.add_row(
+        "event → update",
+        *(_whole(latency[key]) for key in ("p50", "p99", "p999", "max")),
+        str(latency["updates"]), "", "",
+    )  # fmt: skip
+    return table
+
+
+def _mode(summary: Summary) -> str:
+    return "model-based" if summary["mode"] == "model" else "zero-order hold"
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.0f} %" if whole else "-"
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} s"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"
+
+
+def _whole(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
+
+
+def _settings(granted: dict[str, str] | None) -> str:
+    if granted is None:
+        return "unknown"
+    taken = [name for name, verdict in granted.items() if verdict == "granted"]
+    refused = [name for name, verdict in granted.items() if verdict.startswith("refused")]
+    parts = [", ".join(taken) or "none granted"]
+    if refused:
+        parts.append(f"refused: {', '.join(refused)}")
+    return "; ".join(parts)
+
+
+def print_json(document: object) -> None:
+    """Print one JSON document on standard output."""
+    print(json.dumps(document, indent=2, allow_nan=False))

@@ -1,0 +1,229 @@
+"""The view of a run: a rerun recording with its own layout, written while the run goes on.
+
+The view is for people. The run's numbers of record are in its Parquet files; a recording is only
+promised to be readable by neighbouring versions of rerun.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from cosim import blueprint as bp
+from cosim.live_view import LiveView
+from noack.errors import MachineError
+
+Floats = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+
+APPLICATION_ID = "noack"
+
+# A reset error is zero, whose logarithm is not a point of the plot: errors are drawn down to this
+# fraction of the threshold, and no lower than the smallest error worth a look.
+_LOG_DEPTH = 1e-3
+_LOG_FLOOR = 1e-12
+
+
+class ViewError(MachineError):
+    """The recording could not be written; the message names the file and the cause."""
+
+
+class RunView:
+    """Writes ``recording.rrd``; every method takes batches of one kind, ordered in time.
+
+    Times are int64 nanoseconds of simulated time since the run's epoch. Data is handed to the
+    operating system as it comes, so the file is readable while it grows and after a crash.
+
+    Args:
+        path: the file to write; replaced if it exists.
+        run_id: identity of the recording, unique among runs.
+        title: name shown for the recording.
+        about: Markdown shown beside the plots.
+        state_names: names of the n coordinates of x.
+        input_names: names of the m coordinates of u.
+        processes: names of the processes whose lateness is shown.
+        live: shows the file while it is written.
+
+    Raises:
+        ViewError: the file cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        run_id: str,
+        title: str,
+        about: str,
+        state_names: Sequence[str],
+        input_names: Sequence[str],
+        processes: Sequence[str],
+        live: LiveView | None = None,
+    ) -> None:
+        self._path = path
+        self._states = [bp.state_path(name) for name in state_names]
+        self._lateness = {name: bp.lateness_path(name) for name in processes}
+        self._n, self._m = len(state_names), len(input_names)
+        self._open = True
+        self._live = live
+        self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=run_id)
+        names = (state_names, input_names, processes)
+        try:
+            self._recording.save(path, default_blueprint=bp.layout(*names))
+        except RuntimeError as error:
+            raise ViewError(f"{path}: cannot create the recording: {error}") from None
+        self._recording.send_recording_name(title)
+        document = rr.TextDocument(about, media_type=rr.MediaType.MARKDOWN)
+        self._recording.log(bp.ABOUT, document, static=True)
+        for entity, style in bp.styles(*names).items():
+            self._recording.log(entity, style, static=True)
+        if live is not None:
+            live.show(path)
+
+    def samples(
+        self,
+        t_ns: Nanoseconds,
+        x: Floats,
+        x_s: Floats,
+        x_c: Floats,
+        e_s_norm: Floats,
+        threshold: Floats,
+        e_c_norm: Floats,
+    ) -> None:
+        """Add k samples: times (k,), states (k, n), error norms and threshold (k,)."""
+        times = self._times(t_ns)
+        k = len(t_ns)
+        x, x_s, x_c = (
+            _shaped(name, value, (k, self._n))
+            for name, value in (("x", x), ("x_s", x_s), ("x_c", x_c))
+        )
+        triples = np.stack((x, x_s, x_c), axis=2)
+        for i, entity in enumerate(self._states):
+            self._send(entity, times, triples[:, i, :])
+        norms = np.stack(
+            [
+                _shaped(name, value, (k,))
+                for name, value in (
+                    ("e_s_norm", e_s_norm),
+                    ("threshold", threshold),
+                    ("e_c_norm", e_c_norm),
+                )
+            ],
+            axis=1,
+        )
+        self._send(bp.ERROR, times, norms)
+        self._send(bp.ERROR_LOG10, times, _log10(norms))
+
+    def inputs(self, t_ns: Nanoseconds, u: Floats) -> None:
+        """Add the control input u (k, m) at times (k,)."""
+        self._send(bp.INPUT, self._times(t_ns), _shaped("u", u, (len(t_ns), self._m)))
+
+    def broadcasts(self, t_ns: Nanoseconds, interval_s: Floats) -> None:
+        """Add events: times t_i (k,) and t_i − t_{i−1} in seconds (k,).
+
+        The first event has no predecessor, hence interval NaN; it is drawn as a mark at 0.
+        """
+        interval_s = np.nan_to_num(_shaped("interval_s", interval_s, (len(t_ns),)))
+        self._send(bp.EVENT_STEM, *self._stems(t_ns, interval_s))
+        self._send(bp.EVENT, self._times(t_ns), interval_s)
+
+    def receptions(
+        self, t_ns: Nanoseconds, interval_s: Floats, forced: npt.NDArray[np.bool_]
+    ) -> None:
+        """Add deliveries: times (k,), seconds since the one before (k,), forced (k,).
+
+        A delivery is forced when the network had to let it through, because M−1 updates in a row
+        had just been dropped. The first interval is NaN and drawn as a mark at 0.
+        """
+        interval_s = np.nan_to_num(_shaped("interval_s", interval_s, (len(t_ns),)))
+        forced = np.asarray(forced, dtype=bool)
+        self._send(bp.RECEPTION_STEM, *self._stems(t_ns, interval_s))
+        self._send(bp.RECEPTION, self._times(t_ns[~forced]), interval_s[~forced])
+        self._send(bp.FORCED, self._times(t_ns[forced]), interval_s[forced])
+
+    def drops(self, t_ns: Nanoseconds) -> None:
+        """Add the times (k,) at which an update was dropped."""
+        self._send(bp.DROP, self._times(t_ns), np.zeros(len(t_ns)))
+
+    def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
+        """Add how late a process was, in microseconds (k,), at times (k,)."""
+        values = _shaped("lateness_us", lateness_us, (len(t_ns),))
+        self._send(self._lateness[process], self._times(t_ns), values)
+
+    def log(self, t_ns: int, level: str, text: str) -> None:
+        """Add one line to the log; ``level`` is one of rerun's, such as INFO or WARN."""
+        line = f"{t_ns / 1e9:8.3f} s  {text}"
+        columns = rr.TextLog.columns(text=[line], level=[level])
+        times = self._times(np.array([t_ns], dtype=np.int64))
+        self._send_columns(bp.LOG, times, columns)
+
+    def close(self) -> None:
+        """Write what is left and the file's footer; a second call does nothing.
+
+        Raises:
+            ViewError: the file could not be written in full.
+        """
+        if not self._open:
+            return
+        self._open = False
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise ViewError(f"{self._path}: the recording is incomplete: {error}") from None
+        finally:
+            self._recording.disconnect()
+            if self._live is not None:
+                self._live.finish()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _send(self, entity: str, times: rr.TimeColumn, values: Floats) -> None:
+        """Send scalars (k,) or (k, series) to one entity; what is not finite leaves a gap."""
+        if len(values):
+            columns = rr.Scalars.columns(scalars=np.where(np.isfinite(values), values, np.nan))
+            self._send_columns(entity, times, columns)
+
+    def _send_columns(
+        self, entity: str, times: rr.TimeColumn, columns: Iterable[rr.ComponentColumn]
+    ) -> None:
+        try:
+            self._recording.send_columns(entity, [times], columns, strict=True)
+        except RuntimeError as error:
+            raise ViewError(f"{self._path}: cannot write the recording: {error}") from None
+
+    @staticmethod
+    def _times(t_ns: Nanoseconds) -> rr.TimeColumn:
+        return rr.TimeColumn(bp.TIMELINE, duration=np.asarray(t_ns).astype("timedelta64[ns]"))
+
+    def _stems(self, t_ns: Nanoseconds, height: Floats) -> tuple[rr.TimeColumn, Floats]:
+        """Draw lines that rise from 0 to each height (k,), with a gap after each."""
+        zeros = np.zeros_like(height)
+        line = np.stack((zeros, height, np.full_like(height, np.nan)), axis=1).ravel()
+        return self._times(np.repeat(t_ns, 3)), line
+
+
+def _shaped(name: str, value: Floats, shape: tuple[int, ...]) -> Floats:
+    value = np.asarray(value, dtype=np.float64)
+    if value.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, found {value.shape}")
+    return value
+
+
+def _log10(norms: Floats) -> Floats:
+    """Decimal logarithm of (‖e_s‖, threshold, ‖e_c‖) (k, 3), cut off below."""
+    threshold = np.nan_to_num(norms[:, 1:2], nan=0.0, posinf=0.0)
+    floor = np.maximum(_LOG_DEPTH * threshold, _LOG_FLOOR)
+    return np.log10(np.maximum(norms, floor))

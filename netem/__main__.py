@@ -1,0 +1,139 @@
+"""The network emulator's process.
+
+In a run it joins like every other process. On its own it serves any UDP program::
+
+    python -m netem --listen 127.0.0.1:9000 --to 127.0.0.1:9001 --loss bernoulli:0.3 --mansd 4
+"""
+
+import argparse
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+
+from pydantic import TypeAdapter, ValidationError
+
+from netem.link import Link, update_link_of
+from netem.relay import Relay
+from noack.clock import RunClock
+from noack.errors import CallerError, ExitStatus
+from noack.io.loop import run_loop
+from noack.io.node import Node, Signals, run_process
+from noack.io.ticket import DEFAULT_SESSION
+from noack.io.udp import bind, parse_address
+from noack.machine import Notice, Record
+from noack.records import Fate
+from noack.scenario import Loss
+
+_LOSS_FORMS = {
+    "lossless": (),
+    "bernoulli": ("probability",),
+    "gilbert_elliott": ("good_to_bad", "bad_to_good", "loss_in_good", "loss_in_bad"),
+    "worst_case": (),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> ExitStatus:
+    """Run the emulator: alone with ``--listen`` and ``--to``, else in a run."""
+    parser = argparse.ArgumentParser(
+        prog="noack netem",
+        description="A UDP relay that loses datagrams, but never more than MANSD in a row per "
+        "flow. Without --listen it joins the run that `noack record SCENARIO` has opened.",
+    )
+    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    alone = parser.add_argument_group("on its own")
+    alone.add_argument("--listen", metavar="HOST:PORT", help="where datagrams come in")
+    alone.add_argument("--to", metavar="HOST:PORT", help="where survivors go")
+    alone.add_argument(
+        "--loss",
+        default="lossless",
+        help="lossless, bernoulli:P, gilbert_elliott:P:R[:LOSS_GOOD[:LOSS_BAD]] or worst_case",
+    )
+    alone.add_argument("--mansd", type=int, help="at most so many successive drops per flow")
+    alone.add_argument("--seed", type=int, default=0, help="seed of the losses")
+    options = parser.parse_args(arguments)
+    if (options.listen is None) != (options.to is None):
+        parser.error("--listen and --to go together")
+    if options.listen is None:
+        return run_process("netem", _in_a_run, options.session)
+    try:
+        return _alone(options)
+    except CallerError as error:
+        print(f"noack netem: {error}", file=sys.stderr)
+        return error.exit_status
+
+
+def _in_a_run(node: Node) -> None:
+    node.run(
+        update_link_of(node.scenario),
+        lambda endpoint, addresses: Relay(endpoint, addresses["controller"]),
+    )
+
+
+def _alone(options: argparse.Namespace) -> ExitStatus:
+    if options.mansd is not None and options.mansd < 0:
+        raise CallerError(f"--mansd {options.mansd}: must be 0 or more")
+    host, port = parse_address(options.listen, "--listen")
+    link = Link(_parse_loss(options.loss), options.mansd, options.seed, "relay")
+    fates = _Fates()
+    with closing(bind(port, "netem", "--listen", host)) as endpoint:
+        print(f"noack netem: {options.listen} → {options.to}, Ctrl-C ends", file=sys.stderr)
+        with (
+            closing(Relay(endpoint, parse_address(options.to, "--to"))) as relay,
+            Signals().handled() as signals,
+        ):
+            run_loop(
+                link,
+                relay,
+                RunClock(time.monotonic_ns()),
+                fates,
+                end_ns=None,
+                stop=lambda: signals.received is not None,
+            )
+    print(fates, file=sys.stderr)
+    return ExitStatus.OK
+
+
+def _parse_loss(text: str) -> Loss:
+    model, *numbers = text.split(":")
+    keys = _LOSS_FORMS.get(model)
+    if keys is None or len(numbers) > len(keys):
+        raise CallerError(f"--loss {text}: expected one of {', '.join(_LOSS_FORMS)}; see --help")
+    try:
+        settings = dict(zip(keys, map(float, numbers), strict=False))
+        return TypeAdapter[Loss](Loss).validate_python({"model": model, **settings})
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CallerError(f"--loss {text}: {first['loc'][-1]}: {first['msg']}") from None
+    except ValueError:
+        raise CallerError(f"--loss {text}: probabilities are numbers from 0 to 1") from None
+
+
+class _Fates:
+    """Counts fates instead of recording them."""
+
+    def __init__(self) -> None:
+        self._fates: Counter[Fate] = Counter()
+        self._longest_run = 0
+
+    def append(self, record: Record) -> None:
+        """Count a datagram's fate."""
+        _, _, _, _, _, fate, run, _, _ = record.row
+        self._fates[fate] += 1
+        self._longest_run = max(self._longest_run, run)
+
+    def notice(self, notice: Notice) -> None:
+        """Show a line."""
+        print(notice.text, file=sys.stderr)
+
+    def flush(self) -> None:
+        """Nothing is gathered."""
+
+    def __str__(self) -> str:
+        counts = ", ".join(f"{self._fates[fate]} {fate.name.lower()}" for fate in Fate)
+        return f"noack netem: {counts}; longest drop run {self._longest_run}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What every process agrees on: scenario, wire format, linear systems, records, clock."""

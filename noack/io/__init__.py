@@ -1,0 +1,1 @@
+"""The shells' side: UDP sockets, the real-time loop, the zenoh control plane, telemetry."""

@@ -1,0 +1,106 @@
+"""The real-time loop: drives a machine from a socket and a clock.
+
+One thread waits in ``select`` for the socket or the next absolute deadline, whichever comes first.
+select's timeout has microsecond steps; asyncio's and epoll's timers have milliseconds. A deadline
+that was missed is served late and in order, never skipped.
+"""
+
+import select
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar
+
+from noack.clock import RunClock
+from noack.machine import Machine, Notice, Record
+
+T = TypeVar("T")
+
+_HOUSEKEEPING_S = 0.05
+
+
+class Channel(Protocol[T]):
+    """Where a machine's messages come from and go to."""
+
+    def fileno(self) -> int:
+        """File descriptor to wait on."""
+        ...
+
+    def receive(self) -> T | None:
+        """Take one message; None if there was none worth taking."""
+        ...
+
+    def send(self, message: T) -> None:
+        """Send a message; never blocks and never raises for a peer's fault."""
+        ...
+
+
+class Sink(Protocol):
+    """Where a machine's records and notices go."""
+
+    def append(self, record: Record) -> None:
+        """Take a row."""
+        ...
+
+    def notice(self, notice: Notice) -> None:
+        """Take a line for the log."""
+        ...
+
+    def flush(self) -> None:
+        """Hand over what has been gathered; called every 50 ms."""
+        ...
+
+
+def run_loop(
+    machine: Machine[T],
+    channel: Channel[T],
+    clock: RunClock,
+    telemetry: Sink,
+    *,
+    end_ns: int | None,
+    stop: Callable[[], bool],
+    spin_us: float = 0.0,
+) -> None:
+    """Drive ``machine`` until simulated time ``end_ns``, or until ``stop()``.
+
+    Args:
+        machine: the pure machine.
+        channel: its socket.
+        clock: simulated time.
+        telemetry: takes its records and notices.
+        end_ns: when to end; None runs until stopped.
+        stop: asked every 50 ms of wall time.
+        spin_us: busy-wait for the last microseconds before a deadline.
+    """
+    spin_s = spin_us * 1e-6
+    housekeeping_s = time.monotonic() + _HOUSEKEEPING_S
+
+    def emit(outputs: Sequence[T | Record | Notice]) -> None:
+        for output in outputs:
+            if isinstance(output, Record):
+                telemetry.append(output)
+            elif isinstance(output, Notice):
+                telemetry.notice(output)
+            else:
+                channel.send(output)
+
+    watched = [channel]
+    while True:
+        deadline_ns = machine.next_deadline_ns()
+        if deadline_ns is not None and clock.now_ns() >= deadline_ns:
+            emit(machine.on_timer(clock.now_ns()))
+            wait_s = 0.0  # look at the socket between late steps, so that it is never starved
+        else:
+            wait_s = housekeeping_s - time.monotonic()
+            if deadline_ns is not None:
+                wait_s = min(wait_s, clock.wall_s_until(deadline_ns) - spin_s)
+            wait_s = max(wait_s, 0.0)
+        readable, _, _ = select.select(watched, (), (), wait_s)
+        if readable:
+            message = channel.receive()
+            if message is not None:
+                emit(machine.handle(message, clock.now_ns()))
+        if time.monotonic() >= housekeeping_s:
+            telemetry.flush()
+            if stop() or (end_ns is not None and clock.now_ns() >= end_ns):
+                return
+            housekeeping_s = time.monotonic() + _HOUSEKEEPING_S

@@ -1,0 +1,296 @@
+"""The life of a process in a run: join, wait for the common epoch, loop, report, leave.
+
+A process ends when the horizon is reached, when the coordinator asks, when the launcher that holds
+its lifeline is gone, or on SIGINT and SIGTERM. What it recorded reaches the recorder, or else the
+run directory's spool.
+"""
+
+import argparse
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol, TypeVar
+
+from noack.clock import NS_PER_S, RunClock
+from noack.errors import ExitStatus, NoackError, PeerError
+from noack.io.loop import Channel, run_loop
+from noack.io.plane import Plane
+from noack.io.realtime import realtime
+from noack.io.spool import SpoolWriter
+from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notices_of
+from noack.io.ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
+from noack.io.udp import Address, MessageSocket, bind
+from noack.machine import Machine
+from noack.records import OWNER, tables
+from noack.resolve import Loop, loop_of
+from noack.topology import LEGS
+from noack.wire import Decoder, Encoder, Flow, Message
+
+T = TypeVar("T")
+
+_JOIN_TIMEOUT_S = 30.0
+_MANUAL_JOIN_TIMEOUT_S = 3600.0
+_GOODBYE_TIMEOUT_S = 5.0
+_GRACE_S = 0.15
+"""Wall time after the horizon in which what is still under way arrives."""
+
+HORIZON = "horizon"
+"""Why a process ends that has done its work."""
+
+TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
+
+
+class Signals:
+    """Turns SIGINT and SIGTERM into a flag; a loop ends at its next look, nothing is torn."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+
+    @contextmanager
+    def handled(self) -> Iterator["Signals"]:
+        """Handle the signals while the context lasts."""
+        before = {number: signal.signal(number, self._note) for number in _ENDING}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _note(self, number: int, _frame: FrameType | None) -> None:
+        if self.received is not None:  # asked twice: the person means it
+            raise SystemExit(self.status)
+        self.received = number
+
+    @property
+    def status(self) -> ExitStatus:
+        """Exit status that tells of the signal, or OK."""
+        return _ENDING.get(self.received or 0, ExitStatus.OK)
+
+
+_ENDING = {
+    signal.SIGINT.value: ExitStatus.INTERRUPTED,
+    signal.SIGTERM.value: ExitStatus.TERMINATED,
+}
+
+
+class ReportingChannel(Channel[T], Protocol[T]):
+    """A channel that accounts for what passed through it."""
+
+    def report(self) -> Mapping[str, object]:
+        """Counters, for the run's summary."""
+        ...
+
+
+OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[T]]
+
+
+class Node:
+    """A process of the loop that has been admitted to a run.
+
+    Args:
+        role: which process.
+        ticket: its admission.
+        plane: its connection to the control plane.
+        signals: the signals it has received.
+    """
+
+    def __init__(self, role: str, ticket: Ticket, plane: Plane, signals: Signals) -> None:
+        self.role = role
+        self.ticket = ticket
+        self.scenario = ticket.scenario
+        self.loop: Loop = loop_of(ticket.scenario)
+        self.plane = plane
+        self._signals = signals
+        self._ended: str | None = None
+        self.report: dict[str, Any] = {}
+
+    def join(self, address: Address | None) -> Mapping[str, Address]:
+        """Wait at the start barrier; return everyone's address. Sets the common epoch.
+
+        Args:
+            address: where this process receives; None for the recorder, which is not in the loop.
+
+        Raises:
+            PeerError: the run never started.
+        """
+        hello = {"pid": os.getpid(), "address": address}
+        timeout_s = _JOIN_TIMEOUT_S if self.ticket.launched else _MANUAL_JOIN_TIMEOUT_S
+        start = self.plane.request(
+            "join", hello, timeout_s=timeout_s, give_up=lambda: self.stopping
+        )
+        self.clock = RunClock(start["epoch_ns"], self.scenario.speed)
+        return {role: (host, port) for role, (host, port) in start["addresses"].items()}
+
+    def run_messages(self, machine: Machine[Message]) -> None:
+        """Run a machine that speaks the loop's wire format over its leg of the topology."""
+        leg = LEGS[self.role]
+        dimension = self.loop.m if leg.receives is Flow.ACTUATION else self.loop.n
+        decoder = Decoder(leg.receives, dimension, self.ticket.run_id, self.ticket.key)
+        encoder = Encoder(self.ticket.run_id, self.ticket.key)
+
+        def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
+            return MessageSocket(endpoint, decoder, encoder, leg.sends, addresses[leg.to])
+
+        self.run(machine, channel)
+
+    def run(self, machine: Machine[T], open_channel: OpenChannel[T]) -> None:
+        """Join, drive the machine to the horizon, hand over what is left, and report.
+
+        Args:
+            machine: the pure machine.
+            open_channel: makes the machine's channel from a bound socket and everyone's address.
+
+        Raises:
+            CallerError: the process's port is taken.
+            PeerError: the run never started.
+        """
+        rows = tables(self.loop.n, self.loop.m)
+        owned = {table: rows[table] for table, owner in OWNER.items() if owner == self.role}
+        telemetry = TelemetryBuffer(owned, self.plane.publish_telemetry)
+        grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
+        settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
+        with (
+            closing(bind(port, self.role, f"ports.{self.role}")) as endpoint,
+            # Taken before the barrier: locking memory may take a tenth of a second.
+            realtime(settings.enabled, settings.fifo_priority) as granted,
+        ):
+            channel = open_channel(endpoint, self.join(endpoint.getsockname()))
+            try:
+                run_loop(
+                    machine,
+                    channel,
+                    self.clock,
+                    telemetry,
+                    end_ns=self.scenario.horizon_ns + grace_ns,
+                    stop=lambda: self.stopping,
+                    spin_us=settings.spin_us,
+                )
+            finally:
+                telemetry.flush()
+                self.report = {
+                    "pid": os.getpid(),
+                    "ended": self.ended,
+                    "realtime": granted,
+                    "channel": channel.report(),
+                }
+                self._hand_over(telemetry)
+
+    @property
+    def ended(self) -> str:
+        """Why the process ended."""
+        return self._ended or HORIZON
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the process has been asked to end."""
+        return self._end_reason() is not None
+
+    def _end_reason(self) -> str | None:
+        if self._ended is None:
+            if self._signals.received is not None:
+                self._ended = signal.Signals(self._signals.received).name
+            elif (reason := self.plane.stop_requested()) is not None:
+                self._ended = reason
+            elif self.ticket.launched and _lifeline_cut():
+                self._ended = "the launcher is gone"
+        return self._ended
+
+    def _hand_over(self, telemetry: TelemetryBuffer) -> None:
+        self.report["rows"] = telemetry.totals()
+        timeout_s = 0.5 if self._ended == "the launcher is gone" else _GOODBYE_TIMEOUT_S
+        try:
+            for _ in range(3):
+                missing = self.plane.request("goodbye", self.report, timeout_s=timeout_s)
+                if not missing:
+                    return
+                telemetry.resend(missing, self.plane.publish_telemetry_blocking)
+        except PeerError:
+            pass
+        # No recorder, or one that does not take it: the run directory's spool does.
+        writer = SpoolWriter(Path(self.ticket.run_dir) / "spool", self.role)
+        everything = {table: [(0, rows)] for table, rows in telemetry.totals().items()}
+        telemetry.resend(
+            everything,
+            lambda table, header, payload: writer.append(
+                notices_of(self.role) if table == NOTICES else table, first_row(header), payload
+            ),
+        )
+        writer.close()
+
+
+def run_process(
+    role: str, body: Callable[[Node], None], session: str = DEFAULT_SESSION
+) -> ExitStatus:
+    """Join a run as ``role``, do ``body``, and return the exit status.
+
+    A mistake or a peer's fault becomes one line on standard error, with no traceback.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    with Signals().handled() as signals:
+        try:
+            ticket = _admission(role, session, signals)
+            with Plane(ticket.run_id, role, ticket.endpoint) as plane:
+                node = Node(role, ticket, plane, signals)
+                body(node)
+                plane.leave(node.ended)
+        except NoackError as error:
+            if signals.received is None:
+                print(f"noack {role}: {error}", file=sys.stderr)
+                return error.exit_status
+        except Exception:
+            traceback.print_exc()
+            print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
+            return ExitStatus.FAILED
+        return signals.status
+
+
+def main(
+    role: str,
+    body: Callable[[Node], None],
+    arguments: Sequence[str] | None = None,
+) -> ExitStatus:
+    """Command line of one process: ``python -m PACKAGE [--session NAME]``."""
+    parser = argparse.ArgumentParser(
+        prog=f"noack {role}",
+        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
+    )
+    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+    options = parser.parse_args(arguments)
+
+    def body_and_report(node: Node) -> None:
+        body(node)
+        if options.json:
+            print(json.dumps(node.report, indent=2))
+
+    return run_process(role, body_and_report, options.session)
+
+
+def _admission(role: str, session: str, signals: Signals) -> Ticket:
+    if os.environ.pop(TICKET_ON_STDIN, None):
+        return loads(sys.stdin.buffer.readline().decode())
+    ticket = wait_for_ticket(
+        session,
+        _MANUAL_JOIN_TIMEOUT_S,
+        lambda: signals.received is not None,
+        lambda path: print(
+            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r})",
+            file=sys.stderr,
+        ),
+    )
+    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
+    return ticket
+
+
+def _lifeline_cut() -> bool:
+    """Whether the launcher has closed our standard input, which it does only by ending."""
+    readable, _, _ = select.select([sys.stdin.fileno()], (), (), 0)
+    return bool(readable) and os.read(sys.stdin.fileno(), 1) == b""

@@ -1,0 +1,127 @@
+"""The ticket: what a process needs to join a run, handed over by the launcher.
+
+It holds the run's secret key, so it never travels on a command line or in the environment: the
+launcher writes it to its children's standard input. For processes that a person starts, it lies in
+a file that only its owner can read, in the user's runtime directory.
+"""
+
+import contextlib
+import json
+import os
+import secrets
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from noack.errors import CallerError, PeerError
+from noack.scenario import Scenario
+from noack.wire import KEY_BYTES
+
+DEFAULT_SESSION = "default"
+
+
+class Ticket(NamedTuple):
+    """Admission to a run."""
+
+    run_id: int
+    key: bytes
+    endpoint: str
+    """zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``."""
+    run_dir: str
+    launched: bool
+    """Whether a launcher holds the process's standard input as its lifeline."""
+    scenario: Scenario
+    """Resolved."""
+
+    def dumps(self) -> str:
+        """The ticket as one line of JSON."""
+        fields = self._asdict()
+        return json.dumps(
+            fields | {"key": self.key.hex(), "scenario": self.scenario.model_dump(mode="json")}
+        )
+
+
+def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
+    """Return a ticket with a fresh run id and key."""
+    return Ticket(
+        run_id=secrets.randbits(64),
+        key=secrets.token_bytes(KEY_BYTES),
+        endpoint=endpoint,
+        run_dir=str(run_dir),
+        launched=launched,
+        scenario=scenario,
+    )
+
+
+def loads(text: str) -> Ticket:
+    """Read a ticket back.
+
+    Raises:
+        CallerError: the text is not a ticket.
+    """
+    try:
+        fields: dict[str, Any] = json.loads(text)
+        fields["key"] = bytes.fromhex(fields["key"])
+        fields["scenario"] = Scenario.model_validate_json(json.dumps(fields["scenario"]))
+        return Ticket(**fields)
+    except (ValueError, TypeError, KeyError) as error:
+        raise CallerError(f"not a ticket of this version of noack: {error}") from None
+
+
+def ticket_path(session: str) -> Path:
+    """Where the ticket of a session lies that a person's processes join."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    folder = Path(base) if base else Path(tempfile.gettempdir())
+    return folder / f"noack-{os.getuid()}" / f"{session}.json"
+
+
+@contextmanager
+def published(ticket: Ticket, session: str) -> Iterator[Path]:
+    """Keep the ticket in its file, readable by its owner only, while the context lasts.
+
+    Raises:
+        CallerError: the folder is not the user's own.
+    """
+    path = ticket_path(session)
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    status = path.parent.stat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise CallerError(f"{path.parent}: must belong to you and be closed to others (mode 700)")
+    scratch = path.with_suffix(f".{os.getpid()}")
+    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(ticket.dumps())
+    scratch.replace(path)
+    try:
+        yield path
+    finally:
+        with contextlib.suppress(OSError):
+            if loads(path.read_text()).run_id == ticket.run_id:
+                path.unlink()
+
+
+def wait_for_ticket(
+    session: str, timeout_s: float, stop: Callable[[], bool], on_wait: Callable[[Path], None]
+) -> Ticket:
+    """Wait until a recorder or launcher has published the session's ticket, and return it.
+
+    Raises:
+        PeerError: none came in time.
+    """
+    path = ticket_path(session)
+    deadline_s = time.monotonic() + timeout_s
+    told = False
+    while True:
+        with contextlib.suppress(FileNotFoundError):
+            return loads(path.read_text())
+        if stop() or time.monotonic() > deadline_s:
+            raise PeerError(
+                f"no run to join in session {session!r}: start `noack record SCENARIO` first"
+            )
+        if not told:
+            on_wait(path)
+            told = True
+        time.sleep(0.05)

@@ -1,0 +1,166 @@
+"""UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
+
+import errno
+import socket
+from collections import Counter
+from contextlib import suppress
+
+from noack.errors import CallerError
+from noack.wire import Decoder, Encoder, Flow, Message
+
+Address = tuple[str, int]
+LOOPBACK = "127.0.0.1"
+
+# The default receive buffer holds 256 small datagrams; 4 MiB holds some 10,000. What overflows is
+# lost without a trace, and an unintended loss breaks the MANSD guarantee.
+_BUFFER_BYTES = 4 * 1024 * 1024
+_SO_RCVBUFFORCE = 33
+MAX_UDP_BYTES = 65_535
+
+
+def bind(port: int, who: str, key: str, host: str = LOOPBACK) -> socket.socket:
+    """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
+
+    Args:
+        port: the port.
+        who: the process, for the error message.
+        key: the scenario key or option that set the port, for the error message.
+        host: the local address.
+
+    Raises:
+        CallerError: the port is taken or not permitted.
+    """
+    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        endpoint.bind((host, port))
+    except OSError as error:
+        endpoint.close()
+        reason = {
+            errno.EADDRINUSE: "is already taken by another program",
+            errno.EACCES: "needs privileges that this user does not have",
+        }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
+        raise CallerError(
+            f"{who}: UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
+        ) from None
+    endpoint.setblocking(False)
+    enlarge_buffer(endpoint)
+    return endpoint
+
+
+def enlarge_buffer(endpoint: socket.socket) -> int:
+    """Ask for a 4 MiB receive buffer; return what the kernel granted, in bytes."""
+    try:
+        endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
+    except OSError:
+        with suppress(OSError):
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+    return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+
+
+def free_tcp_port(host: str = LOOPBACK) -> int:
+    """Return a TCP port that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
+    """Raise CallerError if a TCP port cannot be listened on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise CallerError(
+                f"control plane: TCP port {host}:{port} cannot be bound ({error.strerror}); "
+                f"set {key} to another port, or to 0 for any"
+            ) from None
+
+
+class MessageSocket:
+    """A process's one socket in the loop: receives one flow, sends another.
+
+    Args:
+        endpoint: a bound socket, from :func:`bind`.
+        decoder: takes the flow that the process receives.
+        encoder: makes the datagrams that it sends.
+        sends: the flow that it sends.
+        destination: where to.
+    """
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        decoder: Decoder,
+        encoder: Encoder,
+        sends: Flow,
+        destination: Address,
+    ) -> None:
+        self._endpoint = endpoint
+        self._decoder = decoder
+        self._encoder = encoder
+        self._sends = sends
+        self._destination = destination
+        self.received_from: Counter[Address] = Counter()
+        self.sent = 0
+        self.send_errors: Counter[str] = Counter()
+
+    def fileno(self) -> int:
+        """File descriptor to wait on."""
+        return self._endpoint.fileno()
+
+    def receive(self) -> Message | None:
+        """Take one datagram; None if there was none or it was rejected."""
+        try:
+            data, source = self._endpoint.recvfrom(MAX_UDP_BYTES)
+        except BlockingIOError:
+            return None
+        except OSError as error:  # an ICMP error of an earlier send is reported here
+            self.send_errors[str(error)] += 1
+            return None
+        self.received_from[source] += 1
+        return self._decoder.decode(data)
+
+    def send(self, message: Message) -> None:
+        """Send a message; a failure is counted, as nobody would learn of it anyway."""
+        if message.flow is not self._sends:
+            raise ValueError(f"this process sends {self._sends.name}, not {message.flow.name}")
+        try:
+            self._endpoint.sendto(self._encoder.encode(message), self._destination)
+            self.sent += 1
+        except OSError as error:
+            self.send_errors[str(error)] += 1
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        return {
+            "local": text_of(self._endpoint.getsockname()),
+            "sends": self._sends.name.lower(),
+            "destination": text_of(self._destination),
+            "sent": self.sent,
+            "send_errors": dict(self.send_errors),
+            "received_from": {text_of(peer): n for peer, n in self.received_from.items()},
+            "accepted": self._decoder.accepted,
+            "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
+        }
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._endpoint.close()
+
+
+def text_of(address: Address) -> str:
+    """``host:port`` of an address."""
+    return f"{address[0]}:{address[1]}"
+
+
+def parse_address(text: str, what: str) -> Address:
+    """Parse ``host:port``.
+
+    Raises:
+        CallerError: it is not of that form.
+    """
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdecimal() or int(port) > 65535:
+        raise CallerError(f"{what}: expected HOST:PORT, for example 127.0.0.1:9000; found {text!r}")
+    return host or LOOPBACK, int(port)

@@ -1,0 +1,354 @@
+"""The scenario: everything that defines a run, validated into frozen objects.
+
+A scenario file is TOML; every key is documented here and in the exported JSON Schema. Unknown keys
+are errors. :mod:`noack.resolve` turns a scenario into one in which nothing is left to chance.
+"""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    NonNegativeFloat,
+    PositiveFloat,
+    model_validator,
+)
+
+from noack.clock import NS_PER_S
+from noack.models import MODEL_PARAMETERS
+from noack.wire import MAX_DIMENSION
+
+Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**64)]
+Port = Annotated[int, Field(ge=0, le=65535)]
+RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
+
+
+class Section(BaseModel):
+    """A frozen table of the scenario file that knows all its keys."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
+
+
+def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
+    """Return (rows, columns) of a matrix given by rows.
+
+    Raises:
+        ValueError: the rows differ in length.
+    """
+    widths = {len(row) for row in rows}
+    if len(widths) > 1:
+        raise ValueError(f"{key}: all rows need the same length, found lengths {sorted(widths)}")
+    return len(rows), widths.pop()
+
+
+def require_shape(
+    rows: tuple[tuple[float, ...], ...], key: str, expected: tuple[int, int], why: str
+) -> None:
+    """Raise ValueError unless a matrix given by rows has the expected shape."""
+    found = shape(rows, key)
+    if found != expected:
+        raise ValueError(
+            f"{key}: expected {expected[0]} x {expected[1]} ({why}), found {found[0]} x {found[1]}"
+        )
+
+
+def period_ns(rate_hz: float) -> int:
+    """The period of a rate in nanoseconds; rates are validated to have a whole one."""
+    return round(NS_PER_S / rate_hz)
+
+
+def _require_whole_period(rate_hz: float, key: str) -> None:
+    whole_ns = period_ns(rate_hz)
+    if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-9 * rate_hz:
+        raise ValueError(
+            f"{key}: the period must be a whole number of nanoseconds; "
+            f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
+        )
+
+
+class Model(Section):
+    """What sensor and controller believe about the plant: Â, B̂, and the gain K of u = K x_c.
+
+    Either ``name`` (with optional ``parameters``) or the matrices ``A``, ``B`` and ``gain``.
+    """
+
+    name: Literal["lane_following", "double_integrator"] | None = None
+    """A named model; see noack/models.py."""
+    parameters: dict[str, FiniteFloat] = {}
+    """Parameters of the named model that differ from its defaults."""
+    A: Rows | None = None
+    """Â by rows, n x n, per second."""
+    B: Rows | None = None
+    """B̂ by rows, n x m."""
+    gain: Rows | None = None
+    """K by rows, m x n; a named model brings its own."""
+    state_names: tuple[str, ...] | None = None
+    """Names of the n states, for plots."""
+    input_names: tuple[str, ...] | None = None
+    """Names of the m inputs, for plots."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.name is not None:
+            if self.A is not None or self.B is not None:
+                raise ValueError(
+                    "name: a named model brings its own A and B; give one or the other"
+                )
+            known = MODEL_PARAMETERS[self.name]
+            for key in self.parameters:
+                if key not in known:
+                    raise ValueError(
+                        f"parameters.{key}: {self.name} has no such parameter; "
+                        f"it has {', '.join(known)}"
+                    )
+            return self
+        if self.parameters:
+            raise ValueError("parameters: only a named model has parameters")
+        if self.A is None or self.B is None or self.gain is None:
+            missing = [k for k in ("A", "B", "gain") if getattr(self, k) is None]
+            raise ValueError(
+                f"{missing[0]}: give a model by name, or by the matrices A, B and gain "
+                f"(missing: {', '.join(missing)})"
+            )
+        n = len(self.A)
+        require_shape(self.A, "A", (n, n), "the system matrix is square")
+        m = shape(self.B, "B")[1]
+        require_shape(self.B, "B", (n, m), "one row per state")
+        require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
+        for key, names, count in (
+            ("state_names", self.state_names, n),
+            ("input_names", self.input_names, m),
+        ):
+            if names is not None and len(names) != count:
+                raise ValueError(f"{key}: expected {count} names, found {len(names)}")
+        return self
+
+
+class Plant(Section):
+    """The true plant, unknown to sensor and controller, and how it is drawn."""
+
+    draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
+    """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
+    one end of its half-width; given: the matrices A and B below."""
+    uncertainty_A: Rows | None = None
+    """Half-widths of the uncertainty box around Â, n x n."""
+    uncertainty_B: Rows | None = None
+    """Half-widths of the uncertainty box around B̂, n x m."""
+    A: Rows | None = None
+    """The true A, n x n, for draw = "given"."""
+    B: Rows | None = None
+    """The true B, n x m, for draw = "given"."""
+    initial_state: Row
+    """x(0), n entries."""
+    initial_state_halfwidth: Row | None = None
+    """x(0) is drawn uniformly within these distances of initial_state; n entries."""
+    rate_hz: RateHz = 500.0
+    """Steps per second of simulated time."""
+    measure_every: Annotated[int, Field(ge=1)] = 1
+    """A measurement is sent every so many steps."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _require_whole_period(self.rate_hz, "rate_hz")
+        given = self.A is not None or self.B is not None
+        if self.draw == "given" and (self.A is None or self.B is None):
+            raise ValueError('A: draw = "given" needs both matrices A and B')
+        if self.draw != "given" and given:
+            raise ValueError(f'A: matrices are for draw = "given", not draw = "{self.draw}"')
+        if self.draw in ("uniform", "vertex") and not (self.uncertainty_A or self.uncertainty_B):
+            raise ValueError(
+                f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
+            )
+        for key in ("uncertainty_A", "uncertainty_B"):
+            rows = getattr(self, key)
+            if rows is not None and any(entry < 0 for row in rows for entry in row):
+                raise ValueError(f"{key}: half-widths cannot be negative")
+        if any(entry < 0 for entry in self.initial_state_halfwidth or ()):
+            raise ValueError("initial_state_halfwidth: half-widths cannot be negative")
+        return self
+
+
+class DecayingTrigger(Section):
+    """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)  (eq:thre)."""
+
+    policy: Literal["decaying"] = "decaying"
+    """The event-triggering policy."""
+    beta: PositiveFloat
+    """β, in the units of ‖W x‖."""
+    alpha_per_s: PositiveFloat
+    """α, per second."""
+    floor: NonNegativeFloat = 0.0
+    """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
+    weight: Rows | None = None
+    """W by rows, n x n, invertible; the identity unless given."""
+
+
+class Controller(Section):
+    """The controller's schedule."""
+
+    rate_hz: RateHz = 500.0
+    """Control inputs per second of simulated time."""
+    phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
+    """Offset of its ticks from the plant's, in periods; half a period lets a fresh update act
+    within the same period."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _require_whole_period(self.rate_hz, "rate_hz")
+        return self
+
+
+class Lossless(Section):
+    """Nothing is lost."""
+
+    model: Literal["lossless"]
+
+
+class Bernoulli(Section):
+    """Each datagram is lost independently."""
+
+    model: Literal["bernoulli"]
+    probability: Probability
+    """Probability of loss, before the MANSD cap."""
+
+
+class GilbertElliott(Section):
+    """Two-state Markov loss: a good and a bad state, each with its own loss probability."""
+
+    model: Literal["gilbert_elliott"]
+    good_to_bad: Probability
+    """Probability p of leaving the good state, per datagram."""
+    bad_to_good: Probability
+    """Probability r of leaving the bad state, per datagram."""
+    loss_in_good: Probability = 0.0
+    """Loss probability 1 − k in the good state."""
+    loss_in_bad: Probability = 1.0
+    """Loss probability 1 − h in the bad state."""
+
+
+class WorstCase(Section):
+    """Everything is lost that the MANSD allows to be lost."""
+
+    model: Literal["worst_case"]
+
+
+Loss = Annotated[Lossless | Bernoulli | GilbertElliott | WorstCase, Field(discriminator="model")]
+
+
+class Network(Section):
+    """The lossy network between sensor and controller."""
+
+    mansd: Annotated[int, Field(ge=0, le=1_000_000)]
+    """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
+    loss: Loss
+    """What is lost, before the cap."""
+    enforce_mansd: bool = True
+    """false: the network ignores the cap, to see what a violated assumption does."""
+    initial_sync: Literal["first_packet", "known_state"] = "first_packet"
+    """How the paper's delivered t_0 is met. first_packet: the network passes the first packet of a
+    flow. known_state: sensor and controller start from x(0)."""
+
+
+class Seeds(Section):
+    """Seeds of the named random streams; they are independent of each other."""
+
+    plant: Seed = 0
+    """Draw of the true plant from its uncertainty box."""
+    initial_state: Seed = 0
+    """Draw of x(0)."""
+    loss: Seed = 0
+    """The network's losses."""
+
+
+class Ports(Section):
+    """UDP ports on the loopback interface, and the control plane's TCP port; 0 takes a free one."""
+
+    plant: Port = 0
+    """Where the plant receives actuation."""
+    sensor: Port = 0
+    """Where the sensor receives measurements."""
+    netem: Port = 0
+    """Where the network takes the sensor's updates."""
+    controller: Port = 0
+    """Where the controller receives what survives."""
+    control: Port = 0
+    """TCP port of the zenoh control plane."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        taken: dict[int, str] = {}
+        for key in ("plant", "sensor", "netem", "controller"):
+            port = getattr(self, key)
+            if port and port in taken:
+                raise ValueError(f"{key}: port {port} is already given to {taken[port]}")
+            taken[port] = key
+        return self
+
+
+class Realtime(Section):
+    """Real-time settings of the loop's processes; each is taken where the system permits it."""
+
+    enabled: bool = True
+    """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
+    fifo_priority: Annotated[int, Field(ge=1, le=98)] = 50
+    """SCHED_FIFO priority."""
+    spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
+    """Busy-wait this long before each deadline; starves the others on a shared core."""
+
+
+class Scenario(Section):
+    """A run of the loop, completely described."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    """Names the run's directory: letters, digits, _ and -."""
+    description: str = ""
+    """What the scenario shows."""
+    mode: Literal["model", "zoh"] = "model"
+    """model: x_s and x_c follow Â + B̂K between updates; zoh: they hold the last update."""
+    horizon_s: Annotated[FiniteFloat, Field(gt=0, le=1e7)]
+    """Simulated length of the run."""
+    speed: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 1.0
+    """Simulated time per wall time."""
+    model: Model
+    plant: Plant
+    trigger: DecayingTrigger
+    network: Network
+    controller: Controller = Controller()
+    seeds: Seeds = Seeds()
+    ports: Ports = Ports()
+    realtime: Realtime = Realtime()
+
+    @property
+    def horizon_ns(self) -> int:
+        """Simulated length of the run in nanoseconds."""
+        return round(self.horizon_s * NS_PER_S)
+
+    @property
+    def plant_period_ns(self) -> int:
+        """Period of the plant's steps."""
+        return period_ns(self.plant.rate_hz)
+
+    @property
+    def controller_period_ns(self) -> int:
+        """Period of the controller's ticks."""
+        return period_ns(self.controller.rate_hz)
+
+    @property
+    def controller_phase_ns(self) -> int:
+        """Time of the controller's first tick."""
+        return round(self.controller.phase * self.controller_period_ns)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.horizon_ns < self.plant_period_ns:
+            raise ValueError(
+                f"horizon_s: shorter than one plant step ({self.plant_period_ns / NS_PER_S} s)"
+            )
+        return self

@@ -1,0 +1,1 @@
+"""Identities and bounds of the theory."""

@@ -1,0 +1,32 @@
+"""The picture: who sends which flow to whom. Nothing else is ever sent in the loop.
+
+plant ──measurement──▶ sensor ──update──▶ netem ──what survives──▶ controller
+▲                                                                    │
+└────────────────────────────── actuation ───────────────────────────┘
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from noack.wire import Flow
+
+
+class Leg(NamedTuple):
+    """What a process receives, and what it sends to whom."""
+
+    receives: Flow
+    sends: Flow
+    to: str
+
+
+LEGS: Mapping[str, Leg] = {
+    "plant": Leg(Flow.ACTUATION, Flow.MEASUREMENT, "sensor"),
+    "sensor": Leg(Flow.MEASUREMENT, Flow.UPDATE, "netem"),
+    "netem": Leg(Flow.UPDATE, Flow.UPDATE, "controller"),
+    "controller": Leg(Flow.UPDATE, Flow.ACTUATION, "plant"),
+}
+
+LOOP_ROLES = tuple(LEGS)
+RECORDER = "recorder"
+COORDINATOR = "coordinator"
+ROLES = (*LOOP_ROLES, RECORDER)

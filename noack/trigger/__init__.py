@@ -1,0 +1,1 @@
+"""Event-triggering policies, one per file."""

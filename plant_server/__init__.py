@@ -1,0 +1,1 @@
+"""The plant: owns the true state x."""

@@ -1,0 +1,1 @@
+"""The sensor: owns the model x_s and the trigger."""
