@@ -41,7 +41,7 @@ class Controller:
         mansd: int,
         x0: Vector | None = None,
     ) -> None:
-        self._propagate = Propagator(H)
+        self._propagate = Propagator(H, (period_ns, phase_ns, period_ns - phase_ns))
         self._K = K
         self._period_ns = period_ns
         self._phase_ns = phase_ns
@@ -53,7 +53,6 @@ class Controller:
         self._last_sequence = -1
         self._model_ns = 0
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
-        self._propagate.transition(period_ns)  # computed before the first deadline, not after it
 
     def next_deadline_ns(self) -> int | None:
         """Time of the next tick."""

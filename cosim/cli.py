@@ -1,11 +1,11 @@
 """The command line ``noack``."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, Any
 
-import click
 import typer
 from rich.console import Console
 
@@ -18,6 +18,7 @@ from noack.topology import RECORDER, ROLES
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     help="A laboratory for event-triggered control over lossy networks, without acknowledgements: "
     "real processes, real UDP sockets, at most M − 1 packets lost in a row.",
@@ -48,6 +49,24 @@ SessionOption = Annotated[
 DEFAULT_RUNS = Path("runs")
 
 
+def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Callable[..., None]]:
+    """Register a command; its result is the exit status, and a mistake becomes one line."""
+
+    def register(function: Callable[..., int]) -> Callable[..., None]:
+        @wraps(function)
+        def reported(*arguments: Any, **options: Any) -> None:
+            try:
+                status = function(*arguments, **options)
+            except NoackError as error:
+                status = _failed(str(error), error.exit_status)
+            raise typer.Exit(int(status))
+
+        registered: Callable[..., None] = app.command(rich_help_panel=panel, **settings)(reported)
+        return registered
+
+    return register
+
+
 def find_scenario(name: str) -> Path:
     """Return the path of a scenario given by path, or by the name of a shipped one."""
     path = Path(name)
@@ -56,14 +75,15 @@ def find_scenario(name: str) -> Path:
     here = Path(__file__).parent
     for folder in (here.parent / "scenarios", here / "scenarios"):
         if (shipped := folder / f"{name}.toml").is_file():
-            return shipped
+            inside = shipped.is_relative_to(Path.cwd())
+            return shipped.relative_to(Path.cwd()) if inside else shipped
         if folder.is_dir() and not path.parent.name:
             names = ", ".join(sorted(file.stem for file in folder.glob("*.toml")))
             raise CallerError(f"{name}: no such file, nor a shipped scenario; there are {names}")
     return path
 
 
-@app.command(rich_help_panel=_RUNS)
+@command(_RUNS)
 def run(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -76,7 +96,7 @@ def run(
     return _run(loaded, runs, ROLES, None, live=live, json=json)
 
 
-@app.command(rich_help_panel=_RUNS)
+@command(_RUNS)
 def demo(
     zoh: Annotated[bool, typer.Option("--zoh", help="Hold the last update; no model.")] = False,
     settings: SetOption = None,
@@ -90,7 +110,7 @@ def demo(
     return _run(loaded, runs, ROLES, None, live=live, json=json)
 
 
-@app.command(rich_help_panel=_RUNS)
+@command(_RUNS)
 def view(
     recording: Annotated[
         Path | None, typer.Argument(help="A run directory or .rrd file; by default the last run.")
@@ -112,7 +132,7 @@ def view(
     return ExitStatus.OK
 
 
-@app.command(rich_help_panel=_RUNS)
+@command(_RUNS)
 def summary(
     run_dir: Annotated[
         Path | None, typer.Argument(help="A run directory; by default the last run.")
@@ -132,7 +152,7 @@ def summary(
     return ExitStatus.OK
 
 
-@app.command(rich_help_panel=_PROCESSES)
+@command(_PROCESSES)
 def record(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -146,7 +166,7 @@ def record(
     return _run(loaded, runs, (RECORDER,), session, live=live, json=json)
 
 
-@app.command(rich_help_panel=_PROCESSES)
+@command(_PROCESSES)
 def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the plant: owns the true state, sends measurements."""
     from plant_server.__main__ import main
@@ -154,7 +174,7 @@ def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
     return main(_process_arguments(session, json=json))
 
 
-@app.command(rich_help_panel=_PROCESSES)
+@command(_PROCESSES)
 def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
     from sensor_node.__main__ import main
@@ -162,7 +182,7 @@ def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
     return main(_process_arguments(session, json=json))
 
 
-@app.command(rich_help_panel=_PROCESSES)
+@command(_PROCESSES)
 def controller(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the controller: runs x_c, sends u = K x_c."""
     from controller_node.__main__ import main
@@ -170,8 +190,8 @@ def controller(session: SessionOption = "default", json: JsonOption = False) -> 
     return main(_process_arguments(session, json=json))
 
 
-@app.command(
-    rich_help_panel=_PROCESSES,
+@command(
+    _PROCESSES,
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     add_help_option=False,
 )
@@ -182,7 +202,7 @@ def netem(context: typer.Context) -> int:
     return main(context.args)
 
 
-@app.command(rich_help_panel=_FILES)
+@command(_FILES)
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
     """Check a scenario and print it resolved: defaults, named models and draws made explicit."""
     from noack.resolve import resolve
@@ -195,7 +215,7 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
     return ExitStatus.OK
 
 
-@app.command(rich_help_panel=_FILES)
+@command(_FILES)
 def schema(json: JsonOption = False) -> int:
     """Print the JSON Schema of scenario files, for editors."""
     _print_json(json_schema())
@@ -233,26 +253,17 @@ def _print_json(document: object) -> None:
     print_json(document)
 
 
-def main() -> NoReturn:
-    """Entry point; a mistake becomes one line and a non-zero exit status."""
-    try:
-        status = app(standalone_mode=False)
-    except NoackError as error:
-        status = _failed(str(error), error.exit_status)
-    except click.UsageError as error:
-        error.show()
-        status = _failed("", ExitStatus.CALLER)
-    except click.exceptions.Abort:
-        status = ExitStatus.INTERRUPTED
-    sys.exit(int(status or 0))
-
-
 def _failed(message: str, status: ExitStatus) -> ExitStatus:
     if "--json" in sys.argv:
         _print_json({"error": message, "exit": {"status": int(status), "reason": message}})
     for line in message.splitlines():
         print(f"noack: {line}", file=sys.stderr)
     return status
+
+
+def main() -> None:
+    """Entry point."""
+    app()
 
 
 if __name__ == "__main__":

@@ -38,6 +38,7 @@ class Coordinator:
         self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
         self._waiting: dict[str, tuple[zenoh.Query, dict[str, Any]]] = {}
         self._vanished_s: dict[str, float] = {}
+        self._stopped: str | None = None
         self.left: dict[str, str] = {}
         """Why each process that has left did so."""
         self.epoch_ns: int | None = None
@@ -51,6 +52,9 @@ class Coordinator:
         """Handle whatever has arrived; call often."""
         while (query := self._joins.try_recv()) is not None:
             role = _role(query.key_expr)
+            if self._stopped is not None:
+                self.plane.refuse(query, self._stopped)
+                continue
             payload = query.payload.to_string() if query.payload is not None else "{}"
             if role in ROLES and self.epoch_ns is None:
                 self._waiting[role] = (query, json.loads(payload))
@@ -64,8 +68,16 @@ class Coordinator:
                 self._vanished_s.setdefault(role, time.monotonic())
             else:
                 self._vanished_s.pop(role, None)
-        if self.epoch_ns is None and not self.missing():
+        if self.epoch_ns is None and self._stopped is None and not self.missing():
             self._start()
+
+    def stop(self, reason: str) -> None:
+        """End the run for everyone, also for those who are still on their way to the barrier."""
+        self._stopped = reason
+        self.plane.request_stop(reason)
+        if self.epoch_ns is None:
+            for query, _ in self._waiting.values():
+                self.plane.refuse(query, reason)
 
     def missing(self) -> tuple[str, ...]:
         """Roles that have not arrived at the start barrier."""

@@ -224,7 +224,7 @@ class _Run:
                 if verdict is None and now_s > patience_s:
                     verdict = (ExitStatus.FAILED, "the run did not end at its horizon")
                 if verdict is not None:
-                    coordinator.plane.request_stop(verdict[1])
+                    coordinator.stop(verdict[1])
                     patience_s = now_s + _STOP_PATIENCE_S
             elif now_s > patience_s:
                 break

@@ -31,7 +31,7 @@ RECORDING = "/recording.rrd"
 
 _BLOCK = 1 << 18
 _POLL_S = 0.1
-_START_S = 15.0
+_START_S = 10.0
 _DRAIN_S = 2.0
 _PATIENCE_S = 5.0
 _WINDOW = "window"
@@ -274,11 +274,16 @@ class _Handler(BaseHTTPRequestHandler):
         """Say nothing."""
 
     def _send_recording(self, recording: RecordingServer) -> None:
-        self.send_response(200)
-        self.send_header("Content-Type", "application/octet-stream")
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        with recording.download(), recording.path.open("rb") as file:
+        try:
+            file = recording.path.open("rb")
+        except OSError:
+            self.send_error(404)
+            return
+        with file, recording.download():
+            self.send_response(200)
+            self.send_header("Content-Type", "application/octet-stream")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
             while True:
                 # Asked before reading, so that what was written before it was set is still sent.
                 finished = recording.finished.is_set()
@@ -323,7 +328,7 @@ def _start_viewer(
 ) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
         [_viewer_program(), *arguments],
-        env=os.environ | {"CI": "1"},  # it asks nothing and reports nothing
+        env=os.environ | {"CI": "1"},  # keeps it quiet
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

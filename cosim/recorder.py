@@ -23,7 +23,7 @@ from cosim.record import (
 from cosim.view import RunView, ViewError
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
-from noack.io.node import Node, run_process
+from noack.io.node import LAUNCHER_GONE, Node, run_process
 from noack.io.plane import Plane
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import NOTICES, first_row, notices_of
@@ -111,6 +111,10 @@ class Recorder:
             except ViewError as error:
                 self._give_up_view(error)
         return record
+
+    def abandon(self) -> None:
+        """Keep what was spooled, unfinished."""
+        self._spool.close()
 
     @property
     def view_is_incomplete(self) -> bool:
@@ -254,6 +258,11 @@ def _record(node: Node, *, live: bool) -> None:
             recorder.show()
             shown_s = now_s
         if node.stopping:
+            if node.ended == LAUNCHER_GONE:
+                # The others spool their own last rows now; `noack summary` finishes the record.
+                recorder.abandon()
+                view.close()
+                return
             stop_s = stop_s or now_s
             if now_s - stop_s > _STOP_PATIENCE_S:
                 break

@@ -36,7 +36,7 @@ class RunView:
     """Writes ``recording.rrd``; every method takes batches of one kind, ordered in time.
 
     Times are int64 nanoseconds of simulated time since the run's epoch. Data is handed to the
-    operating system as it comes, so the file is readable while it grows and after a crash.
+    operating system as it comes, so the file can be shown while it grows and after a crash.
 
     Args:
         path: the file to write; replaced if it exists.

@@ -5,6 +5,7 @@ matrix, bit for bit, whether it was cached or not.
 """
 
 import math
+from collections.abc import Iterable
 from functools import lru_cache, partial
 
 import numpy as np
@@ -46,12 +47,15 @@ class Propagator:
 
     Args:
         generator: G, shape (n, n), per second.
+        steps_ns: steps to prepare now, so that a loop need not at its first deadlines.
     """
 
-    def __init__(self, generator: Matrix) -> None:
+    def __init__(self, generator: Matrix, steps_ns: Iterable[int] = ()) -> None:
         self.generator = np.array(generator, dtype=np.float64)
         self._static = not self.generator.any()
         self.transition = lru_cache(_CACHED_STEPS)(partial(transition, self.generator))
+        for step_ns in steps_ns:
+            self.transition(step_ns)
 
     def __call__(self, state: Vector, dt_ns: int) -> Vector:
         """Return e^{G dt} ``state``, shape (n,)."""

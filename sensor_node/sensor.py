@@ -26,10 +26,18 @@ class Sensor:
         trigger: the event-triggering policy.
         x0: the state that sensor and controller both know at t = 0; None if they do not, in which
             case the first measurement is an event.
+        period_ns: expected time between measurements, to prepare for; others are taken as well.
     """
 
-    def __init__(self, H: Matrix, trigger: DecayingTrigger, x0: Vector | None = None) -> None:
-        self._propagate = Propagator(H)
+    def __init__(
+        self,
+        H: Matrix,
+        trigger: DecayingTrigger,
+        x0: Vector | None = None,
+        *,
+        period_ns: int | None = None,
+    ) -> None:
+        self._propagate = Propagator(H, () if period_ns is None else (period_ns,))
         self._trigger = trigger
         self._model_ns = 0
         self._inputs = 0
@@ -75,4 +83,5 @@ def sensor_of(resolved: Scenario) -> Sensor:
         loop.H,
         DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, loop.weight),
         loop.x0 if known else None,
+        period_ns=resolved.plant_period_ns * resolved.plant.measure_every,
     )

@@ -31,7 +31,7 @@ from noack.io.udp import Address, MessageSocket, bind
 from noack.machine import Machine
 from noack.records import OWNER, tables
 from noack.resolve import Loop, loop_of
-from noack.topology import LEGS
+from noack.topology import LEGS, RECORDER
 from noack.wire import Decoder, Encoder, Flow, Message
 
 T = TypeVar("T")
@@ -44,6 +44,8 @@ _GRACE_S = 0.15
 
 HORIZON = "horizon"
 """Why a process ends that has done its work."""
+LAUNCHER_GONE = "the launcher is gone"
+"""Why a process ends whose launcher has died."""
 
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 
@@ -200,15 +202,15 @@ class Node:
             elif (reason := self.plane.stop_requested()) is not None:
                 self._ended = reason
             elif self.ticket.launched and _lifeline_cut():
-                self._ended = "the launcher is gone"
+                self._ended = LAUNCHER_GONE
         return self._ended
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
         self.report["rows"] = telemetry.totals()
-        timeout_s = 0.5 if self._ended == "the launcher is gone" else _GOODBYE_TIMEOUT_S
+        reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
         try:
-            for _ in range(3):
-                missing = self.plane.request("goodbye", self.report, timeout_s=timeout_s)
+            for _ in range(3 if reachable else 0):
+                missing = self.plane.request("goodbye", self.report, timeout_s=_GOODBYE_TIMEOUT_S)
                 if not missing:
                     return
                 telemetry.resend(missing, self.plane.publish_telemetry_blocking)

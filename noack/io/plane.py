@@ -34,6 +34,8 @@ def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
         # Its shared-memory path would take payloads of 3 KiB and more past the socket.
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": _LEASE_MS,
+        # A batch that finds no room is dropped at once; the loop does not wait for it.
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

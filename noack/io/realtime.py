@@ -10,6 +10,7 @@ import gc
 import os
 import struct
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,7 +55,16 @@ def _attempt(take: object) -> str:
 def _fifo(priority: int, undo: contextlib.ExitStack) -> None:
     if sys.platform != "linux":
         raise OSError(0, "not available on this system")
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    loop = threading.get_native_id()
+    # The other threads (zenoh's) share locks with the loop; left at normal priority, one that is
+    # preempted while it holds a lock would keep the loop waiting for milliseconds.
+    for task in Path("/proc/self/task").iterdir():
+        thread = int(task.name)
+        rank = priority if thread == loop else priority - 1
+        with (
+            contextlib.nullcontext() if thread == loop else contextlib.suppress(ProcessLookupError)
+        ):
+            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
     undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
 
 

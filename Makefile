@@ -1,0 +1,108 @@
+# noack: `make demo` and `make test` need nothing but Python >= 3.11; `make help` explains the rest.
+
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes
+EDITABLE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+
+SCENARIO ?= scenarios/lane_following.toml
+SESSION ?= default
+ARGS ?=
+LIVE ?=
+override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
+
+.PHONY: help
+help: ## Explain the targets
+	@awk 'BEGIN {FS = ":.*## "} /^##@/ {printf "\n%s\n", substr($$0, 5)} \
+		/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
+
+##@ Run
+.PHONY: demo demo-zoh run view summary
+demo: setup ## Run the paper's lane-following example live (20 s)
+	@$(BIN)/noack demo $(FLAGS)
+
+demo-zoh: setup ## The same with zero-order hold instead of a model
+	@$(BIN)/noack demo --zoh $(FLAGS)
+
+run: setup ## Run SCENARIO=FILE, all processes at once
+	@$(BIN)/noack run $(SCENARIO) $(FLAGS)
+
+view: setup ## Open the last recording in the rerun viewer
+	@$(BIN)/noack view $(ARGS)
+
+summary: setup ## Show the last run's summary again
+	@$(BIN)/noack summary $(ARGS)
+
+##@ Five terminals, one process each (start `make record` in one, the others in any order)
+.PHONY: record plant sensor controller netem
+record: setup ## Open a run of SCENARIO and record it
+	@$(BIN)/noack record $(SCENARIO) --session $(SESSION) $(FLAGS)
+
+plant: setup ## The plant: owns the true state x
+	@$(BIN)/noack plant --session $(SESSION) $(ARGS)
+
+sensor: setup ## The sensor: owns the model x_s and the trigger
+	@$(BIN)/noack sensor --session $(SESSION) $(ARGS)
+
+controller: setup ## The controller: owns the model x_c, sends u = K x_c
+	@$(BIN)/noack controller --session $(SESSION) $(ARGS)
+
+netem: setup ## The network: loses packets, at most M - 1 in a row
+	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
+
+##@ Work on noack
+.PHONY: setup setup-dev test check format bench schema lock clean
+setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
+
+setup-dev: $(VENV)/.installed-dev
+
+test: setup-dev check ## Lint, types, import rules, and all tests
+	$(BIN)/python -m pytest $(ARGS)
+
+check: setup-dev ## Lint, format, strict types, import rules
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup-dev ## Format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: setup-dev ## Measure against the alternatives, in one run; prints tables
+	$(BIN)/python -m benchmarks $(ARGS)
+
+schema: setup ## Write the JSON Schema of scenario files to docs/
+	$(BIN)/noack schema > docs/scenario.schema.json
+
+lock: setup-dev ## Pin the dependencies anew
+	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header pyproject.toml --group build -o requirements.lock
+	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
+		--no-header pyproject.toml --group build --group dev -c requirements.lock -o requirements-dev.lock
+
+clean: ## Remove the environment and caches; keep runs/
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }
+	@echo "making $(VENV) with $(PYTHON) ..."
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
+		echo "noack needs Python's venv module (Debian: apt-get install python3-venv)" >&2; exit 2; }
+
+$(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
+	@echo "installing pinned dependencies ..."
+	@$(PIP) -r requirements.lock
+	@$(EDITABLE)
+	@touch $@
+
+$(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed
+	@echo "installing development tools ..."
+	@$(PIP) -r requirements-dev.lock
+	@touch $@

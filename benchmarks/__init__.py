@@ -1,0 +1,1 @@
+"""Benchmarks: each measures an alternative in the same run, so that noise hits both alike."""

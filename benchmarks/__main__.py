@@ -1,0 +1,10 @@
+"""All benchmarks, one table each: ``python -m benchmarks [--json FILE] [--install]``."""
+
+import sys
+
+from benchmarks import demo_run, lateness, latency, machines, startup
+from benchmarks._report import run
+
+if __name__ == "__main__":
+    modules = (demo_run, latency, lateness, startup, machines)
+    sys.exit(run([module.BENCHMARK for module in modules]))

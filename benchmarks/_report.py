@@ -1,0 +1,239 @@
+"""Rows, tables and JSON of the benchmarks, and how busy the machine was meanwhile."""
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+BUSY_SHARE = 0.1
+"""Other programs' share of all cores from which figures are called doubtful."""
+STEAL_SHARE = 0.01
+"""Share of all cores taken by the hypervisor from which figures are called doubtful."""
+
+_TABLE_WIDTH = 130
+"""Of a table that does not go to a terminal."""
+
+_COMPARISONS: dict[str, Callable[[float, float], bool]] = {
+    "<=": lambda found, limit: found <= limit,
+    "<": lambda found, limit: found < limit,
+    ">=": lambda found, limit: found >= limit,
+    "==": lambda found, limit: found == limit,
+}
+
+
+class MeasurementError(Exception):
+    """A benchmark could not be carried out; says why in one line."""
+
+
+class Peer(NamedTuple):
+    """The alternative that was measured in the same run."""
+
+    name: str
+    value: float | None
+
+
+class Goal(NamedTuple):
+    """A figure to reach."""
+
+    comparison: str
+    limit: float
+
+    def holds(self, found: float) -> bool:
+        """Whether ``found`` reaches the goal."""
+        return _COMPARISONS[self.comparison](found, self.limit)
+
+    def __str__(self) -> str:
+        return f"{self.comparison} {self.limit:g}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure.
+
+    Args:
+        name: what was measured.
+        value: the figure; None if it could not be measured.
+        unit: its unit.
+        peer: the alternative, in the same unit.
+        goal: what the ratio to the peer has to satisfy; without a peer, the value itself.
+        note: anything a reader has to know.
+        unjudged: why the goal cannot be judged although there is a figure.
+    """
+
+    name: str
+    value: float | None
+    unit: str
+    peer: Peer | None = None
+    goal: Goal | None = None
+    note: str | None = None
+    unjudged: str | None = None
+
+    @property
+    def ratio(self) -> float | None:
+        """Our value per the peer's."""
+        if self.value is None or self.peer is None or not self.peer.value:
+            return None
+        return self.value / self.peer.value
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the goal was reached; None if there is none or it cannot be judged."""
+        found = self.value if self.peer is None else self.ratio
+        if self.goal is None or found is None or self.unjudged is not None:
+            return None
+        return self.goal.holds(found)
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as written by ``--json``."""
+        row: dict[str, Any] = {
+            "name": self.name,
+            "value": self.value,
+            "unit": self.unit,
+            "peer": None if self.peer is None else self.peer._asdict(),
+            "ratio": self.ratio,
+            "goal": None if self.goal is None else str(self.goal),
+            "holds": self.holds,
+        }
+        notes = [text for text in (self.unjudged, self.note) if text]
+        return row | ({"note": "; ".join(notes)} if notes else {})
+
+
+class CpuTimes(NamedTuple):
+    """CPU seconds of all cores since boot."""
+
+    total_s: float
+    busy_s: float
+    steal_s: float
+
+
+def cpu_times(stat: str) -> CpuTimes:
+    """CPU times from the content of ``/proc/stat``; guests are counted as user time already."""
+    ticks = [int(field) for field in stat.splitlines()[0].split()[1:9]]
+    user, nice, system, idle, iowait, irq, softirq, steal = ticks
+    busy = user + nice + system + irq + softirq
+    per_s = os.sysconf("SC_CLK_TCK")
+    return CpuTimes((busy + idle + iowait + steal) / per_s, busy / per_s, steal / per_s)
+
+
+class Load:
+    """How busy the machine was with other programs from its construction on."""
+
+    def __init__(self) -> None:
+        self._before = self._read()
+
+    def rows(self) -> list[Row]:
+        """Shares of all cores that went to other programs and to the hypervisor."""
+        if self._before is None or (now := self._read()) is None:
+            return []
+        (before, own_before_s), (after, own_after_s) = self._before, now
+        total_s = max(after.total_s - before.total_s, 1e-9)
+        others_s = after.busy_s - before.busy_s - (own_after_s - own_before_s)
+        return [
+            _share("machine: other programs", max(others_s, 0.0) / total_s, BUSY_SHARE),
+            _share("machine: steal", (after.steal_s - before.steal_s) / total_s, STEAL_SHARE),
+        ]
+
+    @staticmethod
+    def _read() -> tuple[CpuTimes, float] | None:
+        path = Path("/proc/stat")
+        if not path.is_file():
+            return None
+        used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return cpu_times(path.read_text()), sum(usage.ru_utime + usage.ru_stime for usage in used)
+
+
+def _share(name: str, share: float, doubtful: float) -> Row:
+    doubt = "the machine was busy: figures are doubtful" if share > doubtful else None
+    return Row(name, 100 * share, "% of all cores", note=doubt)
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark as the command line knows it.
+
+    Args:
+        name: its file's name.
+        title: title of its table.
+        measure: carries it out and returns its rows.
+        add_arguments: declares options of its own.
+    """
+
+    name: str
+    title: str
+    measure: Callable[[argparse.Namespace], list[Row]]
+    add_arguments: Callable[[argparse.ArgumentParser], None] = lambda parser: None
+
+
+def median(values: Iterable[float]) -> float:
+    """Median over rounds."""
+    return statistics.median(values)
+
+
+def say(text: str) -> None:
+    """Tell a waiting person what is being measured."""
+    print(f"  {text} ...", file=sys.stderr, flush=True)
+
+
+def table_of(title: str, rows: Sequence[Row]) -> Table:
+    """The rows as a table."""
+    table = Table(title=title, title_justify="left")
+    for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
+        right = heading in ("value", "its value", "ratio", "goal")
+        table.add_column(heading, justify="right" if right else "left")
+    for row in rows:
+        goal = "" if row.goal is None else str(row.goal)
+        holds = {True: "[green]yes[/]", False: "[bold red]no[/]", None: "?" if goal else ""}
+        table.add_row(
+            row.name, f"{_number(row.value)} {row.unit}",
+            "" if row.peer is None else row.peer.name,
+            "" if row.peer is None else f"{_number(row.peer.value)} {row.unit}",
+            "" if row.ratio is None else _number(row.ratio),
+            goal, holds[row.holds],
+        )  # fmt: skip
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
+    """Command line of one or more benchmarks; 0 if all of them could be carried out."""
+    parser = argparse.ArgumentParser(
+        description="Measure " + ", ".join(benchmark.title for benchmark in benchmarks) + "."
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
+    for benchmark in benchmarks:
+        benchmark.add_arguments(parser)
+    options = parser.parse_args(arguments)
+    console = Console()
+    if not console.is_terminal:
+        console.width = _TABLE_WIDTH
+    everything, failures = [], 0
+    for benchmark in benchmarks:
+        print(f"{benchmark.name}:", file=sys.stderr)
+        load, begun_s = Load(), time.monotonic()
+        try:
+            rows = benchmark.measure(options)
+        except MeasurementError as error:
+            failures += 1
+            rows = [Row(benchmark.name, None, "", unjudged=f"could not be measured: {error}")]
+        rows += load.rows()
+        console.print(table_of(f"{benchmark.title} ({time.monotonic() - begun_s:.0f} s)", rows))
+        for row in rows:
+            if (note := row.as_json().get("note")) is not None:
+                console.print(f"{row.name}: {note}", highlight=False, markup=False)
+        everything += [row.as_json() | {"benchmark": benchmark.name} for row in rows]
+    if options.json is not None:
+        options.json.write_text(json.dumps(everything, indent=2, allow_nan=False) + "\n")
+    return 1 if failures else 0

@@ -1,0 +1,158 @@
+"""Loops that tick at a fixed rate and note how late each tick is: ours and two alternatives."""
+
+import argparse
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks._report import MeasurementError
+from noack.clock import RunClock
+from noack.io.loop import run_loop
+from noack.io.realtime import realtime
+from noack.io.udp import bind
+from noack.machine import Notice, Record
+
+FIFO_PRIORITY = 50
+
+
+class Ticks(NamedTuple):
+    """Lateness of a session's ticks, µs."""
+
+    p50_us: float
+    p99_us: float
+    max_us: float
+    granted: dict[str, str]
+
+
+def ticks(kind: str, seconds: float, period_us: int, *, asked: bool) -> Ticks:
+    """Run a loop in a process of its own.
+
+    Args:
+        kind: one of LOOPS.
+        seconds: how long.
+        period_us: time between two ticks.
+        asked: whether it asks for the real-time settings.
+
+    Raises:
+        MeasurementError: the process failed.
+    """
+    command = [
+        sys.executable, "-m", "benchmarks._ticks", kind,
+        "--count", str(round(seconds * 1e6 / period_us)), "--period-us", str(period_us),
+        *(("--realtime",) if asked else ()),
+    ]  # fmt: skip
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode != 0:
+        raise MeasurementError(f"the {kind} loop ended with {done.returncode}")
+    return Ticks(*json.loads(done.stdout))
+
+
+class _Ticker:
+    """A machine that does nothing but note its lateness."""
+
+    def __init__(self, count: int, period_ns: int) -> None:
+        self.late_ns: list[int] = []
+        self._count = count
+        self._period_ns = period_ns
+        self._due_ns = period_ns
+
+    def next_deadline_ns(self) -> int | None:
+        return self._due_ns if len(self.late_ns) < self._count else None
+
+    def on_timer(self, now_ns: int) -> Sequence[Record | Notice]:
+        self.late_ns.append(now_ns - self._due_ns)
+        self._due_ns += self._period_ns
+        return ()
+
+    def handle(self, message: Record, now_ns: int) -> Sequence[Record | Notice]:
+        return ()
+
+
+class _Nowhere:
+    """Takes what the ticker never puts out."""
+
+    def append(self, record: Record) -> None: ...
+    def notice(self, notice: Notice) -> None: ...
+    def flush(self) -> None: ...
+
+
+class _Silence:
+    """A socket that nothing is sent to."""
+
+    def __init__(self) -> None:
+        self._endpoint = bind(0, "benchmark", "port")
+
+    def fileno(self) -> int:
+        return self._endpoint.fileno()
+
+    def receive(self) -> Record | None:
+        return None
+
+    def send(self, message: Record) -> None: ...
+
+
+def _run_loop(count: int, period_ns: int) -> list[int]:
+    ticker = _Ticker(count, period_ns)
+    clock = RunClock(time.monotonic_ns())
+    end_ns = (count + 1) * period_ns
+    run_loop(ticker, _Silence(), clock, _Nowhere(), end_ns=end_ns, stop=lambda: False)
+    return ticker.late_ns
+
+
+def _time_sleep(count: int, period_ns: int) -> list[int]:
+    late_ns = []
+    begin_ns = time.monotonic_ns()
+    for number in range(1, count + 1):
+        due_ns = begin_ns + number * period_ns
+        time.sleep(max(due_ns - time.monotonic_ns(), 0) * 1e-9)
+        late_ns.append(time.monotonic_ns() - due_ns)
+    return late_ns
+
+
+def _asyncio(count: int, period_ns: int) -> list[int]:
+    late_ns: list[int] = []
+    loop = asyncio.new_event_loop()  # its time is the monotonic clock's
+    begin_ns = time.monotonic_ns()
+
+    def tick() -> None:
+        late_ns.append(time.monotonic_ns() - begin_ns - (len(late_ns) + 1) * period_ns)
+        if len(late_ns) == count:
+            loop.stop()
+        else:
+            loop.call_at((begin_ns + (len(late_ns) + 1) * period_ns) * 1e-9, tick)
+
+    loop.call_at((begin_ns + period_ns) * 1e-9, tick)
+    loop.run_forever()
+    loop.close()
+    return late_ns
+
+
+LOOPS: dict[str, Callable[[int, int], list[int]]] = {
+    "run_loop": _run_loop,
+    "time.sleep": _time_sleep,
+    "asyncio": _asyncio,
+}
+
+
+def main() -> None:
+    """Run one loop and print its lateness."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=LOOPS)
+    parser.add_argument("--count", type=int, default=1000)
+    parser.add_argument("--period-us", type=int, default=1000)
+    parser.add_argument("--realtime", action="store_true")
+    options = parser.parse_args()
+    with realtime(options.realtime, FIFO_PRIORITY) as granted:
+        late_ns = LOOPS[options.kind](options.count, options.period_us * 1000)
+    p50_ns, p99_ns, max_ns = np.quantile(late_ns, [0.5, 0.99, 1.0])
+    print(json.dumps([p50_ns / 1e3, p99_ns / 1e3, max_ns / 1e3, granted]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,127 @@
+"""Lateness of a 1 kHz loop of ours, against cyclictest, asyncio and ``time.sleep``.
+
+cyclictest (Debian: rt-tests) is the kernel's own measure: a C loop on ``clock_nanosleep`` with
+SCHED_FIFO, locked memory and no deep idle states; the settings that our processes ask for. Where
+SCHED_FIFO is refused there is no such comparison and the goal is not judged.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from benchmarks._ticks import FIFO_PRIORITY, LOOPS, Ticks, ticks
+
+ROUNDS = 5
+ROUND_S = 2
+PERIOD_US = 1000
+GOAL = Goal("<=", 1.5)
+_HISTOGRAM_US = 20_000
+
+
+def quantile_of(histogram: Mapping[int, int], share: float) -> float:
+    """Quantile of a histogram with bins of 1 µs: the middle of the bin that it falls in."""
+    rank = share * sum(histogram.values())
+    seen = 0
+    for low_us, count in sorted(histogram.items()):
+        seen += count
+        if seen >= rank:
+            return low_us + 0.5
+    raise ValueError("an empty histogram has no quantiles")
+
+
+def cyclictest() -> tuple[float, float] | str:
+    """Lateness p50 and p99 in µs of a round of cyclictest, or why there is none."""
+    program = shutil.which("cyclictest")
+    if program is None:
+        return "cyclictest is not installed (Debian: apt-get install rt-tests)"
+    with tempfile.TemporaryDirectory() as folder:
+        found = Path(folder) / "cyclictest.json"
+        command = [
+            program, "-m", "-q", "-p", str(FIFO_PRIORITY), "-i", str(PERIOD_US),
+            "-D", str(ROUND_S), "-h", str(_HISTOGRAM_US), f"--json={found}",
+        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0 or not found.is_file():
+            said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
+            return f"cyclictest failed, said {said!r}"
+        counts = json.loads(found.read_text())["thread"]["0"]["histogram"]
+    histogram = {int(low_us): int(count) for low_us, count in counts.items()}
+    return quantile_of(histogram, 0.5), quantile_of(histogram, 0.99)
+
+
+def rows_of(
+    loops: Mapping[tuple[str, bool], list[Ticks]],
+    cyclic: list[tuple[float, float]],
+    no_cyclictest: str | None,
+) -> list[Row]:
+    """Return the rows from all rounds.
+
+    Args:
+        loops: by loop and whether it asked for the real-time settings, its rounds.
+        cyclic: cyclictest's rounds, p50 and p99.
+        no_cyclictest: why there are none.
+    """
+    ours = loops["run_loop", True]
+    fifo = ours[0].granted["sched_fifo"]
+    unjudged = no_cyclictest or (None if fifo == "granted" else f"SCHED_FIFO {fifo}")
+    rows = []
+    for index, quantile in enumerate(("p50", "p99")):
+        value = median(t[index] for t in cyclic) if cyclic else None
+        rows.append(
+            Row(
+                f"run_loop, {quantile}, real-time settings",
+                median(t[index] for t in ours),  # type: ignore[misc]
+                "µs",
+                Peer("cyclictest", value),
+                GOAL if quantile == "p99" else None,
+                unjudged=unjudged if quantile == "p99" else None,
+            )
+        )
+    for asked, settings in ((True, "real-time settings"), (False, "no settings")):
+        for kind in LOOPS:
+            if kind != "run_loop":
+                rows.append(
+                    Row(
+                        f"run_loop, p99, {settings}",
+                        median(t.p99_us for t in loops["run_loop", asked]),
+                        "µs",
+                        Peer(f"{kind} loop", median(t.p99_us for t in loops[kind, asked])),
+                    )
+                )
+    rows.append(
+        Row("run_loop, max, real-time settings", max(t.max_us for t in ours), "µs",
+            note=f"of {len(ours)} rounds of {ROUND_S} s")
+    )  # fmt: skip
+    return rows
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Run all loops in turn, several times."""
+    loops: dict[tuple[str, bool], list[Ticks]] = {}
+    cyclic: list[tuple[float, float]] = []
+    missing: str | None = None
+    for number in range(ROUNDS):
+        say(f"round {number + 1} of {ROUNDS}")
+        found = cyclictest()
+        if isinstance(found, str):
+            missing = found
+        else:
+            cyclic.append(found)
+        for asked in (True, False):
+            for kind in LOOPS:
+                loops.setdefault((kind, asked), []).append(
+                    ticks(kind, ROUND_S, PERIOD_US, asked=asked)
+                )
+    return rows_of(loops, cyclic, missing)
+
+
+BENCHMARK = Benchmark("lateness", "Lateness of a 1 kHz loop", measure)
+
+if __name__ == "__main__":
+    sys.exit(run([BENCHMARK]))

@@ -1,0 +1,217 @@
+"""Cost per call of the pure machines, the wire format and the telemetry buffer.
+
+Each stands against what one would write without it: pickle with HMAC, JSON, a matrix exponential in
+each step, a general integrator. Both sides make the same calls on the same inputs, in turn.
+"""
+
+import argparse
+import gc
+import hashlib
+import hmac
+import json
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from benchmarks._report import Benchmark, Peer, Row, median, run, say
+from controller_node.controller import controller_of
+from cosim.cli import find_scenario
+from netem.link import Datagram, update_link_of
+from noack.io.telemetry import TelemetryBuffer
+from noack.linear import Propagator, Vector
+from noack.machine import Record
+from noack.records import PLANT_STEP, tables
+from noack.resolve import Loop, loop_of, resolve
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.wire import Decoder, Encoder, Flow, Message
+from plant_server.plant import plant_of
+from sensor_node.sensor import sensor_of
+
+ROUNDS = 9
+CALLS = 400
+
+Batch = Callable[[], object]
+"""Makes CALLS calls."""
+
+
+class Case(NamedTuple):
+    """A pair to compare; each side is set up anew for each round, outside the timing."""
+
+    name: str
+    ours: Callable[[], Batch]
+    peer_name: str
+    peer: Callable[[], Batch]
+
+
+class Inputs:
+    """What both sides of all cases work on: the paper's loop and a stretch of its measurements."""
+
+    def __init__(self) -> None:
+        self.scenario: Scenario = resolve(load(find_scenario("lane_following"), ()))
+        self.loop: Loop = loop_of(self.scenario)
+        self.period_ns = self.scenario.plant_period_ns
+        self.period_s = self.period_ns * 1e-9
+        self.key = bytes(range(32))
+        self.measurements: list[Message] = []
+        self.rows: list[Record] = []
+        plant = plant_of(self.scenario)
+        for step in range(CALLS):
+            measurement, record = plant.on_timer(step * self.period_ns)
+            assert isinstance(measurement, Message)
+            assert isinstance(record, Record)
+            self.measurements.append(measurement)
+            self.rows.append(record)
+
+
+def each(calls: Callable[..., object], *inputs: Iterable[object]) -> Batch:
+    """Return a batch that calls ``calls`` with each of the inputs."""
+    tuples = list(zip(*inputs, strict=True))
+
+    def batch() -> None:
+        for arguments in tuples:
+            calls(*arguments)
+
+    return batch
+
+
+def wire_cases(inputs: Inputs) -> list[Case]:
+    """Datagrams there and back, authenticated, against pickle with HMAC-SHA-256."""
+    key, messages = inputs.key, inputs.measurements
+
+    def pickled(message: Message) -> bytes:
+        content = pickle.dumps(tuple(message), pickle.HIGHEST_PROTOCOL)
+        return content + hmac.digest(key, content, hashlib.sha256)
+
+    def unpickled(datagram: bytes) -> Message:
+        if not hmac.compare_digest(
+            hmac.digest(key, datagram[:-32], hashlib.sha256), datagram[-32:]
+        ):
+            raise ValueError("wrong tag")
+        return Message(*pickle.loads(datagram[:-32]))
+
+    encoder = Encoder(1, key)
+    ours = [encoder.encode(message) for message in messages]
+    theirs = [pickled(message) for message in messages]
+    n = inputs.loop.n
+    return [
+        Case("wire encode", lambda: each(encoder.encode, messages),
+             "pickle + HMAC-SHA-256", lambda: each(pickled, messages)),
+        Case("wire decode", lambda: each(Decoder(Flow.MEASUREMENT, n, 1, key).decode, ours),
+             "pickle + HMAC-SHA-256", lambda: each(unpickled, theirs)),
+    ]  # fmt: skip
+
+
+def telemetry_case(inputs: Inputs) -> Case:
+    """A row into the record's buffer, batches included, against a list that becomes JSON."""
+    loop = inputs.loop
+    table = {PLANT_STEP: tables(loop.n, loop.m)[PLANT_STEP]}
+
+    def ours() -> Batch:
+        buffer = TelemetryBuffer(table, lambda table, header, payload: None)
+        rows = inputs.rows
+
+        def batch() -> None:
+            for row in rows:
+                buffer.append(row)
+            buffer.flush()
+
+        return batch
+
+    def peer() -> Batch:
+        gathered: list[tuple[object, ...]] = []
+        rows = inputs.rows
+
+        def batch() -> None:
+            for row in rows:
+                gathered.append(row.row)  # noqa: PERF402 - the loop is what is measured
+            json.dumps(gathered, default=np.ndarray.tolist).encode()
+
+        return batch
+
+    return Case("telemetry append", ours, "list append, then json.dumps", peer)
+
+
+def machine_cases(inputs: Inputs) -> list[Case]:
+    """The machines and the propagation inside them, against the plain mathematics."""
+    loop, scenario, h_s, h_ns = inputs.loop, inputs.scenario, inputs.period_s, inputs.period_ns
+    messages, steps = inputs.measurements, [k * h_ns for k in range(CALLS)]
+    states = [message.vector for message in messages]
+    datagrams = [Datagram(0, Encoder(1, inputs.key).encode(message)) for message in messages]
+    u = np.zeros(loop.m)
+    propagate = Propagator(loop.H)
+    draws = np.random.default_rng(0)
+
+    def integrated(x: Vector) -> object:
+        return solve_ivp(lambda t, z: loop.A @ z + loop.B @ u, (0.0, h_s), x, rtol=1e-9).y[:, -1]
+
+    def advanced(x: Vector) -> object:
+        return expm(loop.H * h_s) @ x
+
+    def tested(x: Vector) -> object:
+        return np.linalg.norm(expm(loop.H * h_s) @ x - x) > 0.5
+
+    def controlled(x: Vector) -> object:
+        return loop.K @ (expm(loop.H * h_s) @ x)
+
+    per_step = "scipy's expm in each step"
+    return [
+        Case("propagation, cached", lambda: each(lambda x: propagate(x, h_ns), states),
+             per_step, lambda: each(advanced, states)),
+        Case("plant step", lambda: each(plant_of(scenario).on_timer, steps),
+             "scipy's solve_ivp, RK45", lambda: each(integrated, states)),
+        Case("sensor measurement", lambda: each(sensor_of(scenario).handle, messages,
+                                                steps),
+             per_step, lambda: each(tested, states)),
+        Case("controller tick", lambda: each(controller_of(scenario).on_timer, steps),
+             per_step, lambda: each(controlled, states)),
+        Case("controller delivery", lambda: each(controller_of(scenario).handle, messages,
+                                                 steps),
+             per_step, lambda: each(advanced, states)),
+        Case("netem datagram", lambda: each(update_link_of(scenario).handle, datagrams,
+                                            steps),
+             "the random draw alone", lambda: each(lambda t_ns: draws.random() < 0.8, steps)),
+    ]  # fmt: skip
+
+
+def per_call_us(batch: Batch) -> float:
+    """Wall microseconds per call of a batch of CALLS calls."""
+    begun_ns = time.perf_counter_ns()
+    batch()
+    return (time.perf_counter_ns() - begun_ns) / CALLS / 1e3
+
+
+def compare(case: Case, rounds: int = ROUNDS) -> Row:
+    """Time both sides of a case in turn; the row of their medians."""
+    ours, peers = [], []
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(rounds):
+            ours.append(per_call_us(case.ours()))
+            peers.append(per_call_us(case.peer()))
+    finally:
+        gc.enable()
+    return Row(case.name, median(ours), "µs/call", Peer(case.peer_name, median(peers)))
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Compare all cases."""
+    inputs = Inputs()
+    rows = []
+    for case in [*machine_cases(inputs), *wire_cases(inputs), telemetry_case(inputs)]:
+        say(case.name)
+        rows.append(compare(case))
+    return rows
+
+
+BENCHMARK = Benchmark("machines", "Cost per call", measure)
+
+if __name__ == "__main__":
+    sys.exit(run([BENCHMARK]))

@@ -1,0 +1,28 @@
+"""What all tests share: Hypothesis without wall time or chance, and a small scenario."""
+
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile(
+    "noack",
+    deadline=None,
+    derandomize=True,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],  # it reads the wall clock
+)
+settings.load_profile("noack")
+
+
+@pytest.fixture
+def content() -> dict[str, Any]:
+    """A valid scenario as parsed TOML: the double integrator, with as little as is required."""
+    return {
+        "name": "small",
+        "horizon_s": 1.0,
+        "model": {"name": "double_integrator"},
+        "plant": {"initial_state": [1.0, 0.0]},
+        "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
+        "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+    }

@@ -1,0 +1,264 @@
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from controller_node.controller import Controller, controller_of
+from noack.machine import Notice, Output, Record
+from noack.records import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
+from noack.resolve import resolve
+from noack.scenario_file import validate
+from noack.wire import Flow, Message
+
+MS = 1_000_000
+H = np.array([[-0.5, 2.0], [-1.0, 0.3]])
+K = np.array([[1.5, -0.7], [0.1, 2.0], [0.0, 1.0]])
+
+
+def new_controller(
+    mansd: int = 2, x0: np.ndarray | None = None, phase_ns: int = MS, horizon_ns: int = 10**9
+) -> Controller:
+    return Controller(
+        H, K, period_ns=2 * MS, phase_ns=phase_ns, horizon_ns=horizon_ns, mansd=mansd, x0=x0
+    )
+
+
+def update(sequence: int, t_ns: int, x: Sequence[float] = (1.0, -2.0)) -> Message:
+    return Message(Flow.UPDATE, sequence, t_ns, np.array(x))
+
+
+def tick(controller: Controller) -> tuple[Message, Any]:
+    """Do the next tick in time; return the actuation and its row."""
+    t_ns = controller.next_deadline_ns()
+    assert t_ns is not None
+    message, record = controller.on_timer(t_ns)
+    assert isinstance(message, Message)
+    (row,) = rows([record], CONTROLLER_STEP)
+    return message, row
+
+
+def rows(outputs: Sequence[Output], table: str) -> Any:
+    found = [out.row for out in outputs if isinstance(out, Record) and out.table == table]
+    return np.array(found, tables(2, 3)[table])
+
+
+def notices(outputs: Sequence[Output]) -> list[Notice]:
+    return [output for output in outputs if isinstance(output, Notice)]
+
+
+def propagated(x: Sequence[float] | np.ndarray, dt_ns: int) -> np.ndarray:
+    return np.asarray(expm(H * dt_ns * 1e-9) @ x)
+
+
+def test_actuations_come_on_their_grid_up_to_the_horizon() -> None:
+    controller = new_controller(phase_ns=MS, horizon_ns=9 * MS)
+    sent = []
+    while controller.next_deadline_ns() is not None:
+        sent.append(tick(controller)[0])
+    assert [message.t_ns for message in sent] == [MS, 3 * MS, 5 * MS, 7 * MS, 9 * MS]
+    assert [message.sequence for message in sent] == [0, 1, 2, 3, 4]
+    assert {message.flow for message in sent} == {Flow.ACTUATION}
+
+
+def test_the_input_is_the_gain_times_the_model_state_bit_for_bit() -> None:
+    controller = new_controller(x0=np.array([0.3, -1.7]))
+    for k in range(100):
+        if k % 7 == 3:
+            controller.handle(update(k, 2 * k * MS - 500, [math.sin(k), math.cos(k)]), 2 * k * MS)
+        message, row = tick(controller)
+        assert message.vector.tobytes() == (K @ controller.x_c).tobytes() == row["u"].tobytes()
+        assert row["x_c"].tobytes() == controller.x_c.tobytes()
+
+
+def test_between_deliveries_the_model_runs_freely() -> None:
+    x0 = np.array([0.3, -1.7])
+    controller = new_controller(x0=x0)
+    for _ in range(400):
+        message, _ = tick(controller)
+        # 400 propagations, each good to some 1e-15; this model does not grow in 0.8 s.
+        np.testing.assert_allclose(controller.x_c, propagated(x0, message.t_ns), atol=1e-12)
+
+
+def test_only_a_delivery_resets_the_model() -> None:
+    controller = new_controller(x0=np.array([0.3, -1.7]))
+    for k in range(50):
+        before, since_ns = controller.x_c, (2 * k - 1) * MS if k else 0
+        if k == 20:
+            outputs = controller.handle(update(0, 39 * MS, [5.0, 5.0]), 39 * MS + 10)
+            assert controller.x_c.tolist() == [5.0, 5.0]
+            (row,) = rows(outputs, CONTROLLER_DELIVERY)
+            np.testing.assert_array_equal(row["x_c_before"], before)
+            before, since_ns = controller.x_c, 39 * MS
+        message, _ = tick(controller)
+        expected = propagated(before, message.t_ns - since_ns)
+        np.testing.assert_allclose(controller.x_c, expected, rtol=1e-13)
+
+
+def test_a_late_update_is_propagated_from_its_event_time() -> None:
+    controller = new_controller()
+    for _ in range(6):
+        tick(controller)
+    x = [1.0, -2.0]
+    outputs = controller.handle(update(0, 4 * MS, x), 12 * MS)  # the model stands at 11 ms
+    np.testing.assert_allclose(controller.x_c, propagated(x, 7 * MS), rtol=1e-13)
+    (row,) = rows(outputs, CONTROLLER_DELIVERY)
+    assert (row["t_ns"], row["now_ns"], row["model_t_ns"]) == (4 * MS, 12 * MS, 11 * MS)
+    assert row["x"].tolist() == x
+    np.testing.assert_array_equal(row["x_c"], controller.x_c)
+    tick(controller)  # at 13 ms, as if it had come in time
+    np.testing.assert_allclose(controller.x_c, propagated(x, 9 * MS), rtol=1e-13)
+
+
+def test_an_update_that_is_newer_than_the_model_takes_it_along() -> None:
+    x0 = np.array([0.3, -1.7])
+    controller = new_controller(x0=x0)
+    outputs = controller.handle(update(0, 6 * MS, [1.0, -2.0]), 6 * MS)  # ticks at 1, 3, 5 ms late
+    (row,) = rows(outputs, CONTROLLER_DELIVERY)
+    assert row["model_t_ns"] == 6 * MS
+    np.testing.assert_allclose(row["x_c_before"], propagated(x0, 6 * MS), rtol=1e-13)
+    for t_ns in (MS, 3 * MS, 5 * MS):  # caught up, but the model does not go back
+        message, row = tick(controller)
+        assert message.t_ns == t_ns
+        assert row["model_t_ns"] == 6 * MS
+        assert row["x_c"].tolist() == [1.0, -2.0]
+    _, row = tick(controller)
+    assert row["model_t_ns"] == 7 * MS
+    np.testing.assert_allclose(row["x_c"], propagated([1.0, -2.0], MS), rtol=1e-13)
+
+
+@given(st.lists(st.none() | st.tuples(st.integers(0, 40), st.integers(0, 3)), max_size=40))
+def test_the_models_time_never_runs_back(inputs: list[tuple[int, int] | None]) -> None:
+    """Ticks (None) and updates of any age and gap, in any order."""
+    controller = new_controller(mansd=0)
+    model_ns, sequence, newest = 0, -1, None
+    for item in inputs:
+        if item is None:
+            message, row = tick(controller)
+            expected_ns = max(model_ns, message.t_ns)
+        else:
+            event_ms, gap = item
+            sequence += 1 + gap
+            x = [math.sin(sequence), math.cos(sequence)]
+            outputs = controller.handle(update(sequence, event_ms * MS, x), 50 * MS)
+            (row,) = rows(outputs, CONTROLLER_DELIVERY)
+            expected_ns = max(model_ns, event_ms * MS)
+            newest = (event_ms * MS, x)
+            assert row["dropouts"] == gap
+        assert row["model_t_ns"] == expected_ns
+        model_ns = expected_ns
+        if newest is None:
+            assert controller.x_c.tolist() == [0.0, 0.0]
+        else:
+            expected = propagated(newest[1], model_ns - newest[0])
+            np.testing.assert_allclose(controller.x_c, expected, atol=1e-13)
+
+
+def test_late_ticks_are_dated_as_they_were_due() -> None:
+    late, in_time = new_controller(x0=np.ones(2)), new_controller(x0=np.ones(2))
+    for k in range(5):
+        message, record = late.on_timer(50 * MS)
+        expected, _ = tick(in_time)
+        assert isinstance(message, Message)
+        assert message.t_ns == expected.t_ns == (2 * k + 1) * MS
+        assert message.vector.tobytes() == expected.vector.tobytes()
+        (row,) = rows([record], CONTROLLER_STEP)
+        assert row["now_ns"] == 50 * MS
+
+
+@pytest.mark.parametrize("mansd", [0, 1, 4])
+@pytest.mark.parametrize("gap", range(7))
+def test_a_violation_is_told_exactly_when_more_were_lost_than_assumed(mansd: int, gap: int) -> None:
+    controller = new_controller(mansd=mansd)
+    assert notices(controller.handle(update(0, 0), 0)) == []
+    outputs = controller.handle(update(1 + gap, 77 * MS), 90 * MS)
+    (row,) = rows(outputs, CONTROLLER_DELIVERY)
+    assert row["dropouts"] == gap
+    told = notices(outputs)
+    if gap <= mansd:
+        assert told == []
+    else:
+        (notice,) = told
+        assert (notice.t_ns, notice.level) == (77 * MS, "violation")
+        assert notice.text == (
+            f"MANSD violated: {gap} successive dropouts before update {1 + gap}, "
+            f"at most {mansd} assumed"
+        )
+    assert notices(controller.handle(update(2 + gap, 78 * MS), 91 * MS)) == []  # counted anew
+
+
+@pytest.mark.parametrize(
+    ("known", "lost", "told"),
+    [
+        (False, 0, None),
+        (False, 1, "no delivered t_0"),
+        (False, 2, "no delivered t_0"),
+        (False, 3, "MANSD violated: 3 successive dropouts"),
+        (True, 0, None),
+        (True, 2, None),
+        (True, 3, "MANSD violated: 3 successive dropouts"),
+    ],
+)
+def test_the_paper_needs_a_delivered_or_a_known_start(
+    known: bool, lost: int, told: str | None
+) -> None:
+    controller = new_controller(mansd=2, x0=np.ones(2) if known else None)
+    outputs = controller.handle(update(lost, 5 * MS), 6 * MS)
+    (row,) = rows(outputs, CONTROLLER_DELIVERY)
+    assert row["dropouts"] == lost
+    if told is None:
+        assert notices(outputs) == []
+    else:
+        (notice,) = notices(outputs)
+        assert (notice.t_ns, notice.level) == (5 * MS, "violation")
+        assert notice.text.startswith(told)
+        assert str(lost) in notice.text or lost == 1
+    # From then on the flow has begun: a gap within the cap is no news.
+    assert notices(controller.handle(update(lost + 2, 7 * MS), 8 * MS)) == []
+
+
+def test_without_a_known_start_the_model_is_at_rest() -> None:
+    message, row = tick(new_controller())
+    assert message.vector.tolist() == [0.0, 0.0, 0.0]
+    assert row["x_c"].tolist() == [0.0, 0.0]
+
+
+def test_inputs_are_numbered_in_their_order() -> None:
+    controller = new_controller()
+    numbers = [tick(controller)[1]["input"]]
+    numbers += rows(controller.handle(update(0, 0), 0), CONTROLLER_DELIVERY)["input"].tolist()
+    numbers.append(tick(controller)[1]["input"])
+    assert numbers == [0, 1, 2]
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_the_controller_of_a_scenario_knows_the_model_not_the_plant(
+    content: dict[str, Any], mode: str
+) -> None:
+    content |= {"mode": mode, "controller": {"rate_hz": 2.0, "phase": 0.5}}
+    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
+    content["network"] |= {"initial_sync": "known_state", "mansd": 1}
+    controller = controller_of(resolve(validate(content, "here")))
+    assert controller.next_deadline_ns() == 250_000_000
+    message, _ = controller.on_timer(250_000_000)
+    assert isinstance(message, Message)
+    assert controller.next_deadline_ns() == 750_000_000
+    # ẍ = −x − 1.5 ẋ from (1, 0), by hand, or held; u = −x − 1.5 ẋ.
+    w, t = math.sqrt(1 - 0.75**2), 0.25
+    decay = math.exp(-0.75 * t)
+    position = decay * (math.cos(w * t) + 0.75 / w * math.sin(w * t))
+    velocity = -decay / w * math.sin(w * t)
+    expected = -position - 1.5 * velocity if mode == "model" else -1.0
+    assert message.vector.item() == pytest.approx(expected, rel=1e-12)
+    assert notices(controller.handle(update(1, 0, [0.0, 0.0]), 0)) == []
+    assert len(notices(controller.handle(update(4, 0, [0.0, 0.0]), 0))) == 1
+
+
+def test_a_scenario_without_a_known_start_leaves_the_controller_at_rest(
+    content: dict[str, Any],
+) -> None:
+    assert controller_of(resolve(validate(content, "here"))).x_c.tolist() == [0.0, 0.0]

@@ -1,0 +1,172 @@
+"""What kills a process, a port or a person's patience: named, ended cleanly, nothing lost."""
+
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.record import load_record
+from tests.integration.conftest import (
+    EPHEMERAL,
+    ROLE_MODULES,
+    Running,
+    noack_command,
+    run_scenario,
+    settings,
+    wait_for,
+)
+
+Start = Callable[..., Running]
+LONG = settings(speed=4.0, horizon_s=400.0)
+
+
+def wait_recording(running: Running) -> None:
+    """Wait until the recorder has something of everyone who has something to tell all the time."""
+    running.wait_started()
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        spooled = running.runs / "latest" / "spool" / f"{table}.recorder"
+        wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
+
+
+@pytest.mark.parametrize("role", ROLE_MODULES)
+def test_a_killed_process_is_named_and_nothing_recorded_is_lost(start: Start, role: str) -> None:
+    running = start(*LONG)
+    wait_recording(running)
+    running.child(role).send_signal(signal.SIGKILL)
+    finished = running.finish()
+    assert finished.status == 1
+    assert finished.summary["exit"]["reason"] == f"{role} died: killed by SIGKILL"
+    record = load_record(finished.run_dir)
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        rows = record[table]
+        assert len(rows) > 10
+        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
+    assert finished.summary["missing_samples"] == 0
+    assert (finished.run_dir / "recording.rrd").stat().st_size > 0
+    assert not (finished.run_dir / "spool").exists()
+    assert running.left_behind() == []
+
+
+def test_a_frozen_process_is_named(start: Start) -> None:
+    running = start(*LONG)
+    wait_recording(running)
+    running.child("sensor").send_signal(signal.SIGSTOP)
+    finished = running.finish()
+    assert finished.status == 1
+    assert finished.summary["exit"]["reason"] == "sensor stopped answering"
+    assert len(load_record(finished.run_dir)["plant_step"]) > 10
+    assert running.left_behind() == []
+
+
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+)
+def test_a_signal_ends_a_run_cleanly(start: Start, number: signal.Signals, status: int) -> None:
+    running = start(*LONG)
+    wait_recording(running)
+    running.process.send_signal(number)
+    finished = running.finish()
+    assert finished.status == status
+    assert finished.summary["exit"]["reason"] == f"stopped by {number.name}"
+    assert finished.summary["missing_samples"] == 0
+    assert finished.summary["lost_outside_netem"] == 0
+    assert set(finished.summary["realtime"]) == {"plant", "sensor", "controller", "netem"}
+    assert running.left_behind() == []
+
+
+def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
+    running = start(*LONG)
+    wait_recording(running)
+    running.process.kill()
+    assert running.left_behind() == []
+    run_dir = (running.runs / "latest").resolve()
+    done = subprocess.run(
+        noack_command("summary", str(run_dir), "--json"), capture_output=True, text=True, check=True
+    )
+    assert '"events"' in done.stdout
+    assert len(load_record(run_dir)["plant_step"]) > 10
+
+
+@pytest.mark.parametrize("role", ["plant", "sensor", "netem", "controller"])
+def test_a_taken_port_is_one_clear_line(tmp_path: Path, role: str) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        squatter.bind(("127.0.0.1", 0))
+        port = squatter.getsockname()[1]
+        done = subprocess.run(
+            noack_command(
+                "run", "lane_following", "--runs", str(tmp_path), *EPHEMERAL,
+                *settings(**{f"ports__{role}": port}),
+            ),
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.strip().splitlines()
+    assert f"127.0.0.1:{port} is already taken" in line
+    assert f"set ports.{role} to another port" in line
+
+
+def test_a_taken_control_port_is_one_clear_line(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as squatter:
+        squatter.bind(("127.0.0.1", 0))
+        squatter.listen()
+        port = squatter.getsockname()[1]
+        done = subprocess.run(
+            noack_command(
+                "run", "lane_following", "--runs", str(tmp_path), *EPHEMERAL,
+                *settings(ports__control=port),
+            ),
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert f"127.0.0.1:{port}" in line
+    assert "ports.control" in line
+
+
+def test_a_violated_assumption_is_reported_with_its_time(tmp_path: Path) -> None:
+    finished = run_scenario(
+        tmp_path,
+        *settings(
+            speed=5.0, horizon_s=10.0, mode="zoh", network__mansd=1, network__enforce_mansd=False
+        ),
+    )
+    assert finished.status == 0
+    violations = finished.summary["assumption_violations"]
+    record = load_record(finished.run_dir)
+    deliveries = record["controller_delivery"]
+    long_gaps = deliveries[deliveries["dropouts"] > 1]
+    assert len(violations) == len(long_gaps) > 0
+    for violation, gap in zip(violations, long_gaps, strict=True):
+        assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
+        assert violation["process"] == "controller"
+        assert f"{gap['dropouts']} successive dropouts" in violation["what"]
+
+
+def test_forged_datagrams_are_counted_and_ignored(start: Start) -> None:
+    running = start(*settings(speed=2.0, horizon_s=8.0))
+    wait_recording(running)
+    ports = {
+        role: [
+            connection.laddr.port
+            for connection in running.child(role).net_connections("udp4")
+            if connection.status == "NONE" and not connection.raddr
+        ]
+        for role in ("plant", "sensor", "controller")
+    }
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as forger:
+        for (port,) in ports.values():
+            for size in (0, 1, 31, 48, 80, 600, 9000):
+                forger.sendto(os.urandom(size), ("127.0.0.1", port))
+    finished = running.finish()
+    assert finished.status == 0
+    for role in ports:
+        rejected = finished.summary["rejected_datagrams"][role]
+        assert sum(rejected.values()) == 7, rejected
+    assert finished.summary["identity_residual_max"] < 1e-11
+    assert finished.summary["missing_samples"] == 0

@@ -1,0 +1,231 @@
+"""A whole run of real processes, checked from its record against independent computations."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy.linalg import expm
+
+from cosim.join import identity_residual, join_all
+from cosim.record import RunRecord, load_record
+from netem.link import Datagram, update_link_of
+from noack.machine import Record
+from noack.records import Fate, tables
+from noack.resolve import resolve
+from noack.scenario_file import load
+from noack.wire import read_header
+from tests.integration.conftest import Finished, run_scenario, settings
+
+SUMMARY_KEYS = {
+    "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",
+    "longest_drop_run", "assumption_violations", "missing_samples", "lost_outside_netem",
+    "inter_event_min_s", "final_state_norm", "lateness_us", "latency_us", "realtime", "exit",
+}  # fmt: skip
+
+CASES = {
+    "model": {"mode": "model"},
+    "zoh": {"mode": "zoh"},
+    "bursts_from_known_state": {
+        "mode": "model",
+        "network__initial_sync": "known_state",
+        "network__loss": {"model": "gilbert_elliott", "good_to_bad": 0.4, "bad_to_good": 0.2},
+        "plant__measure_every": 2,
+        "controller__rate_hz": 200.0,
+    },
+}
+
+
+@pytest.fixture(scope="module", params=CASES.values(), ids=CASES.keys())
+def finished(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    case = request.param | {"speed": 5.0, "horizon_s": 20.0}
+    # A JSON object is an inline table in TOML but for its colons; tables are passed key by key.
+    flat = {}
+    for key, value in case.items():
+        if isinstance(value, dict):
+            flat[key] = {}
+            flat |= {f"{key}__{inner}": entry for inner, entry in value.items()}
+        else:
+            flat[key] = value
+    return run_scenario(tmp_path_factory.mktemp("runs"), *settings(**flat))
+
+
+@pytest.fixture(scope="module")
+def record(finished: Finished) -> RunRecord:
+    return load_record(finished.run_dir)
+
+
+def test_a_run_ends_well_and_its_summary_is_complete(finished: Finished) -> None:
+    assert finished.status == 0, finished.stderr
+    assert finished.summary.keys() >= SUMMARY_KEYS
+    assert finished.summary["exit"] == {"status": 0, "reason": "horizon"}
+    assert finished.summary["missing_samples"] == 0
+    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["assumption_violations"] == []
+    assert finished.summary["rejected_datagrams"] == {}
+    for role in ("plant", "sensor", "controller", "netem"):
+        assert finished.summary["lateness_us"][role].keys() == {
+            "p50", "p99", "p999", "max", "steps", "late_steps",
+        }  # fmt: skip
+
+
+def test_the_run_directory_holds_everything(finished: Finished) -> None:
+    run_dir = finished.run_dir
+    assert json.loads((run_dir / "summary.json").read_text()) == finished.summary
+    assert json.loads((run_dir / "environment.json").read_text())["packages"]["numpy"]
+    assert (run_dir / "recording.rrd").stat().st_size > 10_000
+    assert {log.name for log in (run_dir / "logs").iterdir()} == {
+        f"{role}.log" for role in ("plant", "sensor", "controller", "netem", "recorder")
+    }
+    assert not (run_dir / "spool").exists()
+
+
+def test_the_resolved_scenario_repeats_itself(record: RunRecord, finished: Finished) -> None:
+    again = load(finished.run_dir / "scenario.toml")
+    assert again == record.scenario
+    assert resolve(again) == again
+
+
+def test_every_sample_is_there(record: RunRecord) -> None:
+    scenario = record.scenario
+    steps = scenario.horizon_ns // scenario.plant_period_ns + 1
+    plant, sensor = record["plant_step"], record["sensor_measurement"]
+    assert np.array_equal(plant["t_ns"], np.arange(steps) * scenario.plant_period_ns)
+    every = scenario.plant.measure_every
+    assert np.array_equal(sensor["t_ns"], plant["t_ns"][::every])
+    assert np.array_equal(sensor["x"], plant["x"][::every])
+    ticks = (scenario.horizon_ns - scenario.controller_phase_ns) // scenario.controller_period_ns
+    assert len(record["controller_step"]) == ticks + 1
+
+
+def test_datagrams_flow_only_the_way_the_picture_says(record: RunRecord) -> None:
+    channel = {role: report["channel"] for role, report in record.reports.items()}
+    local = {role: counters["local"] for role, counters in channel.items()}
+    source = local | {"netem": channel["netem"]["forwards_from"]}
+    picture = {"plant": "sensor", "sensor": "netem", "netem": "controller", "controller": "plant"}
+    for role, to in picture.items():
+        assert channel[role]["destination"] == local[to]
+        assert list(channel[to]["received_from"]) == [source[role]]
+    assert local["controller"] not in channel["sensor"]["received_from"]
+    assert source["netem"] not in channel["sensor"]["received_from"]
+
+
+def test_the_plant_moves_exactly_as_its_held_input_says(record: RunRecord) -> None:
+    loop, h_s = record.loop, record.scenario.plant_period_ns * 1e-9
+    n, m = loop.n, loop.m
+    both = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * h_s)
+    x, u = record["plant_step"]["x"], record["plant_step"]["u"]
+    expected = x[:-1] @ both[:n, :n].T + u[:-1] @ both[:n, n:].T
+    assert np.allclose(x[1:], expected, rtol=1e-13, atol=1e-13)  # rounding of one product
+
+
+def test_the_plant_holds_only_inputs_that_the_controller_sent(record: RunRecord) -> None:
+    plant, sent = record["plant_step"], record["controller_step"]
+    held = plant["actuation"] >= 0
+    assert held.sum() > 0.9 * len(plant)
+    assert np.array_equal(plant["u"][held], sent["u"][plant["actuation"][held]])
+    assert not plant["u"][~held].any()
+
+
+def test_x_s_is_reset_at_every_event_and_only_there(record: RunRecord) -> None:
+    rows, loop = record["sensor_measurement"], record.loop
+    transition = expm(loop.H * (rows["t_ns"][1] - rows["t_ns"][0]) * 1e-9)
+    event = rows["event"] >= 0
+    after = np.where(event[:, None], rows["x"], rows["x_s"])
+    assert np.allclose(rows["x_s"][1:], after[:-1] @ transition.T, rtol=1e-12, atol=1e-12)
+    assert np.array_equal(rows["event"][event], np.arange(event.sum()))
+
+
+def test_events_are_exactly_where_the_error_exceeds_the_threshold(record: RunRecord) -> None:
+    rows, trigger = record["sensor_measurement"], record.scenario.trigger
+    threshold = trigger.beta * np.exp(-trigger.alpha_per_s * rows["t_ns"] * 1e-9)
+    error = np.linalg.norm(rows["x_s"] - rows["x"], axis=1)
+    due = error > threshold
+    if record.scenario.network.initial_sync == "first_packet":
+        due[0] = True
+    clear = np.abs(error - threshold) > 1e-12 * threshold  # numpy's exp and norm round differently
+    assert np.array_equal((rows["event"] >= 0)[clear], due[clear])
+
+
+def test_x_c_is_reset_only_at_deliveries(record: RunRecord) -> None:
+    steps, deliveries, loop = record["controller_step"], record["controller_delivery"], record.loop
+    assert np.array_equal(steps["u"], steps["x_c"] @ loop.K.T) or np.allclose(
+        steps["u"], steps["x_c"] @ loop.K.T, rtol=0, atol=1e-15
+    )
+    for delivery in deliveries:
+        late_s = (delivery["model_t_ns"] - delivery["t_ns"]) * 1e-9
+        assert late_s >= 0
+        assert np.allclose(delivery["x_c"], expm(loop.H * late_s) @ delivery["x"], atol=1e-12)
+    untouched = np.diff(steps["input"]) == 1  # no delivery between two ticks
+    transition = expm(loop.H * record.scenario.controller_period_ns * 1e-9)
+    free = steps["x_c"][:-1] @ transition.T
+    assert np.allclose(steps["x_c"][1:][untouched], free[untouched], rtol=1e-12, atol=1e-12)
+    assert (~untouched).sum() <= len(deliveries)
+
+
+def test_u_is_k_times_x_c_bit_for_bit(record: RunRecord) -> None:
+    K = record.loop.K
+    for row in record["controller_step"]:
+        assert np.array_equal(row["u"], K @ np.ascontiguousarray(row["x_c"]))
+
+
+def test_what_the_controller_took_is_what_the_network_let_through(record: RunRecord) -> None:
+    packets, deliveries = record["netem_packet"], record["controller_delivery"]
+    sequence = np.array([read_header(head.tobytes()).sequence for head in packets["head"]])
+    assert np.array_equal(sequence, np.arange(len(packets)))
+    survivors = sequence[packets["fate"] != Fate.DROPPED]
+    assert np.array_equal(deliveries["sequence"], survivors)
+    sent = record["sensor_measurement"]
+    events = sent[sent["event"] >= 0]
+    assert np.array_equal(deliveries["x"], events["x"][deliveries["sequence"]])
+    assert np.array_equal(deliveries["dropouts"], np.diff(survivors, prepend=-1) - 1)
+
+
+def test_no_more_than_mansd_successive_packets_are_lost(record: RunRecord) -> None:
+    mansd = record.scenario.network.mansd
+    assert record["controller_delivery"]["dropouts"].max() <= mansd
+    longest = run = 0
+    for fate in record["netem_packet"]["fate"]:
+        run = run + 1 if fate == Fate.DROPPED else 0
+        longest = max(longest, run)
+    assert 0 < longest <= mansd
+    assert longest == record["netem_packet"]["drop_run"].max()
+
+
+def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:
+    link = update_link_of(record.scenario)
+    fates = []
+    for _ in range(len(record["netem_packet"])):
+        outputs = link.handle(Datagram(0, b"anything"), 0)
+        fates += [output.row[5] for output in outputs if isinstance(output, Record)]
+    assert np.array_equal(record["netem_packet"]["fate"], fates)
+
+
+def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> None:
+    joined = join_all(record)
+    residual = identity_residual(record, joined)
+    in_common = joined.t_ns >= 0
+    if record.scenario.network.initial_sync == "first_packet":
+        in_common = joined.t_ns >= record["controller_delivery"]["model_t_ns"][0]
+    assert np.array_equal(np.isnan(residual), ~in_common)
+    # States of a few units, propagated some thousand times: far below any physical difference.
+    assert residual[in_common].max() < 1e-11
+
+
+def test_the_state_converges(record: RunRecord, finished: Finished) -> None:
+    norms = np.linalg.norm(record["plant_step"]["x"], axis=1)
+    assert norms[-1] < 0.1 * norms[0]
+    assert finished.summary["final_state_norm"] == norms[-1]
+
+
+def test_any_reader_of_parquet_takes_the_record(finished: Finished, record: RunRecord) -> None:
+    for table in tables(record.loop.n, record.loop.m):
+        content = pq.read_table(finished.run_dir / "record" / f"{table}.parquet")
+        assert content.num_rows == len(record[table])
+        assert content.schema.metadata[b"state_names"] == b'["V", "r", "psi", "Y_g"]'
+
+
+def test_nothing_secret_is_readable_by_others(finished: Finished) -> None:
+    for path in Path(finished.run_dir).rglob("*"):
+        assert b'"key"' not in (path.read_bytes() if path.is_file() else b"")

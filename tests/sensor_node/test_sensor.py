@@ -1,0 +1,213 @@
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from noack.linear import Matrix
+from noack.machine import Output, Record
+from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
+from noack.resolve import resolve
+from noack.scenario_file import validate
+from noack.trigger.decaying import DecayingTrigger
+from noack.wire import Flow, Message
+from sensor_node.sensor import Sensor, sensor_of
+
+GRID_NS = 10_000_000
+ZOH = np.zeros((1, 1))
+
+
+def measurement(sequence: int, t_ns: int, x: Sequence[float] | np.ndarray) -> Message:
+    return Message(Flow.MEASUREMENT, sequence, t_ns, np.asarray(x, dtype=float))
+
+
+def updates(outputs: Sequence[Output]) -> list[Message]:
+    return [output for output in outputs if isinstance(output, Message)]
+
+
+def rows(outputs: Sequence[Output], n: int) -> Any:
+    found = [output.row for output in outputs if isinstance(output, Record)]
+    return np.array(found, tables(n, 1)[SENSOR_MEASUREMENT])
+
+
+def feed(sensor: Sensor, x: Callable[[float], float], until_s: float) -> list[Output]:
+    """Measure the scalar x(t) on the grid."""
+    outputs: list[Output] = []
+    for k in range(round(until_s * 1e9) // GRID_NS + 1):
+        outputs += sensor.handle(measurement(k, k * GRID_NS, [x(k * GRID_NS * 1e-9)]), k * GRID_NS)
+    return outputs
+
+
+def next_on_grid_ns(t_s: float) -> int:
+    """The first grid time after ``t_s``."""
+    return (math.floor(t_s * 1e9 / GRID_NS) + 1) * GRID_NS
+
+
+def test_a_held_scalar_crosses_where_its_closed_form_does() -> None:
+    """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
+    x0, beta = 2.0, 0.3
+    sensor = Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([x0]))
+    sent = updates(feed(sensor, lambda t: x0 * math.exp(-t), 3.0))
+    expected = [next_on_grid_ns(math.log(1 + beta / x0))]
+    while expected[-1] <= 3_000_000_000:
+        expected.append(next_on_grid_ns(expected[-1] * 1e-9 + math.log(1 + beta / x0)))
+    assert [message.t_ns for message in sent] == expected[:-1]
+    assert len(sent) == 21  # 0.14 s apart
+
+
+def test_a_modelled_scalar_crosses_where_its_closed_form_does() -> None:
+    """H = −1, x = x₀e^{−2t}, α = 1: x₀(e^{−t} − e^{−2t}) > βe^{−t} from −ln(1 − β/x₀) on."""
+    x0, beta = 2.0, 0.3
+    sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(beta, 1.0), np.array([x0]))
+    first, *_ = updates(feed(sensor, lambda t: x0 * math.exp(-2 * t), 1.0))
+    assert first.t_ns == next_on_grid_ns(-math.log(1 - beta / x0))
+
+
+def test_a_perfect_model_never_transmits() -> None:
+    sensor = Sensor(np.array([[-0.5]]), DecayingTrigger(1e-9, 1e-9), np.array([1.0]))
+    assert updates(feed(sensor, lambda t: math.exp(-0.5 * t), 10.0)) == []
+
+
+def test_a_floor_takes_over_from_the_decay() -> None:
+    """A ramp x = t held at its last update passes every ε seconds once the floor rules."""
+    sensor = Sensor(ZOH, DecayingTrigger(1e-3, 1.0, 0.205), np.array([0.0]))
+    sent = updates(feed(sensor, lambda t: t, 2.0))
+    assert [message.t_ns for message in sent] == [k * 210_000_000 for k in range(1, 10)]
+
+
+def test_an_error_equal_to_the_threshold_is_no_event() -> None:
+    beta = 0.1
+    for x, events in ((beta, 0), (math.nextafter(beta, 1), 1)):
+        sensor = Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([0.0]))
+        assert len(updates(sensor.handle(measurement(0, 0, [x]), 0))) == events
+
+
+@st.composite
+def measured_runs(draw: st.DrawFn) -> tuple[Matrix, Matrix | None, list[tuple[int, np.ndarray]]]:
+    n = draw(st.integers(1, 4))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    H = rng.uniform(-1, 1, (n, n)) * draw(st.sampled_from([0.0, 1.0]))
+    # Diagonally dominant, hence invertible.
+    W = 3 * np.eye(n) + rng.uniform(-0.5, 0.5, (n, n)) if draw(st.booleans()) else None
+    gaps = draw(st.lists(st.integers(1, 5), min_size=1, max_size=30))  # measurements may be missing
+    x, t_ns, run = rng.uniform(-1, 1, n), 0, []
+    for gap in gaps:
+        run.append((t_ns, x))
+        x = x + rng.normal(0, 0.05, n)
+        t_ns += gap * GRID_NS
+    return H, W, run
+
+
+@given(measured_runs(), st.booleans(), st.sampled_from([0.0, 0.1]))
+def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
+    system: tuple[Matrix, Matrix | None, list[tuple[int, np.ndarray]]], known: bool, floor: float
+) -> None:
+    H, W, run = system
+    x0 = run[0][1] + 0.02
+    sensor = Sensor(H, DecayingTrigger(0.2, 0.5, floor, W), x0 if known else None)
+    reset_ns, reset = (0, x0) if known else (0, None)
+    for k, (t_ns, x) in enumerate(run):
+        outputs = sensor.handle(measurement(k, t_ns, x), t_ns)
+        (row,), sent = rows(outputs, len(x)), updates(outputs)
+        # x_s anew from the last event in one step, not measurement by measurement.
+        x_s = x if reset is None else expm(H * (t_ns - reset_ns) * 1e-9) @ reset
+        e_s = x_s - x if W is None else W @ (x_s - x)
+        error = float(np.linalg.norm(e_s))
+        threshold = max(0.2 * math.exp(-0.5 * t_ns * 1e-9), floor)
+        # Thirty propagations, each good to some 1e-15, grown by ‖e^{Ht}‖ < e^{4 · 1.5}.
+        np.testing.assert_allclose(row["x_s"], x_s, atol=1e-11)
+        assert row["e_s_norm"] == pytest.approx(error, abs=1e-10)
+        assert row["threshold"] == pytest.approx(threshold, rel=1e-14)
+        if abs(error - threshold) > 1e-9:
+            assert bool(sent) == (reset is None or error > threshold)
+        assert (row["event"] != NO_SEQUENCE) == bool(sent)
+        if sent:  # whatever becomes of the packet
+            assert sensor.x_s is not None
+            assert sensor.x_s.tolist() == x.tolist()
+            reset_ns, reset = t_ns, x
+
+
+def test_an_update_carries_the_measured_state_and_its_time() -> None:
+    sensor = Sensor(np.zeros((2, 2)), DecayingTrigger(0.1, 1.0))
+    outputs: list[Output] = []
+    for k, x in enumerate([[1.0, 2.0], [1.0, 2.05], [3.0, 2.0], [3.0, 7.0]]):
+        outputs += sensor.handle(measurement(10 + k, k * GRID_NS, x), k * GRID_NS + 777)
+    sent = updates(outputs)
+    assert [(m.flow, m.sequence, m.t_ns, m.vector.tolist()) for m in sent] == [
+        (Flow.UPDATE, 0, 0, [1.0, 2.0]),
+        (Flow.UPDATE, 1, 2 * GRID_NS, [3.0, 2.0]),
+        (Flow.UPDATE, 2, 3 * GRID_NS, [3.0, 7.0]),
+    ]
+    record = rows(outputs, 2)
+    assert record["event"].tolist() == [0, NO_SEQUENCE, 1, 2]
+    assert record["input"].tolist() == [0, 1, 2, 3]
+    assert record["sequence"].tolist() == [10, 11, 12, 13]
+    assert record["now_ns"].tolist() == [k * GRID_NS + 777 for k in range(4)]
+    # Before the reset, so that the record holds e_s(t_k⁻).
+    assert record["x_s"].tolist() == [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0], [3.0, 2.0]]
+
+
+def test_the_first_measurement_is_an_event_unless_the_start_is_known() -> None:
+    x = [1.0]
+    for x0, events in ((None, 1), (np.array(x), 0)):
+        sensor = Sensor(ZOH, DecayingTrigger(0.5, 0.25), x0)
+        assert len(updates(sensor.handle(measurement(0, 0, x), 0))) == events
+
+
+def test_a_known_start_is_propagated_to_the_first_measurement() -> None:
+    """A sensor that misses the measurement at t = 0 still knows x(0)."""
+    sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(1e-6, 1e-3), np.array([2.0]))
+    outputs = sensor.handle(measurement(0, 500_000_000, [2 * math.exp(-0.5)]), 0)
+    assert updates(outputs) == []
+    assert rows(outputs, 1)["x_s"].item() == pytest.approx(2 * math.exp(-0.5), rel=1e-14)
+
+
+def test_when_a_datagram_is_read_does_not_matter() -> None:
+    sent = []
+    for lateness_ns in (0, 5 * GRID_NS):
+        sensor, outputs = Sensor(ZOH, DecayingTrigger(0.2, 0.1)), []
+        for k in range(200):
+            message = measurement(k, k * GRID_NS, [math.sin(3 * k * GRID_NS * 1e-9)])
+            outputs += sensor.handle(message, k * GRID_NS + lateness_ns)
+        sent.append([(m.sequence, m.t_ns, m.vector.tobytes()) for m in updates(outputs)])
+    assert sent[0] == sent[1]
+    assert len(sent[0]) > 10
+
+
+def test_the_sensor_acts_on_measurements_only() -> None:
+    sensor = Sensor(ZOH, DecayingTrigger(0.5, 0.25))
+    sensor.handle(measurement(0, 0, [1.0]), 0)
+    assert sensor.next_deadline_ns() is None
+    assert sensor.on_timer(10**9) == ()
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_the_sensor_of_a_scenario_knows_the_model_not_the_plant(
+    content: dict[str, Any], mode: str
+) -> None:
+    content |= {"mode": mode}
+    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
+    content["network"]["initial_sync"] = "known_state"
+    content["trigger"] = {"beta": 1.0, "alpha_per_s": 0.5, "weight": [[2.0, 0.0], [0.0, 1.0]]}
+    sensor = sensor_of(resolve(validate(content, "here")))
+    (row,) = rows(sensor.handle(measurement(0, 10**9, [0.0, 0.0]), 10**9), 2)
+    # ẍ = u with u = −x − 1.5 ẋ from (1, 0): by hand for the closed loop, or held.
+    w = math.sqrt(1 - 0.75**2)
+    modelled = [
+        math.exp(-0.75) * (math.cos(w) + 0.75 / w * math.sin(w)),
+        -math.exp(-0.75) / w * math.sin(w),
+    ]
+    expected = np.array(modelled if mode == "model" else [1.0, 0.0])
+    np.testing.assert_allclose(row["x_s"], expected, rtol=1e-12)
+    assert row["e_s_norm"] == pytest.approx(math.hypot(2 * expected[0], expected[1]), rel=1e-12)
+    assert row["threshold"] == pytest.approx(math.exp(-0.5), rel=1e-14)
+
+
+def test_a_scenario_without_a_known_start_transmits_at_once(content: dict[str, Any]) -> None:
+    sensor = sensor_of(resolve(validate(content, "here")))
+    assert sensor.x_s is None
+    assert len(updates(sensor.handle(measurement(0, 0, [1.0, 0.0]), 0))) == 1
