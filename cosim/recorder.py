@@ -46,10 +46,16 @@ class Recorder:
         run_dir: the run's directory.
         plane: the control plane.
         view: shows the run; None does without.
+        live: where the run can be watched, for the person who asked.
     """
 
     def __init__(
-        self, scenario: Scenario, run_dir: Path, plane: Plane, view: RunView | None
+        self,
+        scenario: Scenario,
+        run_dir: Path,
+        plane: Plane,
+        view: RunView | None,
+        live: str | None = None,
     ) -> None:
         self._loop: Loop = loop_of(scenario)
         self._types = tables(self._loop.n, self._loop.m)
@@ -69,6 +75,7 @@ class Recorder:
         self._out_of_order = False
         self._account: dict[str, Any] = {
             "t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None,
+            "live": live,
         }  # fmt: skip
 
     @property
@@ -248,7 +255,9 @@ def _record(node: Node, *, live: bool) -> None:
     run_dir = Path(node.ticket.run_dir)
     live_view = LiveView() if live else None
     view = open_view(node.scenario, run_dir, node.ticket.run_id, live_view)
-    recorder = Recorder(node.scenario, run_dir, node.plane, view)
+    recorder = Recorder(
+        node.scenario, run_dir, node.plane, view, live_view.status if live_view else None
+    )
     node.join(None)
     shown_s = stop_s = None
     while not recorder.finished:
@@ -270,7 +279,10 @@ def _record(node: Node, *, live: bool) -> None:
     recorder.poll()
     recorder.show()
     record = recorder.finish()
-    view.close()
+    try:
+        view.close()
+    except ViewError as error:
+        print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
     if recorder.view_is_incomplete:
         write_view(record, run_dir, node.ticket.run_id)
 

@@ -31,6 +31,7 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
         TimeRemainingColumn(elapsed_when_finished=True),
     )
     shown = 0
+    live_told = False
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
         task: TaskID | None = None
 
@@ -43,7 +44,10 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
             task = progress.add_task(scenario.name, total=scenario.horizon_s, account="")
 
         def account(account: dict[str, Any]) -> None:
-            nonlocal shown
+            nonlocal shown, live_told
+            if account["live"] and not live_told:
+                live_told = True
+                console.print(f"live view: {account['live']}", highlight=False, soft_wrap=True)
             text = _account(account)
             if task is not None:
                 progress.update(task, completed=account["t_s"], account=text)

@@ -6,6 +6,7 @@ In a run it joins like every other process. On its own it serves any UDP program
 """
 
 import argparse
+import json
 import sys
 import time
 from collections import Counter
@@ -19,9 +20,8 @@ from netem.relay import Relay
 from noack.clock import RunClock
 from noack.errors import CallerError, ExitStatus
 from noack.io.loop import run_loop
-from noack.io.node import Node, Signals, run_process
-from noack.io.ticket import DEFAULT_SESSION
-from noack.io.udp import bind, parse_address
+from noack.io.node import Node, Signals, add_options, join_run
+from noack.io.udp import bind, parse_address, text_of
 from noack.machine import Notice, Record
 from noack.records import Fate
 from noack.scenario import Loss
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         description="A UDP relay that loses datagrams, but never more than MANSD in a row per "
         "flow. Without --listen it joins the run that `noack record SCENARIO` has opened.",
     )
-    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    add_options(parser)
     alone = parser.add_argument_group("on its own")
     alone.add_argument("--listen", metavar="HOST:PORT", help="where datagrams come in")
     alone.add_argument("--to", metavar="HOST:PORT", help="where survivors go")
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     if (options.listen is None) != (options.to is None):
         parser.error("--listen and --to go together")
     if options.listen is None:
-        return run_process("netem", _in_a_run, options.session)
+        return join_run("netem", _in_a_run, options)
     try:
         return _alone(options)
     except CallerError as error:
@@ -78,7 +78,8 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
     link = Link(_parse_loss(options.loss), options.mansd, options.seed, "relay")
     fates = _Fates()
     with closing(bind(port, "netem", "--listen", host)) as endpoint:
-        print(f"noack netem: {options.listen} → {options.to}, Ctrl-C ends", file=sys.stderr)
+        listening = text_of(endpoint.getsockname())
+        print(f"noack netem: {listening} → {options.to}, Ctrl-C ends", file=sys.stderr, flush=True)
         with (
             closing(Relay(endpoint, parse_address(options.to, "--to"))) as relay,
             Signals().handled() as signals,
@@ -92,6 +93,8 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
                 stop=lambda: signals.received is not None,
             )
     print(fates, file=sys.stderr)
+    if options.json:
+        print(json.dumps(fates.report(), indent=2))
     return ExitStatus.OK
 
 
@@ -129,6 +132,11 @@ class _Fates:
 
     def flush(self) -> None:
         """Nothing is gathered."""
+
+    def report(self) -> dict[str, int]:
+        """The counts."""
+        counts = {fate.name.lower(): self._fates[fate] for fate in Fate}
+        return counts | {"longest_drop_run": self._longest_run}
 
     def __str__(self) -> str:
         counts = ", ".join(f"{self._fates[fate]} {fate.name.lower()}" for fate in Fate)

@@ -36,8 +36,8 @@ from noack.wire import Decoder, Encoder, Flow, Message
 
 T = TypeVar("T")
 
-_JOIN_TIMEOUT_S = 30.0
-_MANUAL_JOIN_TIMEOUT_S = 3600.0
+_JOIN_TIMEOUT_S = 24 * 3600.0
+"""A person may take long to start the other processes; who does not want to wait, interrupts."""
 _GOODBYE_TIMEOUT_S = 5.0
 _GRACE_S = 0.15
 """Wall time after the horizon in which what is still under way arrives."""
@@ -112,6 +112,7 @@ class Node:
         self.plane = plane
         self._signals = signals
         self._ended: str | None = None
+        self._joining = False
         self.report: dict[str, Any] = {}
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
@@ -124,10 +125,11 @@ class Node:
             PeerError: the run never started.
         """
         hello = {"pid": os.getpid(), "address": address}
-        timeout_s = _JOIN_TIMEOUT_S if self.ticket.launched else _MANUAL_JOIN_TIMEOUT_S
+        self._joining = True
         start = self.plane.request(
-            "join", hello, timeout_s=timeout_s, give_up=lambda: self.stopping
+            "join", hello, timeout_s=_JOIN_TIMEOUT_S, give_up=lambda: self.stopping
         )
+        self._joining = False
         self.clock = RunClock(start["epoch_ns"], self.scenario.speed)
         return {role: (host, port) for role, (host, port) in start["addresses"].items()}
 
@@ -203,6 +205,9 @@ class Node:
                 self._ended = reason
             elif self.ticket.launched and _lifeline_cut():
                 self._ended = LAUNCHER_GONE
+            elif self._joining and self.plane.coordinator_gone():
+                # Once the loop runs, it goes on without the control plane.
+                self._ended = "the run's coordinator is gone"
         return self._ended
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
@@ -254,19 +259,24 @@ def run_process(
         return signals.status
 
 
-def main(
-    role: str,
-    body: Callable[[Node], None],
-    arguments: Sequence[str] | None = None,
-) -> ExitStatus:
-    """Command line of one process: ``python -m PACKAGE [--session NAME]``."""
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every process takes."""
+    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+
+
+def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
+    """Command line of one process that does nothing but join a run."""
     parser = argparse.ArgumentParser(
         prog=f"noack {role}",
         description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
     )
-    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
-    options = parser.parse_args(arguments)
+    add_options(parser)
+    return join_run(role, body, parser.parse_args(arguments))
+
+
+def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
+    """Join a run with the options of :func:`add_options`."""
 
     def body_and_report(node: Node) -> None:
         body(node)
@@ -281,7 +291,7 @@ def _admission(role: str, session: str, signals: Signals) -> Ticket:
         return loads(sys.stdin.buffer.readline().decode())
     ticket = wait_for_ticket(
         session,
-        _MANUAL_JOIN_TIMEOUT_S,
+        _JOIN_TIMEOUT_S,
         lambda: signals.received is not None,
         lambda path: print(
             f"noack {role}: waiting for `noack record SCENARIO` (session {session!r})",

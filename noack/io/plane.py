@@ -14,6 +14,7 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.errors import PeerError
+from noack.topology import COORDINATOR
 
 _LEASE_MS = 2000
 _CONNECT_MS = 5000
@@ -71,6 +72,10 @@ class Plane:
         self._token = self.session.liveliness().declare_token(self.key("alive", role))
         self._stops = self.session.declare_subscriber(self.key("stop"), RingChannel(8))
         self._stop_reason: str | None = None
+        self._coordinator = self.session.liveliness().declare_subscriber(
+            self.key("alive", COORDINATOR), RingChannel(8), history=True
+        )
+        self._coordinator_gone = False
 
     def __enter__(self) -> Self:
         return self
@@ -94,6 +99,12 @@ class Plane:
             if sample is not None:
                 self._stop_reason = sample.payload.to_string() or "stopped"
         return self._stop_reason
+
+    def coordinator_gone(self) -> bool:
+        """Whether the coordinator was there and has disappeared."""
+        while (life := self._coordinator.try_recv()) is not None:
+            self._coordinator_gone = life.kind == zenoh.SampleKind.DELETE
+        return self._coordinator_gone
 
     def request_stop(self, reason: str) -> None:
         """Ask every process of the run to end."""

@@ -2,12 +2,13 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,23 @@ from tests.integration.conftest import Running, noack_command, settings, wait_fo
 ROLES = ("plant", "sensor", "controller", "netem")
 
 
-def start_by_hand(role: str, tmp_path: Path) -> subprocess.Popen[str]:
+@pytest.fixture
+def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    """Start one process as a person would; whatever is left is killed at the end."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(role: str) -> subprocess.Popen[str]:
+        started.append(_start_by_hand(role, tmp_path))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+            process.communicate()
+
+
+def _start_by_hand(role: str, tmp_path: Path) -> subprocess.Popen[str]:
     return subprocess.Popen(
         noack_command(role, "--json"),
         stdin=subprocess.DEVNULL,
@@ -29,8 +46,12 @@ def start_by_hand(role: str, tmp_path: Path) -> subprocess.Popen[str]:
     )
 
 
-def test_five_terminals_in_any_order(start: Callable[..., Running], tmp_path: Path) -> None:
-    early = [start_by_hand(role, tmp_path) for role in ROLES[:2]]
+def test_five_terminals_in_any_order(
+    start: Callable[..., Running],
+    by_hand: Callable[[str], subprocess.Popen[str]],
+    tmp_path: Path,
+) -> None:
+    early = [by_hand(role) for role in ROLES[:2]]
     recording = start(*settings(speed=5.0, horizon_s=10.0), command=("record", "lane_following"))
     (folder,) = [tmp_path / f"noack-{os.getuid()}"]
     ticket = folder / "default.json"
@@ -38,7 +59,7 @@ def test_five_terminals_in_any_order(start: Callable[..., Running], tmp_path: Pa
     assert stat.S_IMODE(ticket.stat().st_mode) == 0o600
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     key = json.loads(ticket.read_text())["key"].encode()
-    late = [start_by_hand(role, tmp_path) for role in ROLES[2:]]
+    late = [by_hand(role) for role in ROLES[2:]]
     finished = recording.finish()
     assert finished.status == 0, finished.stderr
     assert finished.summary["missing_samples"] == 0
@@ -54,10 +75,10 @@ def test_five_terminals_in_any_order(start: Callable[..., Running], tmp_path: Pa
 
 
 def test_a_process_that_a_person_ends_is_named(
-    start: Callable[..., Running], tmp_path: Path
+    start: Callable[..., Running], by_hand: Callable[[str], subprocess.Popen[str]]
 ) -> None:
     recording = start(*settings(speed=5.0, horizon_s=500.0), command=("record", "lane_following"))
-    processes = {role: start_by_hand(role, tmp_path) for role in ROLES}
+    processes = {role: by_hand(role) for role in ROLES}
     recording.wait_started()
     processes["sensor"].send_signal(signal.SIGINT)
     finished = recording.finish()
@@ -73,32 +94,32 @@ def test_netem_serves_any_udp_program(loss: str, expected_run: int) -> None:
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
     ):
         server.bind(("127.0.0.1", 0))
         server.settimeout(20)
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-        probe.close()
-        relay = subprocess.Popen(
-            [
-                sys.executable, "-m", "netem", "--listen", f"127.0.0.1:{port}",
-                "--to", f"127.0.0.1:{server.getsockname()[1]}", "--loss", loss, "--mansd", "3",
-            ],
-            stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert relay.stderr is not None
-        assert "Ctrl-C ends" in relay.stderr.readline()
-        for number in range(40):
-            client.sendto(b"%d" % number, ("127.0.0.1", port))
-        stride = expected_run + 1
-        arrived = [int(server.recv(100)) for _ in range(40 // stride)]
-        relay.send_signal(signal.SIGINT)
-        said = relay.stderr.read()
-        relay.wait(timeout=20)
+        destination = f"127.0.0.1:{server.getsockname()[1]}"
+        command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to", destination]
+        command += ["--loss", loss, "--mansd", "3", "--json"]
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as relay:
+            assert relay.stderr is not None
+            found = re.search(r"127\.0\.0\.1:(\d+) → ", relay.stderr.readline())
+            assert found
+            for number in range(40):
+                client.sendto(b"%d" % number, ("127.0.0.1", int(found[1])))
+            stride = expected_run + 1
+            arrived = [int(server.recv(100)) for _ in range(40 // stride)]
+            relay.send_signal(signal.SIGINT)
+            stdout, _ = relay.communicate(timeout=20)
     assert relay.returncode == 0
     assert arrived == list(range(0, 40, stride))
-    assert f"longest drop run {expected_run}" in said
+    assert json.loads(stdout) == {
+        "delivered": 0 if expected_run else 40,
+        "dropped": 30 if expected_run else 0,
+        "forced": 10 if expected_run else 0,
+        "longest_drop_run": expected_run,
+    }
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ def datagram(
     version: int = 1,
     flow: int = 2,
     dimension: int | None = None,
+    reserved: int = 0,
     run_id: int = RUN,
     sequence: int = 0,
     t_ns: int = 0,
@@ -46,7 +47,7 @@ def datagram(
             version.to_bytes(1, "little"),
             flow.to_bytes(1, "little"),
             (len(values) if dimension is None else dimension).to_bytes(2, "little"),
-            b"\0\0",
+            reserved.to_bytes(2, "little"),
             run_id.to_bytes(8, "little"),
             sequence.to_bytes(8, "little"),
             t_ns.to_bytes(8, "little", signed=True),
@@ -278,7 +279,7 @@ def test_a_header_is_read_from_whatever_begins_like_one(head: bytes) -> None:
         assert read_header(head) is None
 
 
-@pytest.mark.parametrize("shape", [(0,), (65,), (), (2, 2), (1, 3)])
+@pytest.mark.parametrize("shape", [(0,), (65,), (2, 2), (1, 3)])
 def test_only_vectors_of_1_to_64_entries_can_be_sent(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
         Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))
@@ -290,6 +291,12 @@ def test_a_key_has_32_bytes(size: int) -> None:
         Encoder(RUN, bytes(size))
     with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
         Decoder(Flow.UPDATE, 3, RUN, bytes(size))
+
+
+def test_the_reserved_bytes_are_covered_by_the_tag_but_mean_nothing() -> None:
+    data = datagram([1.0, 2.0, 3.0], reserved=0xFFFF)
+    assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG)
+    assert new_decoder().decode(data) is not None
 
 
 def test_a_decoded_vector_is_the_receivers_own() -> None:
