@@ -21,6 +21,7 @@ from noack.records import (
     SENSOR_MEASUREMENT,
     Fate,
 )
+from noack.theory.assumptions import assumptions
 from noack.topology import LOOP_ROLES
 
 Summary = dict[str, Any]
@@ -40,7 +41,9 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     joined = join_all(record)
     residual = identity_residual(record, joined)
+    in_common = ~np.isnan(residual)
     states = record[PLANT_STEP]["x"]
+    missing, lost = _missing(record), _lost(record)
     violations = [n for n in record.notices if n["level"] == "violation"]
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
     return {
@@ -59,10 +62,11 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
             {"t_s": n["t_ns"] * 1e-9, "process": n["process"], "what": n["text"]}
             for n in violations
         ],
-        "missing_samples": sum(_missing(record).values()),
-        "missing_by_table": {table: n for table, n in _missing(record).items() if n},
-        "lost_outside_netem": sum(_lost(record).values()),
-        "lost_by_leg": {leg: n for leg, n in _lost(record).items() if n},
+        "assumptions": [assumption._asdict() for assumption in assumptions(scenario)],
+        "missing_samples": sum(missing.values()),
+        "missing_by_table": {table: n for table, n in missing.items() if n},
+        "lost_outside_netem": sum(lost.values()),
+        "lost_by_leg": {leg: n for leg, n in lost.items() if n},
         "rejected_datagrams": {
             role: report["channel"]["rejected"]
             for role, report in record.reports.items()
@@ -74,8 +78,8 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
         "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
         "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
-        "sup_e_c_norm": _or_none(np.nanmax, joined.e_c_norm[~np.isnan(joined.e_c_norm)]),
-        "identity_residual_max": _or_none(np.max, residual[~np.isnan(residual)]),
+        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[in_common]),
+        "identity_residual_max": _or_none(np.max, residual[in_common]),
         "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES},
         "latency_us": _latency(record),
         "realtime": {role: report["realtime"] for role, report in record.reports.items()},

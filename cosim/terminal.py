@@ -15,7 +15,9 @@ from cosim.launch import Outcome, Watcher
 from cosim.record import RECORDING_FILE
 from cosim.summary import Summary
 from noack.scenario import Scenario
+from noack.theory.assumptions import Verdict
 
+_QUANTILES = ("p50", "p99", "p999", "max")
 _PLAIN_LINES = 10
 """Progress lines of a run whose terminal cannot redraw one."""
 
@@ -73,6 +75,8 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     summary = outcome.summary
     console.print(_run_table(summary))
     console.print(_timing_table(summary))
+    _print_realtime(console, summary["realtime"])
+    _print_assumptions(console, summary["assumptions"])
     for violation in summary["assumption_violations"]:
         console.print(
             f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
@@ -119,25 +123,41 @@ def _run_table(summary: Summary) -> Table:
 
 def _timing_table(summary: Summary) -> Table:
     table = Table(title="timing, wall µs")
-    for heading in ("", "p50", "p99", "p99.9", "max", "steps", "late", "real-time settings"):
-        table.add_column(
-            heading, justify="left" if heading in ("", "real-time settings") else "right"
-        )
+    for heading in ("", "p50", "p99", "p99.9", "max", "count", "late"):
+        table.add_column(heading, justify="right" if heading else "left")
     for role, late in summary["lateness_us"].items():
         table.add_row(
             f"{role} lateness",
-            *(_whole(late[key]) for key in ("p50", "p99", "p999", "max")),
+            *(_whole(late[key]) for key in _QUANTILES),
             str(late["steps"]),
             str(late["late_steps"]),
-            _settings(summary["realtime"].get(role)),
         )
     latency = summary["latency_us"]
     table.add_row(
-        "event → update",
-        *(_whole(latency[key]) for key in ("p50", "p99", "p999", "max")),
-        str(latency["updates"]), "", "",
-    )  # fmt: skip
+        "event → update", *(_whole(latency[key]) for key in _QUANTILES), str(latency["updates"]), ""
+    )
     return table
+
+
+def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
+    """One line for all processes that were granted the same."""
+    roles_by_settings: dict[str, list[str]] = {}
+    for role, granted in realtime.items():
+        text = ", ".join(f"{name} {verdict}" for name, verdict in granted.items())
+        roles_by_settings.setdefault(text, []).append(role)
+    for text, roles in roles_by_settings.items():
+        console.print(f"real-time settings of {', '.join(roles)}: {text}", highlight=False)
+
+
+def _print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> None:
+    console.print("the paper's assumptions")
+    for assumption in assumptions:
+        holds = assumption["verdict"] == Verdict.HOLDS
+        mark = "[green]holds   [/]" if holds else "[yellow]violated[/]"
+        console.print(
+            f"  {mark}  {assumption['what']} ({assumption['source']}): {assumption['why']}",
+            highlight=False,
+        )
 
 
 def _mode(summary: Summary) -> str:
@@ -158,17 +178,6 @@ def _number(value: float | None) -> str:
 
 def _whole(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}"
-
-
-def _settings(granted: dict[str, str] | None) -> str:
-    if granted is None:
-        return "unknown"
-    taken = [name for name, verdict in granted.items() if verdict == "granted"]
-    refused = [name for name, verdict in granted.items() if verdict.startswith("refused")]
-    parts = [", ".join(taken) or "none granted"]
-    if refused:
-        parts.append(f"refused: {', '.join(refused)}")
-    return "; ".join(parts)
 
 
 def print_json(document: object) -> None:

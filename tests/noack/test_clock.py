@@ -61,9 +61,7 @@ def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
 
 
 @given(speeds, st.integers(0, 10**12), st.integers(0, 10**13))
-def test_whoever_waits_as_told_wakes_at_the_deadline(
-    speed: float, wall_ns: int, t_ns: int
-) -> None:
+def test_whoever_waits_as_told_wakes_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
     wall = Wall()
     clock = RunClock(EPOCH_NS, speed, wall)
     wall.now_ns = EPOCH_NS + wall_ns

@@ -129,7 +129,9 @@ def test_cached_and_fresh_matrices_are_the_same_bits(
             part.tobytes() for part in discretise(A, B, dt_ns)
         ]
         assert free(state, dt_ns).tobytes() == Propagator(A)(state, dt_ns).tobytes()
-        assert held(state, u, dt_ns).tobytes() == HeldInputPropagator(A, B)(state, u, dt_ns).tobytes()
+        assert (
+            held(state, u, dt_ns).tobytes() == HeldInputPropagator(A, B)(state, u, dt_ns).tobytes()
+        )
 
 
 def test_propagators_keep_their_own_matrices() -> None:

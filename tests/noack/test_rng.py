@@ -32,7 +32,7 @@ def test_a_stream_is_what_it_is_documented_to_be() -> None:
 def test_the_numbers_of_published_runs_stay_the_same() -> None:
     """Written down once: a scenario's seeds must mean the same draws in every later version."""
     found = stream(2, "netem", "update", "loss", "0").random(3)
-    assert found.tolist() == PUBLISHED
+    assert found.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]
 
 
 def test_other_seeds_and_names_give_other_numbers() -> None:

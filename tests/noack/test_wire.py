@@ -82,7 +82,9 @@ class Vector(NamedTuple):
 def published_vectors() -> list[Vector]:
     found = []
     for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL):
-        fields = dict(re.findall(r"^([a-z_ ]+): +(.*?)(?=^[a-z]|\Z)", block, re.DOTALL | re.MULTILINE))
+        fields = dict(
+            re.findall(r"^([a-z_ ]+): +(.*?)(?=^[a-z]|\Z)", block, re.DOTALL | re.MULTILINE)
+        )
         found.append(
             Vector(
                 fields["flow"].strip(),

@@ -13,7 +13,9 @@ def test_the_threshold_decays_exponentially_from_beta(beta: float, alpha: float,
     trigger = DecayingTrigger(beta, alpha)
     assert trigger.threshold(0) == beta
     # The exponent, up to 600, carries its own rounding into the result.
-    assert trigger.threshold(t_ns) == pytest.approx(beta * math.e ** (-alpha * t_ns / 1e9), rel=1e-12)
+    assert trigger.threshold(t_ns) == pytest.approx(
+        beta * math.e ** (-alpha * t_ns / 1e9), rel=1e-12
+    )
 
 
 def test_the_threshold_never_falls_below_its_floor() -> None:
