@@ -120,8 +120,8 @@ def view(
 ) -> int:
     """Open a recording in the rerun viewer."""
     from cosim.launch import latest_run
-    from cosim.live_view import view_recording
     from cosim.record import RECORDING_FILE
+    from cosim.viewer.live import view_recording
 
     path = recording or latest_run(runs)
     path = path / RECORDING_FILE if path.is_dir() else path

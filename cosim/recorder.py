@@ -11,8 +11,6 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.feed import ViewFeed
-from cosim.live_view import LiveView
 from cosim.record import (
     RECORDING_FILE,
     REPORTS_FILE,
@@ -20,7 +18,9 @@ from cosim.record import (
     RunRecord,
     finish_record,
 )
-from cosim.view import RunView, ViewError
+from cosim.viewer.feed import ViewFeed
+from cosim.viewer.live import LiveView
+from cosim.viewer.recording import RunView, ViewError
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
 from noack.io.node import LAUNCHER_GONE, Node, run_process

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.feed import packet_headers
 from cosim.join import identity_residual, join_all
 from cosim.record import Rows, RunRecord
+from cosim.viewer.feed import packet_headers
 from noack.io.node import HORIZON
 from noack.records import (
     CONTROLLER_DELIVERY,

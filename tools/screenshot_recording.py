@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cosim.live_view import RecordingServer
+from cosim.viewer.server import RecordingServer
 from noack.errors import CallerError, MachineError, NoackError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")

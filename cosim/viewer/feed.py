@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cosim.join import ControllerTrack, controller_track, initial_track, join
 from cosim.record import Rows
-from cosim.view import RunView
+from cosim.viewer.recording import RunView
 from noack.clock import NS_PER_S
 from noack.records import (
     CONTROLLER_DELIVERY,
@@ -60,7 +60,8 @@ class ViewFeed:
     def log(self, notice: Mapping[str, Any]) -> None:
         """Take a line of the run's log."""
         text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
-        self._view.log(int(notice["t_ns"]), str(notice["level"]), str(text))
+        level = "WARN" if notice["level"] == "violation" else "INFO"
+        self._view.log(int(notice["t_ns"]), level, str(text))
 
     def advance(self, *, final: bool = False) -> None:
         """Pass on what is complete; at the end, everything."""

@@ -19,9 +19,10 @@ import rerun.chunk
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
-from cosim import blueprint
-from cosim.live_view import RECORDING, LiveView, RecordingServer, has_display, view_recording
-from cosim.view import APPLICATION_ID, RunView, ViewError
+from cosim.viewer import blueprint
+from cosim.viewer.live import LiveView, has_display, view_recording
+from cosim.viewer.recording import APPLICATION_ID, RunView, ViewError
+from cosim.viewer.server import RECORDING, RecordingServer
 from noack.errors import CallerError
 
 ROOT = Path(__file__).parents[2]

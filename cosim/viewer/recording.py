@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from cosim import blueprint as bp
-from cosim.live_view import LiveView
+from cosim.viewer import blueprint as bp
+from cosim.viewer.live import LiveView
 from noack.errors import MachineError
 
 Floats = npt.NDArray[np.float64]
