@@ -49,7 +49,7 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
             nonlocal shown, live_told
             if account["live"] and not live_told:
                 live_told = True
-                console.print(f"live view: {account['live']}", highlight=False, soft_wrap=True)
+                console.print(account["live"], highlight=False, soft_wrap=True)
             text = _account(account)
             if task is not None:
                 progress.update(task, completed=account["t_s"], account=text)

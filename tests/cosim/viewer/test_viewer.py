@@ -25,7 +25,7 @@ from cosim.viewer.recording import APPLICATION_ID, RunView, ViewError
 from cosim.viewer.server import RECORDING, RecordingServer
 from noack.errors import CallerError
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 Floats = NDArray[np.float64]
 
 STATES, INPUTS = ["V", "r", "psi", "Y_g"], ["u_1", "u_2"]
