@@ -3,12 +3,14 @@
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
+from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from cosim.run_dir import RECORDING_FILE, latest_run
 from noack.errors import CallerError, ExitStatus, NoackError
 from noack.scenario import Scenario
 from noack.scenario_file import dumps as scenario_toml
@@ -119,8 +121,6 @@ def view(
     json: JsonOption = False,
 ) -> int:
     """Open a recording in the rerun viewer."""
-    from cosim.launch import latest_run
-    from cosim.record import RECORDING_FILE
     from cosim.viewer.live import view_recording
 
     path = recording or latest_run(runs)
@@ -141,8 +141,8 @@ def summary(
     json: JsonOption = False,
 ) -> int:
     """Show what became of a run; finishes the record of one that was cut short."""
-    from cosim.launch import latest_run, reopen
-    from cosim.terminal import print_outcome
+    from cosim.conclude import reopen
+    from cosim.tables import print_outcome
 
     outcome = reopen(run_dir or latest_run(runs))
     if json:
@@ -231,11 +231,16 @@ def _run(
     live: bool,
     json: bool,
 ) -> int:
+    # Each process of a run waits for the slowest: what is not needed yet is imported later.
     from cosim.launch import launch
-    from cosim.terminal import print_outcome, progress_line
+    from cosim.progress import progress_line
 
     with progress_line(Console(stderr=True), scenario) as watcher:
-        outcome = launch(scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher)
+        ending = launch(scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher)
+    from cosim.conclude import conclude
+    from cosim.tables import print_outcome
+
+    outcome = conclude(ending)
     if json:
         _print_json(outcome.summary)
     else:
@@ -248,9 +253,7 @@ def _process_arguments(session: str, *, json: bool) -> list[str]:
 
 
 def _print_json(document: object) -> None:
-    from cosim.terminal import print_json
-
-    print_json(document)
+    print(dumps(document, indent=2, allow_nan=False))
 
 
 def _failed(message: str, status: ExitStatus) -> ExitStatus:

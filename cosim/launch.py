@@ -13,23 +13,13 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from cosim.coordinator import Coordinator
 from cosim.environment import environment
-from cosim.record import (
-    ENVIRONMENT_FILE,
-    RECORD,
-    SCENARIO_FILE,
-    SPOOL,
-    SUMMARY_FILE,
-    finish_record,
-    load_record,
-)
-from cosim.summary import Summary, dumps, summarise
-from noack.errors import CallerError, ExitStatus, MachineError, NeverStartedError
+from cosim.run_dir import ENVIRONMENT_FILE, SCENARIO_FILE, new_run_dir, point_to_latest
+from noack.errors import ExitStatus, NeverStartedError
 from noack.io.node import HORIZON, TICKET_ON_STDIN, Signals
 from noack.io.ticket import Ticket, new_ticket, published
 from noack.io.udp import LOOPBACK, free_tcp_port, require_free_tcp_port
@@ -48,17 +38,18 @@ _MODULES = {
 _POLL_S = 0.01
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S = 20.0
-LATEST = "latest"
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a run."""
+class Ending:
+    """How a run ended."""
 
     run_dir: Path
+    run_id: int
     status: ExitStatus
     reason: str
-    summary: Summary
+    startup_s: float | None = None
+    """Wall time from the launch to simulated time 0; None if nobody saw it."""
 
 
 @dataclass(frozen=True)
@@ -70,34 +61,6 @@ class Watcher:
     progress: Callable[[dict[str, Any]], None] = lambda account: None
 
 
-def new_run_dir(runs: Path, name: str) -> Path:
-    """Create a fresh run directory below ``runs``.
-
-    Raises:
-        MachineError: the directory cannot be created.
-    """
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    try:
-        runs.mkdir(parents=True, exist_ok=True)
-        for attempt in range(1000):
-            run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
-            with contextlib.suppress(FileExistsError):
-                run_dir.mkdir()
-                (run_dir / "logs").mkdir()
-                return run_dir
-    except OSError as error:
-        raise MachineError(f"{runs}: no run directory can be created: {error}") from None
-    raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
-
-
-def _point_to_latest(run_dir: Path) -> None:
-    scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
-    with contextlib.suppress(OSError):  # a convenience, not worth a run
-        scratch.unlink(missing_ok=True)
-        scratch.symlink_to(run_dir.name)
-        scratch.replace(run_dir.parent / LATEST)
-
-
 def launch(
     scenario: Scenario,
     runs: Path,
@@ -106,8 +69,8 @@ def launch(
     session: str | None = None,
     live: bool = False,
     watcher: Watcher | None = None,
-) -> Outcome:
-    """Run a scenario.
+) -> Ending:
+    """Run a scenario; :func:`cosim.conclude.conclude` makes its record whole.
 
     Args:
         scenario: as loaded; it is resolved here.
@@ -120,6 +83,7 @@ def launch(
     Raises:
         CallerError, MachineError: the run could not begin.
     """
+    began_ns = time.monotonic_ns()
     resolved = resolve(scenario)
     control = resolved.ports.control
     if control:
@@ -139,37 +103,8 @@ def launch(
         status, reason = run.watch(coordinator, signals)
     if coordinator.epoch_ns is None:
         raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
-    return conclude(run_dir, ticket.run_id, status, reason)
-
-
-def conclude(run_dir: Path, run_id: int, status: ExitStatus, reason: str) -> Outcome:
-    """Finish what a dead recorder left undone, and write the summary."""
-    if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
-        record = finish_record(run_dir)
-        from cosim.recorder import write_view  # imports rerun, which a good run does not need here
-
-        write_view(record, run_dir, run_id)
-    else:
-        record = load_record(run_dir)
-    summary = summarise(record, int(status), reason)
-    (run_dir / SUMMARY_FILE).write_text(dumps(summary))
-    return Outcome(run_dir, status, reason, summary)
-
-
-def reopen(run_dir: Path) -> Outcome:
-    """Return the outcome of an earlier run; finish its record if nobody did.
-
-    Raises:
-        CallerError: it is not a run directory.
-    """
-    if not (run_dir / SCENARIO_FILE).is_file():
-        raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    path = run_dir / SUMMARY_FILE
-    if not path.is_file():
-        return conclude(run_dir, 0, ExitStatus.FAILED, "the launcher did not live to see the end")
-    summary = json.loads(path.read_text())
-    end = summary["exit"]
-    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+    startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
+    return Ending(run_dir, ticket.run_id, status, reason, startup_s)
 
 
 class _Run:
@@ -214,7 +149,7 @@ class _Run:
                     told = missing
                     self._watcher.waiting(missing)
             elif patience_s == float("inf"):
-                _point_to_latest(self._run_dir)
+                point_to_latest(self._run_dir)
                 self._watcher.started(self._run_dir)
                 patience_s = now_s + scenario.horizon_s / scenario.speed + _OVERTIME_S
             if (account := coordinator.progress()) is not None:
@@ -283,15 +218,3 @@ class _Run:
         said = lines[-1].removeprefix(f"noack {role}: ") if lines else f"exit status {code}"
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {said}"
-
-
-def latest_run(runs: Path) -> Path:
-    """Return the newest run directory below ``runs``.
-
-    Raises:
-        CallerError: there is none.
-    """
-    link = runs / LATEST
-    if not link.is_dir():
-        raise CallerError(f"{runs}: no run yet; `noack demo` makes one")
-    return link.resolve()

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
 from noack.errors import CallerError, MachineError
 from noack.io.spool import read_chunks
 from noack.io.telemetry import notices_of
@@ -25,13 +26,6 @@ from noack.topology import LOOP_ROLES
 
 Rows = NDArray[np.void]
 
-SCENARIO_FILE = "scenario.toml"
-REPORTS_FILE = "reports.json"
-RECORDING_FILE = "recording.rrd"
-SUMMARY_FILE = "summary.json"
-ENVIRONMENT_FILE = "environment.json"
-SPOOL = "spool"
-RECORD = "record"
 _NOTICES_FILE = "notices.jsonl"
 
 

@@ -11,13 +11,8 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.record import (
-    RECORDING_FILE,
-    REPORTS_FILE,
-    SPOOL,
-    RunRecord,
-    finish_record,
-)
+from cosim.record import RunRecord, finish_record
+from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
 from cosim.viewer.recording import RunView, ViewError

@@ -10,7 +10,6 @@ from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -20,6 +19,9 @@ _CACHED_STEPS = 4096
 
 def transition(generator: Matrix, dt_ns: int) -> Matrix:
     """The transition matrix e^{G dt}, shape (n, n), of ``dz/dt = G z`` over ``dt_ns``."""
+    # The slowest import of all, so that those who propagate nothing should not wait for it.
+    from scipy.linalg import expm
+
     return np.ascontiguousarray(expm(generator * (dt_ns * 1e-9)))
 
 

@@ -22,7 +22,9 @@ def test_each_row_comes_once_and_in_order_and_gaps_are_told(ranges: list[tuple[i
     assert rows.dtype == ROW
     told = [k for low, high in missing for k in range(low, high)]
     if present:
-        assert [k for k in told if k < present[-1]] == sorted(set(range(present[-1])) - set(present))
+        assert [k for k in told if k < present[-1]] == sorted(
+            set(range(present[-1])) - set(present)
+        )
 
 
 def test_gaps_are_half_open_ranges() -> None:

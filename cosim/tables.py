@@ -1,73 +1,14 @@
-"""What a person sees in the terminal: the live progress line and the table at the end."""
-
-import json
-import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
+"""The tables that a person sees at the end of a run."""
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from cosim.launch import Outcome, Watcher
-from cosim.record import RECORDING_FILE
+from cosim.conclude import Outcome
+from cosim.run_dir import RECORDING_FILE
 from cosim.summary import Summary
-from noack.scenario import Scenario
 from noack.theory.assumptions import Verdict
 
 _QUANTILES = ("p50", "p99", "p999", "max")
-_PLAIN_LINES = 10
-"""Progress lines of a run whose terminal cannot redraw one."""
-
-
-@contextmanager
-def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
-    """Show a run's progress while the context lasts."""
-    live = console.is_terminal
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[account]}"),
-        TimeRemainingColumn(elapsed_when_finished=True),
-    )
-    shown = 0
-    live_told = False
-    with Progress(*columns, console=console, disable=not live, transient=False) as progress:
-        task: TaskID | None = None
-
-        def waiting(roles: Sequence[str]) -> None:
-            if roles:
-                console.print(f"waiting for {', '.join(roles)}")
-
-        def started(run_dir: Path) -> None:
-            nonlocal task
-            task = progress.add_task(scenario.name, total=scenario.horizon_s, account="")
-
-        def account(account: dict[str, Any]) -> None:
-            nonlocal shown, live_told
-            if account["live"] and not live_told:
-                live_told = True
-                console.print(account["live"], highlight=False, soft_wrap=True)
-            text = _account(account)
-            if task is not None:
-                progress.update(task, completed=account["t_s"], account=text)
-            due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
-            if not live and due > shown:
-                shown = due
-                console.print(text, highlight=False, soft_wrap=True)
-
-        yield Watcher(waiting, started, account)
-
-
-def _account(account: dict[str, Any]) -> str:
-    norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.4f}"
-    return (
-        f"t {account['t_s']:7.3f} s  events {account['events']}  "
-        f"delivered {account['deliveries']}  longest drop run {account['longest_drop_run']}  "
-        f"‖x‖ {norm}"
-    )
 
 
 def print_outcome(console: Console, outcome: Outcome) -> None:
@@ -178,8 +119,3 @@ def _number(value: float | None) -> str:
 
 def _whole(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}"
-
-
-def print_json(document: object) -> None:
-    """Print one JSON document on standard output."""
-    print(json.dumps(document, indent=2, allow_nan=False))
