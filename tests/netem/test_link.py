@@ -110,6 +110,7 @@ def test_a_link_has_nothing_of_its_own_to_do() -> None:
         ({"initial_sync": "known_state"}, "ddFddFd"),
         ({"mansd": 0}, "FFFFFFF"),
         ({"enforce_mansd": False, "initial_sync": "known_state"}, "ddddddd"),
+        ({"enforce_mansd": False}, "Fdddddd"),
     ],
 )
 def test_the_link_of_a_scenario_keeps_its_promise(

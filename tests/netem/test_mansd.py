@@ -89,7 +89,7 @@ def assert_capped_rate(dropped: Flags, p: float, m: int) -> None:
 
 def test_without_a_cap_the_loss_model_decides(sequence: tuple[Loss, Flags]) -> None:
     _, lost = sequence
-    fates = decide(lost[:100_000], MansdCap(None))
+    fates = decide(lost[:100_000], MansdCap(None, first_delivered=False))
     np.testing.assert_array_equal(fates, np.where(lost[:100_000], Fate.DROPPED, Fate.DELIVERED))
 
 

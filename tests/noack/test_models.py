@@ -5,7 +5,7 @@ from noack.models import MODEL_PARAMETERS, NAMED_MODELS, double_integrator, lane
 
 
 def test_the_lane_model_is_the_papers() -> None:
-    """The equations of Section V, written out, with its nominal numbers, U = −12, d = 40, gain 1."""
+    """The equations of Section V, written out, with its numbers: U = −12, d = 40, gain 1."""
     model = lane_following({})
     rng = np.random.default_rng(0)
     (V, r, psi, Y_g), (u_1, u_2) = rng.uniform(-1, 1, 4), rng.uniform(-1, 1, 2)

@@ -42,7 +42,7 @@ def test_the_sum_is_the_sum_of_the_propagated_jumps(
     expected = np.zeros(3)
     for then_ns, e_s in jumps[newest + 1 :]:
         expected += expm(H * (t_ns - then_ns) * 1e-9) @ e_s
-    # Twelve terms, propagated in at most twelve roundings of some 1e-15, each grown by at most this.
+    # Twelve terms of at most twelve roundings, some 1e-15 each, grown by no more than this.
     np.testing.assert_allclose(missed.total(), expected, atol=1e-12 * GROWTH)
 
 

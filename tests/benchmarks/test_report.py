@@ -1,0 +1,142 @@
+import argparse
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from benchmarks._report import (
+    Benchmark,
+    Goal,
+    MeasurementError,
+    Peer,
+    Row,
+    cpu_times,
+    median,
+    run,
+    table_of,
+)
+
+KEYS = {"name", "value", "unit", "peer", "ratio", "goal", "holds"}
+
+
+@pytest.mark.parametrize(
+    ("goal", "found", "holds"),
+    [
+        (Goal("<=", 3), 3.0, True),
+        (Goal("<=", 3), 3.01, False),
+        (Goal("<", 3), 3.0, False),
+        (Goal(">=", 99.9), 99.9, True),
+        (Goal("==", 0), 1, False),
+    ],
+)
+def test_a_goal_compares_what_was_found_with_its_limit(
+    goal: Goal, found: float, holds: bool
+) -> None:
+    assert goal.holds(found) is holds
+
+
+def test_a_goal_is_about_the_ratio_if_there_is_a_peer() -> None:
+    row = Row("latency", 30.0, "µs", Peer("ping", 12.0), Goal("<=", 3))
+    assert row.ratio == 2.5
+    assert row.holds is True
+
+
+def test_a_goal_is_about_the_value_if_there_is_no_peer() -> None:
+    assert Row("missing", 1, "samples", goal=Goal("==", 0)).holds is False
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        Row("nothing asked", 1.0, "s"),
+        Row("not measured", None, "s", goal=Goal("<", 3)),
+        Row("no peer to compare with", 1.0, "s", Peer("cyclictest", None), Goal("<", 3)),
+        Row("not comparable", 1.0, "s", Peer("p", 1.0), Goal("<", 3), unjudged="no SCHED_FIFO"),
+    ],
+)
+def test_what_cannot_be_judged_neither_holds_nor_fails(row: Row) -> None:
+    assert row.holds is None
+
+
+def test_a_row_as_json_has_the_agreed_keys_and_says_why_it_was_not_judged() -> None:
+    plain = Row("p50", 3.0, "µs", Peer("ping", 1.5), Goal("<=", 3)).as_json()
+    assert plain == {
+        "name": "p50",
+        "value": 3.0,
+        "unit": "µs",
+        "peer": {"name": "ping", "value": 1.5},
+        "ratio": 2.0,
+        "goal": "<= 3",
+        "holds": True,
+    }
+    unjudged = Row("p99", 3.0, "µs", goal=Goal("<=", 3), note="n = 3", unjudged="refused").as_json()
+    assert unjudged.keys() == KEYS | {"note"}
+    assert unjudged["note"] == "refused; n = 3"
+    assert unjudged["holds"] is None
+
+
+def test_the_median_of_rounds_ignores_an_outlier() -> None:
+    assert median([12.0, 11.0, 900.0]) == 12.0
+
+
+def test_cpu_times_are_read_from_the_line_of_all_cores() -> None:
+    per_s = os.sysconf("SC_CLK_TCK")
+    ticks = [per_s * seconds for seconds in (10, 1, 5, 80, 2, 0, 1, 4, 3, 0)]
+    times = cpu_times("cpu  " + " ".join(map(str, ticks)) + "\ncpu0 1 1 1 1 1 1 1 1 1 1\n")
+    assert times.busy_s == 10 + 1 + 5 + 0 + 1
+    assert times.steal_s == 4
+    assert times.total_s == 17 + 80 + 2 + 4  # guest time, the last two, is part of user time
+
+
+def test_the_table_has_one_line_per_row() -> None:
+    rows = [Row("a", 1.0, "s", Peer("b", 2.0), Goal("<=", 1)), Row("c", None, "")]
+    assert table_of("title", rows).row_count == 2
+
+
+def benchmark(rows: list[Row]) -> Benchmark:
+    return Benchmark("example", "An example", lambda options: list(rows))
+
+
+def test_the_rows_are_written_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rows.json"
+    status = run([benchmark([Row("a", 1.5, "s", goal=Goal("<", 3))])], ["--json", str(path)])
+    assert status == 0
+    rows = json.loads(path.read_text())
+    assert rows[0] == Row("a", 1.5, "s", goal=Goal("<", 3)).as_json() | {"benchmark": "example"}
+    assert all(row.keys() >= KEYS for row in rows)
+    assert "An example" in capsys.readouterr().out
+
+
+def test_a_benchmark_that_cannot_be_carried_out_says_why_and_the_next_one_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(options: argparse.Namespace) -> list[Row]:
+        raise MeasurementError("no such program")
+
+    path = tmp_path / "rows.json"
+    status = run(
+        [Benchmark("broken", "Broken", fail), benchmark([Row("a", 1.0, "s")])],
+        ["--json", str(path)],
+    )
+    assert status == 1
+    rows = {row["name"]: row for row in json.loads(path.read_text())}
+    assert rows["broken"]["value"] is None
+    assert "no such program" in rows["broken"]["note"]
+    assert rows["a"]["value"] == 1.0
+    assert "no such program" in capsys.readouterr().out
+
+
+def test_options_of_a_benchmark_reach_it(capsys: pytest.CaptureFixture[str]) -> None:
+    seen: list[bool] = []
+
+    def measure(options: argparse.Namespace) -> list[Row]:
+        seen.append(options.install)
+        return []
+
+    def declare(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--install", action="store_true")
+
+    run([Benchmark("example", "An example", measure, declare)], ["--install"])
+    assert seen == [True]
+    assert capsys.readouterr().out

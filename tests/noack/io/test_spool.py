@@ -1,0 +1,110 @@
+import itertools
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosim.record import merge_rows
+from noack.errors import MachineError
+from noack.io.spool import SpoolWriter, read_chunks
+
+ROW = np.dtype([("number", "<i8")])
+
+
+def spool(folder: Path, writer: str, table: str, *batches: tuple[int, bytes]) -> Path:
+    with_writer = SpoolWriter(folder, writer)
+    for first, payload in batches:
+        with_writer.append(table, first, payload)
+    with_writer.close()
+    return folder / f"{table}.{writer}"
+
+
+def numbers(first: int, end: int) -> bytes:
+    return np.arange(first, end, dtype="<i8").tobytes()
+
+
+def test_batches_come_back_as_they_were_written(tmp_path: Path) -> None:
+    batches = [(0, b"abc"), (3, b""), (3, bytes(10_000)), (2**64 - 1, b"x")]
+    spool(tmp_path / "new" / "spool", "recorder", "plant_step", *batches)
+    assert list(read_chunks(tmp_path / "new" / "spool", "plant_step")) == batches
+
+
+def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
+    path = spool(tmp_path, "recorder", "plant_step", (7, b"abc"), (8, b"de"))
+    expected = struct.pack("<QQ", 7, 3) + b"abc" + struct.pack("<QQ", 8, 2) + b"de"
+    assert path.read_bytes() == expected
+
+
+def test_a_batch_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
+    writer = SpoolWriter(tmp_path, "recorder")
+    for k in range(3):
+        writer.append("plant_step", k, b"x")
+        assert [first for first, _ in read_chunks(tmp_path, "plant_step")] == list(range(k + 1))
+    writer.close()
+
+
+def test_a_chunk_that_was_cut_short_is_ignored_wherever_it_was_cut(tmp_path: Path) -> None:
+    batches = [(0, b"first"), (5, b"second")]
+    path = spool(tmp_path, "recorder", "plant_step", *batches)
+    whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
+
+
+def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
+    spool(tmp_path, "recorder", "step", (0, b"a"))
+    spool(tmp_path, "recorder", "step_more", (0, b"b"))
+    spool(tmp_path, "plant", "step", (1, b"c"))
+    assert sorted(read_chunks(tmp_path, "step")) == [(0, b"a"), (1, b"c")]
+    assert list(read_chunks(tmp_path, "step_more")) == [(0, b"b")]
+    assert list(read_chunks(tmp_path, "nothing")) == []
+    assert list(read_chunks(tmp_path / "nowhere", "step")) == []
+
+
+def test_a_reopened_file_is_continued(tmp_path: Path) -> None:
+    for first in (0, 1):
+        spool(tmp_path, "recorder", "step", (first, b"a"))
+    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0, 1]
+
+
+@given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
+def test_what_was_spooled_twice_is_merged(
+    tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
+) -> None:
+    """The recorder kept the first rows, the process all of them, cut into other batches."""
+    folder = tmp_path_factory.mktemp("spool")
+    for writer, cuts, end in (("recorder", cuts_a, 13), ("plant", cuts_b, 20)):
+        edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
+        batches = [(a, numbers(a, b)) for a, b in itertools.pairwise(edges)]
+        spool(folder, writer, "step", *batches)
+    chunks = [(first, np.frombuffer(data, ROW)) for first, data in read_chunks(folder, "step")]
+    missing, rows = merge_rows(chunks, ROW)
+    assert missing == []
+    assert rows["number"].tolist() == list(range(20))
+
+
+def test_a_folder_that_cannot_be_written_is_the_machines_error(tmp_path: Path) -> None:
+    writer = SpoolWriter(tmp_path / "spool", "recorder")
+    (tmp_path / "spool").rmdir()
+    with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
+        writer.append("step", 0, b"a")
+
+
+def test_a_disk_that_fills_up_is_told_by_the_batch_it_cuts_short(tmp_path: Path) -> None:
+    """Not by the next one: there may be none, and what follows would be read as rows."""
+    resource = pytest.importorskip("resource")
+    writer = SpoolWriter(tmp_path, "recorder")
+    writer.append("step", 0, bytes(100))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # as if the disk had 34 bytes left
+    try:
+        with pytest.raises(MachineError, match="the record cannot be written"):
+            writer.append("step", 100, bytes(100))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        writer.close()
+    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
