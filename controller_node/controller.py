@@ -86,7 +86,7 @@ class Controller:
                 Notice(
                     event_ns,
                     "violation",
-                    f"no delivered t_0: the first {dropouts} updates of the flow were lost",
+                    f"no delivered t_0: {dropouts} updates were lost before the first delivery",
                 )
             )
         self._last_sequence = message.sequence

@@ -75,7 +75,13 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
     if options.mansd is not None and options.mansd < 0:
         raise CallerError(f"--mansd {options.mansd}: must be 0 or more")
     host, port = parse_address(options.listen, "--listen")
-    link = Link(_parse_loss(options.loss), options.mansd, options.seed, "relay")
+    link = Link(
+        _parse_loss(options.loss),
+        options.mansd,
+        options.seed,
+        "relay",
+        first_delivered=options.mansd is not None,
+    )
     fates = _Fates()
     with closing(bind(port, "netem", "--listen", host)) as endpoint:
         listening = text_of(endpoint.getsockname())

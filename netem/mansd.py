@@ -11,13 +11,13 @@ class MansdCap:
 
     Args:
         mansd: M − 1, or None for no cap.
-        first_delivered: the counter starts full, so that the flow's first datagram passes: the
-            paper's delivered t_0.
+        first_delivered: the counter starts full, so that the flow's first datagram passes, cap or
+            not: the paper's delivered t_0.
     """
 
     def __init__(self, mansd: int | None, *, first_delivered: bool = True) -> None:
         self._mansd = mansd
-        self._full = first_delivered and mansd is not None
+        self._full = first_delivered
         self.run = 0
         """Successive drops up to and including the last datagram."""
 

@@ -31,8 +31,13 @@ def lane_following(parameters: Mapping[str, float]) -> NamedModel:
     States: lateral velocity V, yaw rate r, yaw ψ, lateral position Y_g of the centre of gravity.
     ``speed`` is U (negative: "considered in the opposite direction"), ``look_ahead`` is d; the two
     inputs are steered alike by ``u = gain · (Y_g/d − ψ)``. Units follow the paper (SI, radian).
+
+    Raises:
+        ValueError: the look-ahead distance is 0.
     """
     p = {**LANE_FOLLOWING_DEFAULTS, **parameters}
+    if p["look_ahead"] == 0:
+        raise ValueError("parameters.look_ahead: the look-ahead distance cannot be 0")
     A = np.array(
         [
             [p["a11"], p["a12"], 0.0, 0.0],

@@ -8,11 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from noack.errors import CallerError
 from noack.linear import Matrix, Vector
 from noack.models import NAMED_MODELS
 from noack.rng import stream
-from noack.scenario import Model, Scenario, require_shape
+from noack.scenario import Model, Scenario
 
 
 @dataclass(frozen=True)
@@ -50,59 +49,10 @@ class Loop:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """Return the scenario with every named or drawn quantity made explicit.
-
-    Raises:
-        CallerError: a matrix or vector has the wrong shape, or W is singular.
-    """
-    try:
-        return _resolve(scenario)
-    except ValueError as error:
-        raise CallerError(str(error)) from None
-
-
-def loop_of(resolved: Scenario) -> Loop:
-    """Return the matrices of a resolved scenario."""
-    model, plant = resolved.model, resolved.plant
-    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
-    H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
-    weight = resolved.trigger.weight
-    return Loop(
-        A_model=A_model,
-        B_model=B_model,
-        K=K,
-        H=H,
-        A=np.array(plant.A),
-        B=np.array(plant.B),
-        x0=np.array(plant.initial_state),
-        weight=None if weight is None else np.array(weight),
-        state_names=model.state_names or (),
-        input_names=model.input_names or (),
-    )
-
-
-def _resolve(scenario: Scenario) -> Scenario:
+    """Return the scenario with every named or drawn quantity made explicit."""
     model = _explicit_model(scenario.model)
     A, B = np.array(model.A), np.array(model.B)
-    (n, m), plant, weight = B.shape, scenario.plant, scenario.trigger.weight
-    for key, rows, expected in (
-        ("plant.uncertainty_A", plant.uncertainty_A, (n, n)),
-        ("plant.uncertainty_B", plant.uncertainty_B, (n, m)),
-        ("plant.A", plant.A, (n, n)),
-        ("plant.B", plant.B, (n, m)),
-        ("trigger.weight", weight, (n, n)),
-    ):
-        if rows is not None:
-            require_shape(rows, key, expected, f"the model has {n} states and {m} inputs")
-    for key, row in (
-        ("plant.initial_state", plant.initial_state),
-        ("plant.initial_state_halfwidth", plant.initial_state_halfwidth),
-    ):
-        if row is not None and len(row) != n:
-            raise ValueError(f"{key}: expected {n} entries (one per state), found {len(row)}")
-    if weight is not None and np.linalg.matrix_rank(np.array(weight)) < n:
-        raise ValueError("trigger.weight: W must be invertible, this one is singular")
-
+    (n, m), plant = B.shape, scenario.plant
     x0 = np.array(plant.initial_state)
     if plant.initial_state_halfwidth is not None:
         halfwidth = np.array(plant.initial_state_halfwidth)
@@ -129,12 +79,29 @@ def _resolve(scenario: Scenario) -> Scenario:
     )
 
 
+def loop_of(resolved: Scenario) -> Loop:
+    """Return the matrices of a resolved scenario."""
+    model, plant = resolved.model, resolved.plant
+    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
+    H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
+    weight = resolved.trigger.weight
+    return Loop(
+        A_model=A_model,
+        B_model=B_model,
+        K=K,
+        H=H,
+        A=np.array(plant.A),
+        B=np.array(plant.B),
+        x0=np.array(plant.initial_state),
+        weight=None if weight is None else np.array(weight),
+        state_names=model.state_names or (),
+        input_names=model.input_names or (),
+    )
+
+
 def _explicit_model(model: Model) -> Model:
     if model.name is not None:
         named = NAMED_MODELS[model.name](model.parameters)
-        n, m = named.B.shape
-        if model.gain is not None:
-            require_shape(model.gain, "model.gain", (m, n), f"{model.name} has {n} states")
         return Model(
             A=_rows(named.A),
             B=_rows(named.B),

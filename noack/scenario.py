@@ -6,22 +6,21 @@ are errors. :mod:`noack.resolve` turns a scenario into one in which nothing is l
 
 from typing import Annotated, Literal, Self
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    NonNegativeFloat,
-    PositiveFloat,
-    model_validator,
-)
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from noack.clock import NS_PER_S
-from noack.models import MODEL_PARAMETERS
-from noack.wire import MAX_DIMENSION
+from noack.matrices import (
+    Row,
+    Rows,
+    require_length,
+    require_non_negative,
+    require_shape,
+    shape,
+)
+from noack.models import MODEL_PARAMETERS, NAMED_MODELS
 
-Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
-Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
+Positive = Annotated[FiniteFloat, Field(gt=0)]
 Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
 Port = Annotated[int, Field(ge=0, le=65535)]
@@ -36,29 +35,6 @@ class Section(BaseModel):
     )
 
 
-def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
-    """Return (rows, columns) of a matrix given by rows.
-
-    Raises:
-        ValueError: the rows differ in length.
-    """
-    widths = {len(row) for row in rows}
-    if len(widths) > 1:
-        raise ValueError(f"{key}: all rows need the same length, found lengths {sorted(widths)}")
-    return len(rows), widths.pop()
-
-
-def require_shape(
-    rows: tuple[tuple[float, ...], ...], key: str, expected: tuple[int, int], why: str
-) -> None:
-    """Raise ValueError unless a matrix given by rows has the expected shape."""
-    found = shape(rows, key)
-    if found != expected:
-        raise ValueError(
-            f"{key}: expected {expected[0]} x {expected[1]} ({why}), found {found[0]} x {found[1]}"
-        )
-
-
 def period_ns(rate_hz: float) -> int:
     """The period of a rate in nanoseconds; rates are validated to have a whole one."""
     return round(NS_PER_S / rate_hz)
@@ -66,7 +42,7 @@ def period_ns(rate_hz: float) -> int:
 
 def _require_whole_period(rate_hz: float, key: str) -> None:
     whole_ns = period_ns(rate_hz)
-    if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-9 * rate_hz:
+    if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
         raise ValueError(
             f"{key}: the period must be a whole number of nanoseconds; "
             f"the nearest such rate is {NS_PER_S / max(whole_ns, 1)!r}"
@@ -97,18 +73,29 @@ class Model(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.name is not None:
-            if self.A is not None or self.B is not None:
+            self._check_named(self.name)
+        else:
+            self._check_explicit()
+        n, m = self.dimensions
+        require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
+        require_length(self.state_names, "state_names", n, "one name per state")
+        require_length(self.input_names, "input_names", m, "one name per input")
+        return self
+
+    def _check_named(self, name: str) -> None:
+        if self.A is not None or self.B is not None:
+            raise ValueError("name: a named model has its own A and B; give one or the other")
+        known = MODEL_PARAMETERS[name]
+        for key in self.parameters:
+            if key not in known:
                 raise ValueError(
-                    "name: a named model brings its own A and B; give one or the other"
+                    f"parameters.{key}: {name} has no such parameter; it has {', '.join(known)}"
                 )
-            known = MODEL_PARAMETERS[self.name]
-            for key in self.parameters:
-                if key not in known:
-                    raise ValueError(
-                        f"parameters.{key}: {self.name} has no such parameter; "
-                        f"it has {', '.join(known)}"
-                    )
-            return self
+        named = NAMED_MODELS[name](self.parameters)
+        if not all(np.isfinite(matrix).all() for matrix in (named.A, named.B, named.K)):
+            raise ValueError("parameters: these give matrices with infinite entries")
+
+    def _check_explicit(self) -> None:
         if self.parameters:
             raise ValueError("parameters: only a named model has parameters")
         if self.A is None or self.B is None or self.gain is None:
@@ -119,16 +106,15 @@ class Model(Section):
             )
         n = len(self.A)
         require_shape(self.A, "A", (n, n), "the system matrix is square")
-        m = shape(self.B, "B")[1]
-        require_shape(self.B, "B", (n, m), "one row per state")
-        require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
-        for key, names, count in (
-            ("state_names", self.state_names, n),
-            ("input_names", self.input_names, m),
-        ):
-            if names is not None and len(names) != count:
-                raise ValueError(f"{key}: expected {count} names, found {len(names)}")
-        return self
+        require_shape(self.B, "B", (n, shape(self.B, "B")[1]), "one row per state")
+
+    @property
+    def dimensions(self) -> tuple[int, int]:
+        """Number of states n and of inputs m."""
+        if self.name is not None:
+            n, m = NAMED_MODELS[self.name](self.parameters).B.shape
+            return n, m
+        return (len(self.B), len(self.B[0])) if self.B else (0, 0)
 
 
 class Plant(Section):
@@ -157,21 +143,21 @@ class Plant(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         _require_whole_period(self.rate_hz, "rate_hz")
-        given = self.A is not None or self.B is not None
-        if self.draw == "given" and (self.A is None or self.B is None):
-            raise ValueError('A: draw = "given" needs both matrices A and B')
-        if self.draw != "given" and given:
-            raise ValueError(f'A: matrices are for draw = "given", not draw = "{self.draw}"')
-        if self.draw in ("uniform", "vertex") and not (self.uncertainty_A or self.uncertainty_B):
+        for key in ("A", "B"):
+            matrix = getattr(self, key)
+            if self.draw == "given" and matrix is None:
+                raise ValueError(f'{key}: draw = "given" needs both matrices A and B')
+            if self.draw != "given" and matrix is not None:
+                raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
+        box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
+        if self.draw in ("uniform", "vertex") and not box:
             raise ValueError(
                 f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
             )
         for key in ("uncertainty_A", "uncertainty_B"):
-            rows = getattr(self, key)
-            if rows is not None and any(entry < 0 for row in rows for entry in row):
-                raise ValueError(f"{key}: half-widths cannot be negative")
-        if any(entry < 0 for entry in self.initial_state_halfwidth or ()):
-            raise ValueError("initial_state_halfwidth: half-widths cannot be negative")
+            for row in getattr(self, key) or ():
+                require_non_negative(row, key)
+        require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
         return self
 
 
@@ -180,11 +166,11 @@ class DecayingTrigger(Section):
 
     policy: Literal["decaying"] = "decaying"
     """The event-triggering policy."""
-    beta: PositiveFloat
+    beta: Positive
     """β, in the units of ‖W x‖."""
-    alpha_per_s: PositiveFloat
+    alpha_per_s: Positive
     """α, per second."""
-    floor: NonNegativeFloat = 0.0
+    floor: Annotated[FiniteFloat, Field(ge=0)] = 0.0
     """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
     weight: Rows | None = None
     """W by rows, n x n, invertible; the identity unless given."""
@@ -287,7 +273,10 @@ class Ports(Section):
         for key in ("plant", "sensor", "netem", "controller"):
             port = getattr(self, key)
             if port and port in taken:
-                raise ValueError(f"{key}: port {port} is already given to {taken[port]}")
+                raise ValueError(
+                    f"{key}: port {port} is already given to {taken[port]}; "
+                    "take another, or 0 for any"
+                )
             taken[port] = key
         return self
 
@@ -351,4 +340,18 @@ class Scenario(Section):
             raise ValueError(
                 f"horizon_s: shorter than one plant step ({self.plant_period_ns / NS_PER_S} s)"
             )
+        n, m = self.model.dimensions
+        why = f"the model has {n} states and {m} inputs"
+        plant, weight = self.plant, self.trigger.weight
+        require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), why)
+        require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), why)
+        require_shape(plant.A, "plant.A", (n, n), why)
+        require_shape(plant.B, "plant.B", (n, m), why)
+        require_length(plant.initial_state, "plant.initial_state", n, "one per state")
+        require_length(
+            plant.initial_state_halfwidth, "plant.initial_state_halfwidth", n, "one per state"
+        )
+        require_shape(weight, "trigger.weight", (n, n), why)
+        if weight is not None and np.linalg.matrix_rank(np.array(weight)) < n:
+            raise ValueError("trigger.weight: W must be invertible, this one is singular")
         return self

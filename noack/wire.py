@@ -124,7 +124,7 @@ class Encoder:
         """Return the datagram of a message.
 
         Raises:
-            ValueError: the vector does not have 1 to 64 entries.
+            ValueError: the vector does not have 1 to 64 entries, or a number does not fit.
         """
         vector = np.ascontiguousarray(message.vector, dtype="<f8")
         if vector.ndim != 1 or not 1 <= vector.size <= MAX_DIMENSION:
@@ -132,13 +132,14 @@ class Encoder:
                 f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, "
                 f"not shape {vector.shape}"
             )
-        content = (
-            _HEADER.pack(
+        try:
+            header = _HEADER.pack(
                 MAGIC, VERSION, message.flow, vector.size, 0,
                 self._run_id, message.sequence, message.t_ns,
-            )
-            + vector.tobytes()
-        )  # fmt: skip
+            )  # fmt: skip
+        except struct.error as error:
+            raise ValueError(f"a number does not fit its field: {error}") from None
+        content = header + vector.tobytes()
         return content + self._tag(content)
 
 

@@ -5,6 +5,7 @@ endian. A killed writer leaves at most one broken chunk at the end, which reader
 rows may come twice, from two writers; row numbers tell.
 """
 
+import errno
 import os
 import struct
 from collections.abc import Iterator
@@ -41,7 +42,11 @@ class SpoolWriter:
             if file is None:
                 path = self._folder / f"{table}.{self._writer}"
                 file = self._files[table] = path.open("ab", buffering=0)
-            file.write(_CHUNK.pack(first, len(payload)) + payload)
+            chunk = _CHUNK.pack(first, len(payload)) + payload
+            written = file.write(chunk)
+            if written != len(chunk):  # what a full disk leaves must not be read as rows later
+                file.truncate(file.tell() - written)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
 

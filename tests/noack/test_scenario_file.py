@@ -121,10 +121,10 @@ LANE_MISTAKES = [
     ("trigger.policy=relative", 'trigger.policy = "relative": ', "should be 'decaying'"),
     ("network.initial_sync=0", "network.initial_sync = 0: ", "'first_packet' or 'known_state'"),
     ("model.name=lane", 'model.name = "lane": ', "'lane_following' or 'double_integrator'"),
-    ("network.loss.model=bernouli", "network.loss.model", "'bernoulli'.*\"bernouli\""),
-    ("network.loss.model=3", "network.loss.model", "'bernoulli'.*3"),
-    ("network.loss={}", "network.loss.model: ", "'bernoulli'"),
-    ("network.loss={probability=1}", "network.loss.model: ", "'bernoulli'"),
+    ("network.loss.model=bernouli", 'network.loss.model = "bernouli": ', "did you mean bernoulli?"),
+    ("network.loss.model=3", "network.loss.model = 3: ", "one of .*bernoulli"),
+    ("network.loss={}", "network.loss.model: missing; ", "one of .*bernoulli"),
+    ("network.loss={probability=1}", "network.loss.model: missing; ", "one of .*bernoulli"),
     ("name=lane following", 'name = "lane following": ', "A-Za-z0-9|letters"),
     ("name=../../etc", 'name = "../../etc": ', "A-Za-z0-9|letters"),
     ("name=", 'name = "": ', "A-Za-z0-9|letters"),
@@ -209,8 +209,8 @@ LANE_MISTAKES = [
     ),
     ("model.gain=[[1,2,3,4]]", "model.gain = [[1, 2, 3, 4]]: ", "expected 2 x 4 .*found 1 x 4"),
     ("model.gain=[[1,2],[3]]", "model.gain = [[1, 2], [3]]: ", "all rows need the same length"),
-    ('model.state_names=["a"]', 'model.state_names = ["a"]: ', "expected 4 names, found 1"),
-    ('model.input_names=["a"]', 'model.input_names = ["a"]: ', "expected 2 names, found 1"),
+    ('model.state_names=["a"]', 'model.state_names = ["a"]: ', "expected 4 entries .*, found 1"),
+    ('model.input_names=["a"]', 'model.input_names = ["a"]: ', "expected 2 entries .*, found 1"),
     # What goes together.
     ("plant.draw=given", "plant.A: ", 'draw = "given" needs both matrices A and B'),
     ("plant.A=[[1]]", "plant.A = [[1]]: ", 'matrices are for draw = "given", not .*"uniform"'),
@@ -239,11 +239,11 @@ DOUBLE_MISTAKES = [
     ("model.A=[[0,1],[0]]", "model.A = [[0, 1], [0]]: ", r"same length, found lengths \[1, 2\]"),
     ("model.B=[[0]]", "model.B = [[0]]: ", r"expected 2 x 1 \(one row per state\), found 1 x 1"),
     ("model.gain=[[1],[1]]", "model.gain = [[1], [1]]: ", "expected 1 x 2 .*found 2 x 1"),
-    ('model.state_names=["p"]', 'model.state_names = ["p"]: ', "expected 2 names, found 1"),
+    ('model.state_names=["p"]', 'model.state_names = ["p"]: ', "expected 2 entries .*, found 1"),
     (
         'model.input_names=["f","g"]',
         'model.input_names = ["f", "g"]: ',
-        "expected 1 names?, found 2",
+        "expected 1 entries .*, found 2",
     ),
     ("model.parameters.a=1", 'model.parameters = {"a": 1}: ', "only a named model has parameters"),
     ("model={}", "model.A: ", r"missing: A, B, gain"),
@@ -288,7 +288,7 @@ def test_a_mistake_in_given_matrices_gets_one_line(
             ["probability", "good_to_bad"],
         ),
         ('{model="worst_case",x=1}', "x = 1: unknown key; ", ["probability", "good_to_bad"]),
-        ('{model="bernoulli"}', "probability: missing; ", ["good_to_bad", "loss_in_bad"]),
+        ('{model="bernoulli"}', "probability: missing ", ["good_to_bad", "loss_in_bad"]),
     ],
 )
 def test_only_the_chosen_loss_models_keys_are_proposed(
@@ -324,8 +324,7 @@ def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> N
         section = section[part]
     del section[last]
     (line,) = mistakes(tomli_w.dumps(content), tmp_path)
-    assert line.startswith(f"FILE: {key}: missing; ")
-    assert re.search(rf"\b{last}\b", line.partition("missing; ")[2])
+    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)  # what it is for
 
 
 def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
