@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
+from importlib.metadata import version
 from json import dumps
 from pathlib import Path
 from typing import Annotated, Any
@@ -49,6 +50,21 @@ SessionOption = Annotated[
 ]
 
 DEFAULT_RUNS = Path("runs")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        print(f"noack {version('noack')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    _: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Take the options before the command."""
 
 
 def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Callable[..., None]]:

@@ -67,9 +67,3 @@ def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
                 if file.tell() + length > size:
                     break
                 yield first, file.read(length)
-
-
-def free_bytes(folder: Path) -> int:
-    """Free space of the file system that holds ``folder``, in bytes."""
-    status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize

@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +62,20 @@ def test_a_frozen_process_is_named(start: Start) -> None:
     assert finished.summary["exit"]["reason"] == "sensor stopped answering"
     assert len(load_record(finished.run_dir)["plant_step"]) > 10
     assert running.left_behind() == []
+
+
+def test_the_loop_and_its_record_outlast_a_frozen_control_plane(start: Start) -> None:
+    """The coordinator routes all telemetry; what it holds up is sent again at the end."""
+    running = start(*settings(speed=5.0, horizon_s=20.0))
+    wait_recording(running)
+    running.process.send_signal(signal.SIGSTOP)
+    time.sleep(1.2)
+    running.process.send_signal(signal.SIGCONT)
+    finished = running.finish()
+    assert finished.status == 0, finished.stderr
+    assert finished.summary["missing_samples"] == 0
+    assert finished.summary["reached_s"] == 20.0
+    assert finished.summary["identity_residual_max"] < 1e-11
 
 
 @pytest.mark.parametrize(
