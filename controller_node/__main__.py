@@ -5,12 +5,12 @@ from collections.abc import Sequence
 
 from controller_node.controller import controller_of
 from noack.errors import ExitStatus
-from noack.io import node
+from noack.io import process
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
-    return node.main(
+    return process.main(
         "controller", lambda member: member.run_messages(controller_of(member.scenario)), arguments
     )
 

@@ -20,7 +20,9 @@ from cosim.coordinator import Coordinator
 from cosim.environment import environment
 from cosim.run_dir import ENVIRONMENT_FILE, SCENARIO_FILE, new_run_dir, point_to_latest
 from noack.errors import ExitStatus, NeverStartedError
-from noack.io.node import HORIZON, TICKET_ON_STDIN, Signals
+from noack.io.node import HORIZON
+from noack.io.process import TICKET_ON_STDIN
+from noack.io.signals import Signals
 from noack.io.ticket import Ticket, new_ticket, published
 from noack.io.udp import LOOPBACK, free_tcp_port, require_free_tcp_port
 from noack.resolve import resolve

@@ -18,8 +18,9 @@ from cosim.viewer.live import LiveView
 from cosim.viewer.recording import RunView, ViewError
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
-from noack.io.node import LAUNCHER_GONE, Node, run_process
+from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
+from noack.io.process import run_process
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import NOTICES, first_row, notices_of
 from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT, Fate, tables

@@ -20,7 +20,9 @@ from netem.relay import Relay
 from noack.clock import RunClock
 from noack.errors import CallerError, ExitStatus
 from noack.io.loop import run_loop
-from noack.io.node import Node, Signals, add_options, join_run
+from noack.io.node import Node
+from noack.io.process import add_options, join_run
+from noack.io.signals import Signals
 from noack.io.udp import bind, parse_address, text_of
 from noack.machine import Notice, Record
 from noack.records import Fate

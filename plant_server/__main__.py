@@ -4,13 +4,13 @@ import sys
 from collections.abc import Sequence
 
 from noack.errors import ExitStatus
-from noack.io import node
+from noack.io import process
 from plant_server.plant import plant_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the plant in the run that a recorder or launcher has opened."""
-    return node.main(
+    return process.main(
         "plant", lambda member: member.run_messages(plant_of(member.scenario)), arguments
     )
 

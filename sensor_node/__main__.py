@@ -4,13 +4,13 @@ import sys
 from collections.abc import Sequence
 
 from noack.errors import ExitStatus
-from noack.io import node
+from noack.io import process
 from sensor_node.sensor import sensor_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
-    return node.main(
+    return process.main(
         "sensor", lambda member: member.run_messages(sensor_of(member.scenario)), arguments
     )
 

@@ -5,28 +5,25 @@ its lifeline is gone, or on SIGINT and SIGTERM. What it recorded reaches the rec
 run directory's spool.
 """
 
-import argparse
-import json
 import os
 import select
 import signal
 import socket
 import sys
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol, TypeVar
 
 from noack.clock import NS_PER_S, RunClock
-from noack.errors import ExitStatus, NoackError, PeerError
+from noack.errors import PeerError
 from noack.io.loop import Channel, run_loop
 from noack.io.plane import Plane
 from noack.io.realtime import realtime
+from noack.io.signals import Signals
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notices_of
-from noack.io.ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
+from noack.io.ticket import Ticket
 from noack.io.udp import Address, MessageSocket, bind
 from noack.machine import Machine
 from noack.records import OWNER, tables
@@ -46,41 +43,6 @@ HORIZON = "horizon"
 """Why a process ends that has done its work."""
 LAUNCHER_GONE = "the launcher is gone"
 """Why a process ends whose launcher has died."""
-
-TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
-
-
-class Signals:
-    """Turns SIGINT and SIGTERM into a flag; a loop ends at its next look, nothing is torn."""
-
-    def __init__(self) -> None:
-        self.received: int | None = None
-
-    @contextmanager
-    def handled(self) -> Iterator["Signals"]:
-        """Handle the signals while the context lasts."""
-        before = {number: signal.signal(number, self._note) for number in _ENDING}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self.received is not None:  # asked twice: the person means it
-            raise SystemExit(self.status)
-        self.received = number
-
-    @property
-    def status(self) -> ExitStatus:
-        """Exit status that tells of the signal, or OK."""
-        return _ENDING.get(self.received or 0, ExitStatus.OK)
-
-
-_ENDING = {
-    signal.SIGINT.value: ExitStatus.INTERRUPTED,
-    signal.SIGTERM.value: ExitStatus.TERMINATED,
-}
 
 
 class ReportingChannel(Channel[T], Protocol[T]):
@@ -177,6 +139,9 @@ class Node:
                     stop=lambda: self.stopping,
                     spin_us=settings.spin_us,
                 )
+            except BaseException as error:
+                self._ended = f"an error of its own: {error!r}"
+                raise
             finally:
                 telemetry.flush()
                 self.report = {
@@ -184,6 +149,7 @@ class Node:
                     "ended": self.ended,
                     "realtime": granted,
                     "channel": channel.report(),
+                    "rows": telemetry.totals(),
                 }
                 self._hand_over(telemetry)
 
@@ -211,7 +177,6 @@ class Node:
         return self._ended
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
-        self.report["rows"] = telemetry.totals()
         reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
         try:
             for _ in range(3 if reachable else 0):
@@ -231,75 +196,6 @@ class Node:
             ),
         )
         writer.close()
-
-
-def run_process(
-    role: str, body: Callable[[Node], None], session: str = DEFAULT_SESSION
-) -> ExitStatus:
-    """Join a run as ``role``, do ``body``, and return the exit status.
-
-    A mistake or a peer's fault becomes one line on standard error, with no traceback.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    with Signals().handled() as signals:
-        try:
-            ticket = _admission(role, session, signals)
-            with Plane(ticket.run_id, role, ticket.endpoint) as plane:
-                node = Node(role, ticket, plane, signals)
-                body(node)
-                plane.leave(node.ended)
-        except NoackError as error:
-            if signals.received is None:
-                print(f"noack {role}: {error}", file=sys.stderr)
-                return error.exit_status
-        except Exception:
-            traceback.print_exc()
-            print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
-            return ExitStatus.FAILED
-        return signals.status
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every process takes."""
-    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
-    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
-
-
-def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
-    """Command line of one process that does nothing but join a run."""
-    parser = argparse.ArgumentParser(
-        prog=f"noack {role}",
-        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
-    )
-    add_options(parser)
-    return join_run(role, body, parser.parse_args(arguments))
-
-
-def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
-    """Join a run with the options of :func:`add_options`."""
-
-    def body_and_report(node: Node) -> None:
-        body(node)
-        if options.json:
-            print(json.dumps(node.report, indent=2))
-
-    return run_process(role, body_and_report, options.session)
-
-
-def _admission(role: str, session: str, signals: Signals) -> Ticket:
-    if os.environ.pop(TICKET_ON_STDIN, None):
-        return loads(sys.stdin.buffer.readline().decode())
-    ticket = wait_for_ticket(
-        session,
-        _JOIN_TIMEOUT_S,
-        lambda: signals.received is not None,
-        lambda path: print(
-            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r})",
-            file=sys.stderr,
-        ),
-    )
-    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
-    return ticket
 
 
 def _lifeline_cut() -> bool:

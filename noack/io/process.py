@@ -1,0 +1,87 @@
+"""A process's way into a run and out of it: ticket, command line, exit status."""
+
+import argparse
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+from noack.errors import ExitStatus, NoackError
+from noack.io.node import Node
+from noack.io.plane import Plane
+from noack.io.signals import Signals
+from noack.io.ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
+
+_TICKET_TIMEOUT_S = 24 * 3600.0
+"""A person may take long to start the recorder; who does not want to wait, interrupts."""
+
+TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
+
+
+def run_process(
+    role: str, body: Callable[[Node], None], session: str = DEFAULT_SESSION
+) -> ExitStatus:
+    """Join a run as ``role``, do ``body``, and return the exit status.
+
+    A mistake or a peer's fault becomes one line on standard error, with no traceback.
+    """
+    with Signals().handled() as signals:
+        try:
+            ticket = _admission(role, session, signals)
+            with Plane(ticket.run_id, role, ticket.endpoint) as plane:
+                node = Node(role, ticket, plane, signals)
+                body(node)
+                plane.leave(node.ended)
+        except NoackError as error:
+            if signals.received is None:
+                print(f"noack {role}: {error}", file=sys.stderr)
+                return error.exit_status
+        except Exception:
+            traceback.print_exc()
+            print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
+            return ExitStatus.FAILED
+        return signals.status
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every process takes."""
+    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+
+
+def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
+    """Command line of one process that does nothing but join a run."""
+    parser = argparse.ArgumentParser(
+        prog=f"noack {role}",
+        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
+    )
+    add_options(parser)
+    return join_run(role, body, parser.parse_args(arguments))
+
+
+def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
+    """Join a run with the options of :func:`add_options`."""
+
+    def body_and_report(node: Node) -> None:
+        body(node)
+        if options.json:
+            print(json.dumps(node.report, indent=2))
+
+    return run_process(role, body_and_report, options.session)
+
+
+def _admission(role: str, session: str, signals: Signals) -> Ticket:
+    if os.environ.pop(TICKET_ON_STDIN, None):
+        return loads(sys.stdin.buffer.readline().decode())
+    ticket = wait_for_ticket(
+        session,
+        _TICKET_TIMEOUT_S,
+        lambda: signals.received is not None,
+        lambda path: print(
+            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r})",
+            file=sys.stderr,
+        ),
+    )
+    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
+    return ticket
