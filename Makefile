@@ -31,7 +31,7 @@ demo-zoh: setup ## The same with zero-order hold instead of a model
 	@$(BIN)/noack demo --zoh $(FLAGS)
 
 run: setup ## Run SCENARIO=FILE, all processes at once
-	@$(BIN)/noack run $(SCENARIO) $(FLAGS)
+	@$(BIN)/noack run "$(SCENARIO)" $(FLAGS)
 
 view: setup ## Open the last recording in the rerun viewer
 	@$(BIN)/noack view $(ARGS)
@@ -42,7 +42,7 @@ summary: setup ## Show the last run's summary again
 ##@ Five terminals, one process each (start `make record` in one, the others in any order)
 .PHONY: record plant sensor controller netem
 record: setup ## Open a run of SCENARIO and record it
-	@$(BIN)/noack record $(SCENARIO) --session $(SESSION) $(FLAGS)
+	@$(BIN)/noack record "$(SCENARIO)" --session $(SESSION) $(FLAGS)
 
 plant: setup ## The plant: owns the true state x
 	@$(BIN)/noack plant --session $(SESSION) $(ARGS)

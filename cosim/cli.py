@@ -1,5 +1,6 @@
 """The command line ``noack``."""
 
+import io
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -75,8 +76,11 @@ def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Calla
         def reported(*arguments: Any, **options: Any) -> None:
             try:
                 status = function(*arguments, **options)
+                sys.stdout.flush()
             except NoackError as error:
                 status = _failed(str(error), error.exit_status)
+            except OSError as error:  # standard output is a full disk or a closed pipe
+                status = _failed(f"cannot write: {error}", ExitStatus.FAILED)
             raise typer.Exit(int(status))
 
         registered: Callable[..., None] = app.command(rich_help_panel=panel, **settings)(reported)
@@ -251,8 +255,15 @@ def _run(
     from cosim.launch import launch
     from cosim.progress import progress_line
 
-    with progress_line(Console(stderr=True), scenario) as watcher:
-        ending = launch(scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher)
+    ending = None
+    try:
+        with progress_line(Console(stderr=True), scenario) as watcher:
+            ending = launch(
+                scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
+            )
+    except OSError:  # a closed terminal is no reason to lose a run
+        if ending is None:
+            raise
     from cosim.conclude import conclude
     from cosim.tables import print_outcome
 
@@ -282,7 +293,13 @@ def _failed(message: str, status: ExitStatus) -> ExitStatus:
 
 def main() -> None:
     """Entry point."""
-    app()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show ‖x‖ gets ?x?
+            stream.reconfigure(errors="replace")
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(ExitStatus.INTERRUPTED)
 
 
 if __name__ == "__main__":

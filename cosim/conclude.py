@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cosim.launch import Ending
 from cosim.record import finish_record, load_record
-from cosim.run_dir import RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.run_dir import RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus
 
@@ -24,30 +24,42 @@ class Outcome:
 def conclude(ending: Ending) -> Outcome:
     """Finish what a dead recorder left undone, and write the summary."""
     run_dir = ending.run_dir
-    if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
-        record = finish_record(run_dir)
-        from cosim.recorder import write_view  # imports rerun, which a good run does not need here
+    with concluded(run_dir):
+        if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
+            record = finish_record(run_dir)
+            from cosim.recorder import write_view  # imports rerun, which a good run needs not here
 
-        write_view(record, run_dir, ending.run_id)
-    else:
-        record = load_record(run_dir)
-    summary = {"startup_s": ending.startup_s} | summarise(record, int(ending.status), ending.reason)
-    (run_dir / SUMMARY_FILE).write_text(dumps(summary))
-    return Outcome(run_dir, ending.status, ending.reason, summary)
+            write_view(record, run_dir, ending.run_id)
+        else:
+            record = load_record(run_dir)
+        summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
+        (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+    end = summary["exit"]
+    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
 
 def reopen(run_dir: Path) -> Outcome:
     """Return the outcome of an earlier run; finish its record if nobody did.
 
     Raises:
-        CallerError: it is not a run directory.
+        CallerError: it is not a run directory, or the run is still under way.
     """
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    path = run_dir / SUMMARY_FILE
-    if not path.is_file():
+    summary = _read_summary(run_dir)
+    if summary is None:
         reason = "the launcher did not live to see the end"
         return conclude(Ending(run_dir, 0, ExitStatus.FAILED, reason))
-    summary = json.loads(path.read_text())
-    end = summary["exit"]
-    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+    status, reason = ExitStatus(summary["exit"]["status"]), summary["exit"]["reason"]
+    if (run_dir / SPOOL).is_dir():  # from a process that woke up after the end
+        return conclude(Ending(run_dir, 0, status, reason, summary["startup_s"]))
+    return Outcome(run_dir, status, reason, summary)
+
+
+def _read_summary(run_dir: Path) -> Summary | None:
+    """The run's summary; None if there is none, or a damaged one, which is then written anew."""
+    try:
+        summary: Summary = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
+        return summary if {"exit", "startup_s"} <= summary.keys() else None
+    except (OSError, ValueError, AttributeError):
+        return None

@@ -18,8 +18,8 @@ from typing import Any
 
 from cosim.coordinator import Coordinator
 from cosim.environment import environment
-from cosim.run_dir import ENVIRONMENT_FILE, SCENARIO_FILE, new_run_dir, point_to_latest
-from noack.errors import ExitStatus, NeverStartedError
+from cosim.run_dir import ENVIRONMENT_FILE, SCENARIO_FILE, new_run_dir, point_to_latest, under_way
+from noack.errors import ExitStatus, MachineError, NeverStartedError
 from noack.io.node import HORIZON
 from noack.io.process import TICKET_ON_STDIN
 from noack.io.signals import Signals
@@ -38,6 +38,7 @@ _MODULES = {
     "controller": "controller_node",
 }
 _POLL_S = 0.01
+_START_PATIENCE_S = 30.0
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S = 20.0
 
@@ -92,11 +93,12 @@ def launch(
         require_free_tcp_port(control, "ports.control")
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
-    (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved))
-    (run_dir / ENVIRONMENT_FILE).write_text(json.dumps(environment(), indent=2))
+    (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved), encoding="utf-8")
+    (run_dir / ENVIRONMENT_FILE).write_text(json.dumps(environment(), indent=2), encoding="utf-8")
     ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
     run = _Run(ticket, run_dir, spawn, watcher or Watcher())
     with Signals().handled() as signals, contextlib.ExitStack() as stack:
+        stack.enter_context(under_way(run_dir))
         coordinator = Coordinator(ticket)
         stack.callback(coordinator.close)
         if session is not None:
@@ -141,7 +143,9 @@ class _Run:
         scenario = self._ticket.scenario
         verdict: tuple[ExitStatus, str] | None = None
         told: tuple[str, ...] = ()
-        patience_s = float("inf")
+        by_hand = any(role not in self._spawn for role in ROLES)
+        patience_s = float("inf") if by_hand else time.monotonic() + _START_PATIENCE_S
+        started = False
         while not self._over(coordinator, stopping=verdict is not None):
             coordinator.poll()
             now_s = time.monotonic()
@@ -149,17 +153,18 @@ class _Run:
                 missing = tuple(r for r in coordinator.missing() if r not in self._spawn)
                 if missing != told:
                     told = missing
-                    self._watcher.waiting(missing)
-            elif patience_s == float("inf"):
+                    self._tell(self._watcher.waiting, missing)
+            elif not started:
+                started = True
                 point_to_latest(self._run_dir)
-                self._watcher.started(self._run_dir)
+                self._tell(self._watcher.started, self._run_dir)
                 patience_s = now_s + scenario.horizon_s / scenario.speed + _OVERTIME_S
             if (account := coordinator.progress()) is not None:
-                self._watcher.progress(account)
+                self._tell(self._watcher.progress, account)
             if verdict is None:
                 verdict = self._trouble(coordinator, signals)
                 if verdict is None and now_s > patience_s:
-                    verdict = (ExitStatus.FAILED, "the run did not end at its horizon")
+                    verdict = (ExitStatus.FAILED, _overdue(coordinator))
                 if verdict is not None:
                     coordinator.stop(verdict[1])
                     patience_s = now_s + _STOP_PATIENCE_S
@@ -168,20 +173,35 @@ class _Run:
             time.sleep(_POLL_S)
         return verdict or self._trouble(coordinator, signals) or (ExitStatus.OK, HORIZON)
 
+    def _tell(self, callback: Callable[..., None], *arguments: object) -> None:
+        try:
+            callback(*arguments)
+        except OSError:  # whoever watched has gone; the run goes on
+            self._watcher = Watcher()
+
     def _start(self, role: str, *, live: bool) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", _MODULES[role]]
+        # -P: a module of the folder in which the person stands must not shadow one of ours.
+        command = [sys.executable, "-P", "-m", _MODULES[role]]
         if role == RECORDER and live:
             command.append("--live")
-        with (self._run_dir / "logs" / f"{role}.log").open("w") as log:
-            child = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=log,
-                text=True,
-                start_new_session=True,  # a Ctrl-C is the launcher's to handle
-                env=os.environ | {TICKET_ON_STDIN: "1", "OPENBLAS_NUM_THREADS": "1"},
-            )
+        environment = os.environ | {
+            TICKET_ON_STDIN: "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONUTF8": "1",
+        }
+        try:
+            with (self._run_dir / "logs" / f"{role}.log").open("w") as log:
+                child = subprocess.Popen(
+                    command,
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    encoding="utf-8",
+                    start_new_session=True,  # a Ctrl-C is the launcher's to handle
+                    env=environment,
+                )
+        except OSError as error:
+            raise MachineError(f"{role} cannot be started: {error}") from None
         assert child.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             child.stdin.write(self._ticket.dumps() + "\n")
@@ -201,7 +221,7 @@ class _Run:
 
     def _trouble(self, coordinator: Coordinator, signals: Signals) -> tuple[ExitStatus, str] | None:
         if signals.received is not None:
-            return signals.status, f"stopped by {signal.Signals(signals.received).name}"
+            return signals.status, f"stopped by {_name(signals.received)}"
         for role, child in self._children.items():
             code = child.poll()
             if code is not None and code != 0:
@@ -215,8 +235,24 @@ class _Run:
 
     def _died(self, role: str, code: int) -> tuple[ExitStatus, str]:
         if code < 0:
-            return ExitStatus.FAILED, f"{role} died: killed by {signal.Signals(-code).name}"
-        lines = (self._run_dir / "logs" / f"{role}.log").read_text().strip().splitlines()
+            return ExitStatus.FAILED, f"{role} died: killed by {_name(-code)}"
+        if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
+            return ExitStatus.FAILED, f"{role} ended early: {_name(code - 128)}"
+        log = self._run_dir / "logs" / f"{role}.log"
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         said = lines[-1].removeprefix(f"noack {role}: ") if lines else f"exit status {code}"
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {said}"
+
+
+def _overdue(coordinator: Coordinator) -> str:
+    if coordinator.epoch_ns is None:
+        return f"{', '.join(coordinator.missing())} did not come to the start"
+    return "the run did not end at its horizon"
+
+
+def _name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

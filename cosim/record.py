@@ -5,7 +5,8 @@ are stored one column per entry (``x_0``, ``x_1``, …) so that any reader of Pa
 """
 
 import json
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
 from noack.scenario_file import load
 from noack.topology import LOOP_ROLES
+from noack.wire import VERSION, Flow, read_header
 
 Rows = NDArray[np.void]
 
@@ -74,8 +76,7 @@ def load_record(run_dir: Path) -> RunRecord:
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables(loop.n, loop.m).items()
     }
-    lines = (folder / _NOTICES_FILE).read_text().splitlines()
-    return RunRecord(scenario, rows, [json.loads(line) for line in lines], _reports(run_dir))
+    return RunRecord(scenario, rows, _read_notices(folder), _reports(run_dir))
 
 
 def finish_record(run_dir: Path) -> RunRecord:
@@ -89,62 +90,91 @@ def finish_record(run_dir: Path) -> RunRecord:
     scenario = load(run_dir / SCENARIO_FILE)
     loop, spool, folder = loop_of(scenario), run_dir / SPOOL, run_dir / RECORD
     rows = {
-        table: merge_rows(
-            [(first, np.frombuffer(data, dtype)) for first, data in read_chunks(spool, table)],
-            dtype,
-        )[1]
+        table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)
         for table, dtype in tables(loop.n, loop.m).items()
     }
-    notices = _spooled_notices(spool)
+    notices = _notices(folder, spool)
     try:
         folder.mkdir(exist_ok=True)
         for table, array in rows.items():
             _to_parquet(array, folder / f"{table}.parquet", loop)
-        with (folder / _NOTICES_FILE).open("w") as file:
+        with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
             file.writelines(json.dumps(notice) + "\n" for notice in notices)
+        if spool.is_dir():  # dropped in one step, so that nobody ever takes half a spool for all
+            shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
             f"{folder}: the record cannot be written ({error}); it is kept in {spool}"
         ) from None
-    for path in spool.glob("*"):
-        path.unlink()
-    if spool.is_dir():
-        spool.rmdir()
     return RunRecord(scenario, rows, notices, _reports(run_dir))
 
 
-def merge_rows(
-    batches: list[tuple[int, Rows]], dtype: np.dtype[np.void]
-) -> tuple[list[tuple[int, int]], Rows]:
-    """Put batches in order of their row numbers, dropping what came twice.
+def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
+    """Put the rows of a table in the order of the machine's inputs, each of them once.
+
+    Args:
+        parts: batches, in any order.
+        dtype: the table's row type.
+    """
+    rows = np.concatenate([np.zeros(0, dtype), *parts])
+    _, first = np.unique(rows["input"], return_index=True)
+    return rows[first]
+
+
+def updates_in(packets: Rows) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+    """Pick the loop's updates from what reached the network emulator, which reads no payload.
 
     Returns:
-        The half-open ranges of row numbers that are missing before the last row, and the rows.
+        Their rows of ``netem_packet``, sequence numbers and event times.
     """
-    missing: list[tuple[int, int]] = []
-    parts: list[Rows] = []
-    following = 0
-    for first, rows in sorted(batches, key=lambda batch: batch[0]):
-        if first > following:
-            missing.append((following, first))
-            following = first
-        fresh = rows[following - first :]
-        parts.append(fresh)
-        following += len(fresh)
-    return missing, np.concatenate(parts) if parts else np.zeros(0, dtype)
+    kept, sequences, events_ns = [], [], []
+    for i, head in enumerate(packets["head"]):
+        header = read_header(head.tobytes())
+        if header is None or (header.version, header.flow) != (VERSION, Flow.UPDATE):
+            continue
+        if header.sequence < 2**63 and header.t_ns >= 0:  # what else has no place in the record
+            kept.append(i)
+            sequences.append(header.sequence)
+            events_ns.append(header.t_ns)
+    return (
+        packets[kept],
+        np.array(sequences, dtype=np.int64),
+        np.array(events_ns, dtype=np.int64),
+    )
 
 
-def _spooled_notices(spool: Path) -> list[dict[str, Any]]:
-    notices: dict[tuple[str, int], dict[str, Any]] = {}
+def _recorded(folder: Path, table: str, dtype: np.dtype[np.void]) -> Rows:
+    path = folder / f"{table}.parquet"
+    return _from_parquet(path, dtype) if path.is_file() else np.zeros(0, dtype)
+
+
+def _spooled(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
+    for _, data in read_chunks(spool, table):
+        yield np.frombuffer(data, dtype)
+
+
+def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
+    notices = _read_notices(folder)
     for role in LOOP_ROLES:
-        for first, data in read_chunks(spool, notices_of(role)):
-            notices[role, first] = json.loads(data) | {"process": role}
-    return sorted(notices.values(), key=lambda notice: int(notice["t_ns"]))
+        for _, data in read_chunks(spool, notices_of(role)):
+            notice = json.loads(data) | {"process": role}
+            if notice not in notices:
+                notices.append(notice)
+    return sorted(notices, key=lambda notice: int(notice["t_ns"]))
+
+
+def _read_notices(folder: Path) -> list[dict[str, Any]]:
+    path = folder / _NOTICES_FILE
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [json.loads(line) for line in lines]
 
 
 def _reports(run_dir: Path) -> dict[str, dict[str, Any]]:
     path = run_dir / REPORTS_FILE
-    reports: dict[str, dict[str, Any]] = json.loads(path.read_text()) if path.is_file() else {}
+    try:
+        reports: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):  # a dead recorder wrote none, or half of one
+        return {}
     return reports
 
 

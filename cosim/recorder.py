@@ -11,8 +11,8 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.record import RunRecord, finish_record
-from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL
+from cosim.record import RunRecord, finish_record, updates_in
+from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
 from cosim.viewer.recording import RunView, ViewError
@@ -106,7 +106,9 @@ class Recorder:
             MachineError: the record cannot be written; what was spooled is kept.
         """
         self._spool.close()
-        (self._run_dir / REPORTS_FILE).write_text(json.dumps(self._reports, indent=2))
+        (self._run_dir / REPORTS_FILE).write_text(
+            json.dumps(self._reports, indent=2), encoding="utf-8"
+        )
         record = finish_record(self._run_dir)
         if self._feed is not None:
             try:
@@ -156,6 +158,7 @@ class Recorder:
         elif table == CONTROLLER_DELIVERY:
             account["deliveries"] += len(rows)
         elif table == NETEM_PACKET:
+            rows = updates_in(rows)[0]
             dropped = rows["drop_run"][rows["fate"] == Fate.DROPPED]
             longest = int(dropped.max()) if len(dropped) else 0
             account["longest_drop_run"] = max(account["longest_drop_run"], longest)
@@ -248,6 +251,11 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 
 def _record(node: Node, *, live: bool) -> None:
+    with under_way(Path(node.ticket.run_dir)):
+        _record_run(node, live=live)
+
+
+def _record_run(node: Node, *, live: bool) -> None:
     run_dir = Path(node.ticket.run_dir)
     live_view = LiveView() if live else None
     view = open_view(node.scenario, run_dir, node.ticket.run_id, live_view)
@@ -263,6 +271,8 @@ def _record(node: Node, *, live: bool) -> None:
             recorder.show()
             shown_s = now_s
         if node.stopping:
+            if node.ended in ("SIGINT", "SIGTERM"):
+                break
             if node.ended == LAUNCHER_GONE:
                 # The others spool their own last rows now; `noack summary` finishes the record.
                 recorder.abandon()

@@ -1,7 +1,11 @@
 """The run directory: the names of what it holds, and where the newest one is."""
 
 import contextlib
+import fcntl
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
@@ -15,6 +19,8 @@ SUMMARY_FILE = "summary.json"
 SPOOL = "spool"
 RECORD = "record"
 LATEST = "latest"
+_LOCK = ".lock"
+_LEAST_FREE_BYTES = 16 * 1024 * 1024
 
 
 def new_run_dir(runs: Path, name: str) -> Path:
@@ -26,6 +32,12 @@ def new_run_dir(runs: Path, name: str) -> Path:
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     try:
         runs.mkdir(parents=True, exist_ok=True)
+        free_bytes = shutil.disk_usage(runs).free
+        if free_bytes < _LEAST_FREE_BYTES:
+            raise MachineError(
+                f"{runs}: only {free_bytes // 1024} KiB are free on the disk; a run wants "
+                f"{_LEAST_FREE_BYTES // 2**20} MiB at the least"
+            )
         for attempt in range(1000):
             run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
             with contextlib.suppress(FileExistsError):
@@ -40,10 +52,13 @@ def new_run_dir(runs: Path, name: str) -> Path:
 def point_to_latest(run_dir: Path) -> None:
     """Let ``latest`` beside the run directory lead to it."""
     scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
-    with contextlib.suppress(OSError):  # a convenience, not worth a run
+    try:  # a convenience, not worth a run
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(run_dir.name)
         scratch.replace(run_dir.parent / LATEST)
+    except OSError:
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
 
 
 def latest_run(runs: Path) -> Path:
@@ -53,6 +68,29 @@ def latest_run(runs: Path) -> Path:
         CallerError: there is none.
     """
     link = runs / LATEST
-    if not link.is_dir():
+    if not link.is_symlink() or not link.is_dir():
         raise CallerError(f"{runs}: no run yet; `noack demo` makes one")
     return link.resolve()
+
+
+@contextmanager
+def under_way(run_dir: Path) -> Iterator[None]:
+    """Mark a run as under way; the launcher and the recorder do, each for as long as it lives."""
+    with (run_dir / _LOCK).open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        yield
+
+
+@contextmanager
+def concluded(run_dir: Path) -> Iterator[None]:
+    """Have a run directory to oneself.
+
+    Raises:
+        CallerError: the run is still under way.
+    """
+    with (run_dir / _LOCK).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CallerError(f"{run_dir}: the run is still under way") from None
+        yield

@@ -1,14 +1,15 @@
 """The summary of a run, computed from its record: counts, claims of completeness, timing."""
 
 import json
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.join import identity_residual, join_all
-from cosim.record import Rows, RunRecord
-from cosim.viewer.feed import packet_headers
+from cosim.record import Rows, RunRecord, updates_in
+from noack.errors import ExitStatus
 from noack.io.node import HORIZON
 from noack.records import (
     CONTROLLER_DELIVERY,
@@ -27,16 +28,26 @@ from noack.topology import LOOP_ROLES
 Summary = dict[str, Any]
 
 
-def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
+def summarise(
+    record: RunRecord, exit_status: int, reason: str, startup_s: float | None = None
+) -> Summary:
     """Return the content of ``summary.json``; ``docs/record.md`` documents the keys.
 
     Args:
         record: the run's record.
         exit_status: the run's exit status.
         reason: why the run ended.
+        startup_s: wall time from the launch to simulated time 0, if anybody saw it.
     """
+    with np.errstate(all="ignore"):  # a run that diverged has a summary, too
+        return _summarise(record, exit_status, reason, startup_s)
+
+
+def _summarise(
+    record: RunRecord, exit_status: int, reason: str, startup_s: float | None
+) -> Summary:
     scenario = record.scenario
-    sensor, packets = record[SENSOR_MEASUREMENT], record[NETEM_PACKET]
+    sensor, (packets, _, _) = record[SENSOR_MEASUREMENT], updates_in(record[NETEM_PACKET])
     events = sensor[sensor["event"] != NO_SEQUENCE]
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     joined = join_all(record)
@@ -44,9 +55,12 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
     in_common = ~np.isnan(residual)
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
-    violations = [n for n in record.notices if n["level"] == "violation"]
+    diverged_at_s = _diverged_at_s(record[PLANT_STEP])
+    if diverged_at_s is not None and exit_status == ExitStatus.OK:
+        exit_status, reason = ExitStatus.FAILED, f"diverged: x is not finite at {diverged_at_s:g} s"
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
-    return {
+    summary = {
+        "startup_s": startup_s,
         "scenario": scenario.name,
         "mode": scenario.mode,
         "mansd": scenario.network.mansd,
@@ -58,10 +72,7 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
         "drops": int((packets["fate"] == Fate.DROPPED).sum()),
         "forced_deliveries": int((packets["fate"] == Fate.FORCED).sum()),
         "longest_drop_run": int(packets["drop_run"].max(initial=0)),
-        "assumption_violations": [
-            {"t_s": n["t_ns"] * 1e-9, "process": n["process"], "what": n["text"]}
-            for n in violations
-        ],
+        "assumption_violations": _violations(record),
         "assumptions": [assumption._asdict() for assumption in assumptions(scenario)],
         "missing_samples": sum(missing.values()),
         "missing_by_table": {table: n for table, n in missing.items() if n},
@@ -83,8 +94,44 @@ def summarise(record: RunRecord, exit_status: int, reason: str) -> Summary:
         "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES},
         "latency_us": _latency(record),
         "realtime": {role: report["realtime"] for role, report in record.reports.items()},
-        "exit": {"status": exit_status, "reason": reason},
+        "diverged_at_s": diverged_at_s,
+        "exit": {"status": int(exit_status), "reason": reason},
     }
+    finite: Summary = _finite(summary)
+    return finite
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no infinity: what is not finite becomes null."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _diverged_at_s(steps: Rows) -> float | None:
+    lost = np.flatnonzero(~np.isfinite(steps["x"]).all(axis=1))
+    return float(steps["t_ns"][lost[0]]) * 1e-9 if len(lost) else None
+
+
+def _violations(record: RunRecord) -> list[dict[str, Any]]:
+    """What the controller saw, and the run of drops at the end that it could not see any more."""
+    seen = [
+        {"t_s": notice["t_ns"] * 1e-9, "process": notice["process"], "what": notice["text"]}
+        for notice in record.notices
+        if notice["level"] == "violation"
+    ]
+    mansd = record.scenario.network.mansd
+    packets, _, event_ns = updates_in(record[NETEM_PACKET])
+    survived = np.flatnonzero(packets["fate"] != Fate.DROPPED)
+    last = int(survived[-1]) + 1 if len(survived) else 0
+    dropped = len(packets) - last
+    if dropped > mansd:
+        what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
+        at_s = float(event_ns[last + mansd]) * 1e-9
+        seen.append({"t_s": at_s, "process": "netem", "what": what})
+    return seen
 
 
 def _last_s(rows: Rows) -> float:
@@ -118,7 +165,7 @@ def _lost(record: RunRecord) -> dict[str, int]:
     sensor, packets = record[SENSOR_MEASUREMENT], record[NETEM_PACKET]
     every = record.scenario.plant.measure_every
     sent = record[PLANT_STEP]["sequence"]
-    entered, _ = packet_headers(packets)
+    packets, entered, _ = updates_in(packets)
     legs = {
         "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
         "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], entered),
@@ -158,7 +205,9 @@ def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
         "netem": (NETEM_PACKET, scenario.plant_period_ns),
     }[role]
     rows = record[table]
-    due_ns = packet_headers(rows)[1] if role == "netem" else rows["t_ns"]
+    due_ns = rows["t_ns"]
+    if role == "netem":
+        rows, _, due_ns = updates_in(rows)
     late_us = (rows["now_ns"] - due_ns) / (1e3 * scenario.speed)
     late_steps = int((late_us * 1e3 * scenario.speed > period_ns).sum())
     return {**_quantiles(late_us), "steps": len(rows), "late_steps": late_steps}

@@ -1,6 +1,7 @@
 """The tables that a person sees at the end of a run."""
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cosim.conclude import Outcome
@@ -21,15 +22,18 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     for violation in summary["assumption_violations"]:
         console.print(
             f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
-            f"seen by {violation['process']}: {violation['what']}"
+            f"seen by {violation['process']}: {escape(violation['what'])}"
         )
     if outcome.status:
-        console.print(f"[bold red]the run failed:[/] {outcome.reason}")
-    console.print(f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]the run failed:[/] {escape(outcome.reason)}")
+    console.print(
+        f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True, markup=False
+    )
     console.print(
         f"look at it     noack view {outcome.run_dir / RECORDING_FILE}",
         highlight=False,
         soft_wrap=True,
+        markup=False,
     )
 
 

@@ -23,7 +23,7 @@ from noack.io.loop import run_loop
 from noack.io.node import Node
 from noack.io.process import add_options, join_run
 from noack.io.signals import Signals
-from noack.io.udp import bind, parse_address, text_of
+from noack.io.udp import bind, kernel_drops, parse_address, text_of
 from noack.machine import Notice, Record
 from noack.records import Fate
 from noack.scenario import Loss
@@ -58,6 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     if (options.listen is None) != (options.to is None):
         parser.error("--listen and --to go together")
     if options.listen is None:
+        for name in ("loss", "mansd", "seed"):
+            if getattr(options, name) != parser.get_default(name):
+                parser.error(f"--{name} is for an emulator on its own, with --listen and --to")
         return join_run("netem", _in_a_run, options)
     try:
         return _alone(options)
@@ -69,14 +72,17 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 def _in_a_run(node: Node) -> None:
     node.run(
         update_link_of(node.scenario),
-        lambda endpoint, addresses: Relay(endpoint, addresses["controller"]),
+        lambda endpoint, addresses: Relay(endpoint, addresses["controller"], addresses["sensor"]),
     )
 
 
 def _alone(options: argparse.Namespace) -> ExitStatus:
-    if options.mansd is not None and options.mansd < 0:
-        raise CallerError(f"--mansd {options.mansd}: must be 0 or more")
+    for name in ("mansd", "seed"):
+        value = getattr(options, name)
+        if value is not None and value < 0:
+            raise CallerError(f"--{name} {value}: must be 0 or more")
     host, port = parse_address(options.listen, "--listen")
+    destination = parse_address(options.to, "--to")
     link = Link(
         _parse_loss(options.loss),
         options.mansd,
@@ -86,12 +92,12 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
     )
     fates = _Fates()
     with closing(bind(port, "netem", "--listen", host)) as endpoint:
+        if destination == endpoint.getsockname():
+            raise CallerError(f"--to {options.to}: leads back to --listen")
         listening = text_of(endpoint.getsockname())
         print(f"noack netem: {listening} → {options.to}, Ctrl-C ends", file=sys.stderr, flush=True)
-        with (
-            closing(Relay(endpoint, parse_address(options.to, "--to"))) as relay,
-            Signals().handled() as signals,
-        ):
+        relay = Relay(endpoint, destination)
+        with Signals().handled() as signals:
             run_loop(
                 link,
                 relay,
@@ -100,9 +106,15 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
                 end_ns=None,
                 stop=lambda: signals.received is not None,
             )
-    print(fates, file=sys.stderr)
+        report = fates.report() | {
+            "send_errors": sum(relay.send_errors.values()),
+            "lost_in_kernel": kernel_drops(endpoint),
+        }
+    print("noack netem: " + ", ".join(f"{n} {key}" for key, n in report.items()), file=sys.stderr)
+    for what, n in relay.send_errors.items():
+        print(f"noack netem: {n} datagrams could not be sent: {what}", file=sys.stderr)
     if options.json:
-        print(json.dumps(fates.report(), indent=2))
+        print(json.dumps(report, indent=2))
     return ExitStatus.OK
 
 
@@ -145,10 +157,6 @@ class _Fates:
         """The counts."""
         counts = {fate.name.lower(): self._fates[fate] for fate in Fate}
         return counts | {"longest_drop_run": self._longest_run}
-
-    def __str__(self) -> str:
-        counts = ", ".join(f"{self._fates[fate]} {fate.name.lower()}" for fate in Fate)
-        return f"noack netem: {counts}; longest drop run {self._longest_run}"
 
 
 if __name__ == "__main__":

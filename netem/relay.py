@@ -1,67 +1,70 @@
-"""The relay: the network emulator's sockets. Datagrams in from anyone, out to one destination.
+"""The relay: the network emulator's socket. Datagrams in, survivors out to one destination, unread.
 
-It reads no payload and serves any UDP program. Flows are numbered by source address, in the order
-of their first datagram.
+Flows are numbered by source address, in the order of their first datagram. Survivors leave from the
+port that they came in by.
 """
 
 import socket
 from collections import Counter
 
 from netem.link import Datagram
-from noack.io.udp import MAX_UDP_BYTES, Address, text_of
+from noack.io.udp import MAX_UDP_BYTES, Address, busiest, kernel_drops, text_of
 
 
 class Relay:
     """The channel of a link.
 
     Args:
-        endpoint: a bound socket, from :func:`noack.io.udp.bind`.
+        endpoint: a bound socket, from :func:`noack.io.udp.bind`. It stays unconnected: a connected
+            one would fail a send for an earlier one's ICMP error, which is a loss beyond the cap.
         destination: where surviving datagrams go.
+        source: the only address to serve; None serves everyone.
     """
 
-    def __init__(self, endpoint: socket.socket, destination: Address) -> None:
-        self._in = endpoint
-        self._out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._out.setblocking(False)
-        self._out.connect(destination)
+    def __init__(
+        self, endpoint: socket.socket, destination: Address, source: Address | None = None
+    ) -> None:
+        self._endpoint = endpoint
         self._destination = destination
+        self._source = source
         self._flows: dict[Address, int] = {}
+        self._foreign = 0
         self.received_from: Counter[Address] = Counter()
         self.sent = 0
         self.send_errors: Counter[str] = Counter()
 
     def fileno(self) -> int:
         """File descriptor to wait on."""
-        return self._in.fileno()
+        return self._endpoint.fileno()
 
     def receive(self) -> Datagram | None:
-        """Take one datagram; None if there was none."""
+        """Take one datagram; None if there was none, or one that is not served."""
         try:
-            data, source = self._in.recvfrom(MAX_UDP_BYTES)
+            data, source = self._endpoint.recvfrom(MAX_UDP_BYTES)
         except OSError:
             return None
         self.received_from[source] += 1
+        if self._source is not None and source != self._source:
+            self._foreign += 1
+            return None
         return Datagram(self._flows.setdefault(source, len(self._flows)), data)
 
     def send(self, message: Datagram) -> None:
         """Forward a datagram that survived; a failure is counted."""
         try:
-            self._out.send(message.data)
+            self._endpoint.sendto(message.data, self._destination)
             self.sent += 1
         except OSError as error:
-            self.send_errors[error.strerror or str(error)] += 1
+            self.send_errors[str(error)] += 1
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
         return {
-            "local": text_of(self._in.getsockname()),
-            "forwards_from": text_of(self._out.getsockname()),
+            "local": text_of(self._endpoint.getsockname()),
             "destination": text_of(self._destination),
             "sent": self.sent,
             "send_errors": dict(self.send_errors),
-            "received_from": {text_of(peer): n for peer, n in self.received_from.items()},
+            "received_from": busiest(self.received_from),
+            "rejected": {"source": self._foreign} if self._foreign else {},
+            "lost_in_kernel": kernel_drops(self._endpoint),
         }
-
-    def close(self) -> None:
-        """Close the outgoing socket; the incoming one is its owner's."""
-        self._out.close()

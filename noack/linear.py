@@ -85,8 +85,8 @@ class HeldInputPropagator:
 
 
 def norm(vector: Vector) -> float:
-    """Euclidean norm ‖v‖₂ of a vector of shape (n,)."""
-    return math.sqrt(float(vector @ vector))
+    """Euclidean norm ‖v‖₂ of a vector of shape (n,); does not overflow before it must."""
+    return math.hypot(*vector.tolist())
 
 
 def spectral_abscissa(matrix: Matrix) -> float:

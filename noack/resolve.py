@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
+from noack.errors import CallerError
+from noack.linear import Matrix, Vector, discretise
 from noack.models import NAMED_MODELS
 from noack.rng import stream
 from noack.scenario import Model, Scenario
@@ -49,7 +50,11 @@ class Loop:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """Return the scenario with every named or drawn quantity made explicit."""
+    """Return the scenario with every named or drawn quantity made explicit.
+
+    Raises:
+        CallerError: the numbers are so large that one step of the plant or model is not finite.
+    """
     model = _explicit_model(scenario.model)
     A, B = np.array(model.A), np.array(model.B)
     (n, m), plant = B.shape, scenario.plant
@@ -63,6 +68,9 @@ def resolve(scenario: Scenario) -> Scenario:
         rng = stream(scenario.seeds.plant, "plant")
         A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
         B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
+    K = np.array(model.gain)
+    _require_finite("plant", A, B, scenario.plant_period_ns)
+    _require_finite("model", np.array(model.A) + np.array(model.B) @ K, K.T, 1)
     return scenario.model_copy(
         update={
             "model": model,
@@ -97,6 +105,16 @@ def loop_of(resolved: Scenario) -> Loop:
         state_names=model.state_names or (),
         input_names=model.input_names or (),
     )
+
+
+def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
+    with np.errstate(all="ignore"):
+        try:
+            finite = all(np.isfinite(block).all() for block in discretise(A, B, step_ns))
+        except ValueError:  # scipy's word for an exponential of infinite entries
+            finite = False
+    if not finite:
+        raise CallerError(f"{key}: these matrices take one step to infinity; check their size")
 
 
 def _explicit_model(model: Model) -> Model:

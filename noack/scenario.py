@@ -137,7 +137,7 @@ class Plant(Section):
     """x(0) is drawn uniformly within these distances of initial_state; n entries."""
     rate_hz: RateHz = 500.0
     """Steps per second of simulated time."""
-    measure_every: Annotated[int, Field(ge=1)] = 1
+    measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """A measurement is sent every so many steps."""
 
     @model_validator(mode="after")

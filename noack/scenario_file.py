@@ -32,7 +32,7 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
         raise CallerError(f"{path}: cannot be read as text: {error}") from None
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise CallerError(f"{path}: not valid TOML: {error}") from None
     for override in overrides:
         _apply(content, override)
@@ -74,6 +74,8 @@ def _apply(content: dict[str, Any], override: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text  # a bare word is taken as a string
+    except (ValueError, RecursionError) as error:
+        raise CallerError(f"--set {key}: not valid TOML: {error}") from None
     table = content
     *path, last = key.strip().split(".")
     for part in path:

@@ -26,6 +26,9 @@ LEGS: Mapping[str, Leg] = {
     "controller": Leg(Flow.UPDATE, Flow.ACTUATION, "plant"),
 }
 
+SENDER: Mapping[str, str] = {leg.to: role for role, leg in LEGS.items()}
+"""From whom each process receives."""
+
 LOOP_ROLES = tuple(LEGS)
 RECORDER = "recorder"
 COORDINATOR = "coordinator"

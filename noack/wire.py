@@ -66,6 +66,7 @@ class Rejection(StrEnum):
     RUN = "run"
     FLOW = "flow"
     TAG = "tag"
+    SOURCE = "source"
     STALE = "stale"
     NOT_FINITE = "not_finite"
 
@@ -165,9 +166,15 @@ class Decoder:
         self.accepted = 0
         self.rejected: dict[Rejection, int] = dict.fromkeys(Rejection, 0)
 
-    def decode(self, datagram: bytes) -> Message | None:
-        """Return the message, or None when the datagram was rejected (see ``rejected``)."""
-        verdict = self._examine(datagram)
+    def decode(self, datagram: bytes, *, from_peer: bool = True) -> Message | None:
+        """Return the message, or None when the datagram was rejected (see ``rejected``).
+
+        Args:
+            datagram: as received.
+            from_peer: whether it came from the address that sends this flow; from elsewhere even an
+                authentic datagram is a replay.
+        """
+        verdict = self._examine(datagram, from_peer=from_peer)
         if isinstance(verdict, Rejection):
             self.rejected[verdict] += 1
             return None
@@ -175,7 +182,7 @@ class Decoder:
         self.accepted += 1
         return verdict
 
-    def _examine(self, datagram: bytes) -> Message | Rejection:
+    def _examine(self, datagram: bytes, *, from_peer: bool) -> Message | Rejection:
         # Cheap tests of the outer form come first: they shed junk and name the commonest mistakes.
         header = read_header(datagram)
         if header is None or header.version != VERSION:
@@ -188,6 +195,8 @@ class Decoder:
             return Rejection.FLOW
         if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
             return Rejection.TAG
+        if not from_peer:
+            return Rejection.SOURCE
         if header.sequence <= self._newest:
             return Rejection.STALE
         vector = np.frombuffer(datagram, "<f8", self._dimension, HEADER_BYTES).astype(np.float64)

@@ -1,13 +1,13 @@
 """Feeds the view of a run from the tables of its record, as they grow or all at once."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.join import ControllerTrack, controller_track, initial_track, join
-from cosim.record import Rows
+from cosim.record import Rows, updates_in
 from cosim.viewer.recording import RunView
 from noack.clock import NS_PER_S
 from noack.records import (
@@ -22,7 +22,6 @@ from noack.records import (
 )
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.wire import read_header
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""
@@ -123,7 +122,7 @@ class ViewFeed:
     def _packets(self, rows: Rows) -> None:
         if not len(rows):
             return
-        sequence, event_ns = packet_headers(rows)
+        rows, sequence, event_ns = updates_in(rows)
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
         dropped = rows["fate"] == Fate.DROPPED
         if dropped.any():
@@ -142,14 +141,6 @@ class ViewFeed:
 
     def _wall_us(self, simulated_ns: Times) -> NDArray[np.float64]:
         return np.asarray(simulated_ns / (1e3 * self._scenario.speed), dtype=np.float64)
-
-
-def packet_headers(packets: Rows) -> tuple[Times, Times]:
-    """Sequence number and event time of the update in each packet; (k,), (k,), −1 if not ours."""
-    headers: Iterable[Any] = [read_header(head.tobytes()) for head in packets["head"]]
-    sequence = [h.sequence if h else NO_SEQUENCE for h in headers]
-    event_ns = [h.t_ns if h else NO_SEQUENCE for h in headers]
-    return np.array(sequence, dtype=np.int64), np.array(event_ns, dtype=np.int64)
 
 
 def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:

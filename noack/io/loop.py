@@ -59,7 +59,7 @@ def run_loop(
     end_ns: int | None,
     stop: Callable[[], bool],
     spin_us: float = 0.0,
-) -> None:
+) -> int:
     """Drive ``machine`` until simulated time ``end_ns``, or until ``stop()``.
 
     Args:
@@ -70,6 +70,9 @@ def run_loop(
         end_ns: when to end; None runs until stopped.
         stop: asked every 50 ms of wall time.
         spin_us: busy-wait for the last microseconds before a deadline.
+
+    Returns:
+        By how much the machine was behind its deadlines at the end, in ns; 0 if it was not.
     """
     spin_s = spin_us * 1e-6
     housekeeping_s = time.monotonic() + _HOUSEKEEPING_S
@@ -102,5 +105,6 @@ def run_loop(
         if time.monotonic() >= housekeeping_s:
             telemetry.flush()
             if stop() or (end_ns is not None and clock.now_ns() >= end_ns):
-                return
+                deadline_ns = machine.next_deadline_ns()
+                return 0 if deadline_ns is None else max(clock.now_ns() - deadline_ns, 0)
             housekeeping_s = time.monotonic() + _HOUSEKEEPING_S

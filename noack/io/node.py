@@ -28,7 +28,7 @@ from noack.io.udp import Address, MessageSocket, bind
 from noack.machine import Machine
 from noack.records import OWNER, tables
 from noack.resolve import Loop, loop_of
-from noack.topology import LEGS, RECORDER
+from noack.topology import LEGS, RECORDER, SENDER
 from noack.wire import Decoder, Encoder, Flow, Message
 
 T = TypeVar("T")
@@ -103,7 +103,14 @@ class Node:
         encoder = Encoder(self.ticket.run_id, self.ticket.key)
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
-            return MessageSocket(endpoint, decoder, encoder, leg.sends, addresses[leg.to])
+            return MessageSocket(
+                endpoint,
+                decoder,
+                encoder,
+                leg.sends,
+                source=addresses[SENDER[self.role]],
+                destination=addresses[leg.to],
+            )
 
         self.run(machine, channel)
 
@@ -130,7 +137,7 @@ class Node:
         ):
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             try:
-                run_loop(
+                behind_ns = run_loop(
                     machine,
                     channel,
                     self.clock,
@@ -139,6 +146,9 @@ class Node:
                     stop=lambda: self.stopping,
                     spin_us=settings.spin_us,
                 )
+                if behind_ns and not self.stopping:
+                    behind_s = behind_ns / NS_PER_S
+                    self._ended = f"too slow: {behind_s:g} s behind; try a lower speed or rate"
             except BaseException as error:
                 self._ended = f"an error of its own: {error!r}"
                 raise

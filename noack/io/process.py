@@ -31,8 +31,10 @@ def run_process(
             ticket = _admission(role, session, signals)
             with Plane(ticket.run_id, role, ticket.endpoint) as plane:
                 node = Node(role, ticket, plane, signals)
-                body(node)
-                plane.leave(node.ended)
+                try:
+                    body(node)
+                finally:
+                    plane.leave(node.ended)
         except NoackError as error:
             if signals.received is None:
                 print(f"noack {role}: {error}", file=sys.stderr)

@@ -8,7 +8,9 @@ a file that only its owner can read, in the user's runtime directory.
 import contextlib
 import json
 import os
+import re
 import secrets
+import socket
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -72,10 +74,32 @@ def loads(text: str) -> Ticket:
 
 
 def ticket_path(session: str) -> Path:
-    """Where the ticket of a session lies that a person's processes join."""
+    """Where the ticket of a session lies that a person's processes join.
+
+    Raises:
+        CallerError: the name is not fit for a file.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", session):
+        raise CallerError(f"session {session!r}: use letters, digits, _ and -, at most 64")
     base = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(base) if base else Path(tempfile.gettempdir())
     return folder / f"noack-{os.getuid()}" / f"{session}.json"
+
+
+def _require_private(folder: Path) -> None:
+    status = folder.stat()
+    if not folder.is_dir() or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise CallerError(f"{folder}: must be a folder of yours, closed to others (mode 700)")
+
+
+def _in_use(path: Path) -> bool:
+    """Whether the coordinator of the ticket that lies here still listens."""
+    try:
+        host, _, port = loads(path.read_text()).endpoint.removeprefix("tcp/").rpartition(":")
+        with socket.create_connection((host, int(port)), timeout=1):
+            return True
+    except (OSError, ValueError, CallerError):
+        return False
 
 
 @contextmanager
@@ -86,10 +110,13 @@ def published(ticket: Ticket, session: str) -> Iterator[Path]:
         CallerError: the folder is not the user's own.
     """
     path = ticket_path(session)
-    path.parent.mkdir(mode=0o700, exist_ok=True)
-    status = path.parent.stat()
-    if status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise CallerError(f"{path.parent}: must belong to you and be closed to others (mode 700)")
+    try:
+        path.parent.mkdir(mode=0o700, exist_ok=True)
+    except OSError as error:
+        raise CallerError(f"{path.parent}: cannot be made ({error.strerror})") from None
+    _require_private(path.parent)
+    if _in_use(path):
+        raise CallerError(f"session {session!r}: another run is open in it; choose --session NAME")
     scratch = path.with_suffix(f".{os.getpid()}")
     descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w") as file:
@@ -112,11 +139,15 @@ def wait_for_ticket(
         PeerError: none came in time.
     """
     path = ticket_path(session)
+    if path.parent.exists():
+        _require_private(path.parent)
     deadline_s = time.monotonic() + timeout_s
     told = False
     while True:
         with contextlib.suppress(FileNotFoundError):
-            return loads(path.read_text())
+            text = path.read_text()
+            _require_private(path.parent)
+            return loads(text)
         if stop() or time.monotonic() > deadline_s:
             raise PeerError(
                 f"no run to join in session {session!r}: start `noack record SCENARIO` first"

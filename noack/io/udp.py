@@ -1,9 +1,11 @@
 """UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
 
 import errno
+import os
 import socket
 from collections import Counter
 from contextlib import suppress
+from pathlib import Path
 
 from noack.errors import CallerError
 from noack.wire import Decoder, Encoder, Flow, Message
@@ -15,6 +17,7 @@ LOOPBACK = "127.0.0.1"
 # lost without a trace, and an unintended loss breaks the MANSD guarantee.
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
+_REPORTED_SOURCES = 16
 MAX_UDP_BYTES = 65_535
 
 
@@ -77,6 +80,16 @@ def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
             ) from None
 
 
+def kernel_drops(endpoint: socket.socket) -> int | None:
+    """Datagrams that the kernel dropped as nobody took them in time; None if it does not say."""
+    inode = str(os.fstat(endpoint.fileno()).st_ino)
+    try:
+        lines = Path("/proc/net/udp").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(f[-1]) for line in lines if (f := line.split())[9] == inode), None)
+
+
 class MessageSocket:
     """A process's one socket in the loop: receives one flow, sends another.
 
@@ -85,7 +98,8 @@ class MessageSocket:
         decoder: takes the flow that the process receives.
         encoder: makes the datagrams that it sends.
         sends: the flow that it sends.
-        destination: where to.
+        source: who sends to it; what comes from elsewhere is never acted on.
+        destination: where it sends.
     """
 
     def __init__(
@@ -94,12 +108,15 @@ class MessageSocket:
         decoder: Decoder,
         encoder: Encoder,
         sends: Flow,
+        *,
+        source: Address,
         destination: Address,
     ) -> None:
         self._endpoint = endpoint
         self._decoder = decoder
         self._encoder = encoder
         self._sends = sends
+        self._source = source
         self._destination = destination
         self.received_from: Counter[Address] = Counter()
         self.sent = 0
@@ -119,7 +136,7 @@ class MessageSocket:
             self.send_errors[str(error)] += 1
             return None
         self.received_from[source] += 1
-        return self._decoder.decode(data)
+        return self._decoder.decode(data, from_peer=source == self._source)
 
     def send(self, message: Message) -> None:
         """Send a message; a failure is counted, as nobody would learn of it anyway."""
@@ -139,14 +156,20 @@ class MessageSocket:
             "destination": text_of(self._destination),
             "sent": self.sent,
             "send_errors": dict(self.send_errors),
-            "received_from": {text_of(peer): n for peer, n in self.received_from.items()},
+            "received_from": busiest(self.received_from),
             "accepted": self._decoder.accepted,
             "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
+            "lost_in_kernel": kernel_drops(self._endpoint),
         }
 
     def close(self) -> None:
         """Close the socket."""
         self._endpoint.close()
+
+
+def busiest(sources: Counter[Address]) -> dict[str, int]:
+    """The sources that sent most; a flood from many ports must not flood the report."""
+    return {text_of(source): n for source, n in sources.most_common(_REPORTED_SOURCES)}
 
 
 def text_of(address: Address) -> str:
@@ -158,9 +181,14 @@ def parse_address(text: str, what: str) -> Address:
     """Parse ``host:port``.
 
     Raises:
-        CallerError: it is not of that form.
+        CallerError: it is not of that form, or the host is unknown.
     """
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdecimal() or int(port) > 65535:
         raise CallerError(f"{what}: expected HOST:PORT, for example 127.0.0.1:9000; found {text!r}")
-    return host or LOOPBACK, int(port)
+    try:
+        found = socket.getaddrinfo(host or LOOPBACK, int(port), socket.AF_INET, socket.SOCK_DGRAM)
+    except OSError as error:
+        raise CallerError(f"{what}: {host}: no such IPv4 host ({error.strerror})") from None
+    address: Address = found[0][4]  # type: ignore[assignment]
+    return address

@@ -20,26 +20,28 @@ class MissedJumps:
 
     def __init__(self, H: Matrix) -> None:
         self._propagate = Propagator(H)
-        self._terms: dict[int, Vector] = {}
+        self._jumps: dict[int, tuple[int, Vector]] = {}
         self._t_ns = 0
+        self._total = np.zeros(H.shape[0])
 
     def advance_to(self, t_ns: int) -> None:
-        """Propagate every missed jump to time ``t_ns``."""
-        dt_ns = t_ns - self._t_ns
+        """Propagate the sum of the missed jumps to time ``t_ns``."""
+        self._total = self._propagate(self._total, t_ns - self._t_ns)
         self._t_ns = t_ns
-        for sequence, term in self._terms.items():
-            self._terms[sequence] = self._propagate(term, dt_ns)
 
     def event(self, sequence: int, e_s: Vector) -> None:
         """Event ``sequence`` happens now with sensor error e_s(t_k⁻), shape (n,)."""
-        self._terms[sequence] = e_s
+        self._jumps[sequence] = (self._t_ns, e_s)
+        self._total = self._total + e_s
 
     def received(self, sequence: int) -> None:
         """The controller now has event ``sequence``; it and all before it are missed no more."""
-        for older in [k for k in self._terms if k <= sequence]:
-            del self._terms[older]
+        if self._jumps and next(iter(self._jumps)) <= sequence:  # numbered in order
+            self._jumps = {k: jump for k, jump in self._jumps.items() if k > sequence}
+            # Anew rather than by subtraction, so that no rounding outlives a delivery.
+            terms = [self._propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
+            self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
 
     def total(self) -> Vector:
         """Σ of the missed jumps at the present time, shape (n,)."""
-        zero = np.zeros(self._propagate.generator.shape[0])
-        return np.sum(list(self._terms.values()), axis=0) if self._terms else zero
+        return self._total

@@ -82,6 +82,13 @@ class Running:
         summary = json.loads(stdout)
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 
+    def finish_unstarted(self) -> str:
+        """The error of a run that never began."""
+        stdout, _ = self.process.communicate(timeout=PATIENCE_S)
+        assert self.process.returncode == 1
+        error: str = json.loads(stdout)["error"]
+        return error
+
     def left_behind(self) -> list[psutil.Process]:
         _, alive = psutil.wait_procs(self._children, timeout=10)
         return alive

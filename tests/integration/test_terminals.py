@@ -119,6 +119,8 @@ def test_netem_serves_any_udp_program(loss: str, expected_run: int) -> None:
         "dropped": 30 if expected_run else 0,
         "forced": 10 if expected_run else 0,
         "longest_drop_run": expected_run,
+        "send_errors": 0,
+        "lost_in_kernel": 0,
     }
 
 
@@ -130,6 +132,9 @@ def test_netem_serves_any_udp_program(loss: str, expected_run: int) -> None:
         (["--listen", ":0", "--to", ":9", "--loss", "bernoulli:1.5"], "less than or equal to 1"),
         (["--listen", ":0", "--to", ":9", "--loss", "sometimes"], "expected one of lossless"),
         (["--listen", ":0", "--to", ":9", "--mansd", "-1"], "must be 0 or more"),
+        (["--listen", ":0", "--to", ":9", "--seed", "-1"], "must be 0 or more"),
+        (["--listen", ":0", "--to", "[::1]:9"], "no such IPv4 host"),
+        (["--loss", "worst_case"], "is for an emulator on its own"),
     ],
 )
 def test_netem_says_what_is_wrong(arguments: list[str], words: str) -> None:
