@@ -253,11 +253,11 @@ def _run(
 ) -> int:
     # Each process of a run waits for the slowest: what is not needed yet is imported later.
     from cosim.launch import launch
-    from cosim.progress import progress_line
+    from cosim.progress import PatientConsole, progress_line
 
     ending = None
     try:
-        with progress_line(Console(stderr=True), scenario) as watcher:
+        with progress_line(PatientConsole(stderr=True), scenario) as watcher:
             ending = launch(
                 scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
             )

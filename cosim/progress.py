@@ -16,6 +16,13 @@ _PLAIN_LINES = 10
 """Progress lines of a run whose terminal cannot redraw one."""
 
 
+class PatientConsole(Console):
+    """A console whose reader may leave: rich would end the program, and with it the run."""
+
+    def on_broken_pipe(self) -> None:
+        """Go on in silence."""
+
+
 @contextmanager
 def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
     """Show a run's progress while the context lasts."""

@@ -22,7 +22,7 @@ from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
 from noack.io.process import run_process
 from noack.io.spool import SpoolWriter
-from noack.io.telemetry import NOTICES, first_row, notices_of
+from noack.io.telemetry import NOTICES, first_row, missing_ranges, notices_of
 from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT, Fate, tables
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
@@ -183,18 +183,12 @@ class Recorder:
                 self._take(sample)
 
     def _missing(self, totals: dict[str, int]) -> dict[str, list[tuple[int, int]]]:
-        missing: dict[str, list[tuple[int, int]]] = {}
-        for table, total in totals.items():
-            if table == NOTICES:
-                continue
-            following = 0
-            for first, end in sorted(self._got.get(table, [])):
-                if first > following:
-                    missing.setdefault(table, []).append((following, first))
-                following = max(following, end)
-            if following < total:
-                missing.setdefault(table, []).append((following, total))
-        return missing
+        missing = {
+            table: missing_ranges(self._got.get(table, ()), total)
+            for table, total in totals.items()
+            if table != NOTICES
+        }
+        return {table: ranges for table, ranges in missing.items() if ranges}
 
     def _give_up_view(self, error: ViewError) -> None:
         print(f"noack recorder: {error}; the numeric record goes on", file=sys.stderr)

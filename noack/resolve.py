@@ -70,7 +70,9 @@ def resolve(scenario: Scenario) -> Scenario:
         B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
     K = np.array(model.gain)
     _require_finite("plant", A, B, scenario.plant_period_ns)
-    _require_finite("model", np.array(model.A) + np.array(model.B) @ K, K.T, 1)
+    if scenario.mode == "model":
+        H = np.array(model.A) + np.array(model.B) @ K
+        _require_finite("model", H, K.T, scenario.controller_period_ns)
     return scenario.model_copy(
         update={
             "model": model,

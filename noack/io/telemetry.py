@@ -7,7 +7,7 @@ it has them all, up to a bound.
 
 import json
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -105,3 +105,19 @@ def first_row(header: bytes) -> int:
 def notices_of(role: str) -> str:
     """Name under which a process's notices are spooled."""
     return f"{NOTICES}_{role}"
+
+
+def missing_ranges(got: Iterable[tuple[int, int]], total: int) -> list[tuple[int, int]]:
+    """Return what lies between batches, and after the last one.
+
+    Args:
+        got: half-open ranges of row numbers that have arrived, in any order.
+        total: rows that were sent.
+    """
+    missing: list[tuple[int, int]] = []
+    following = 0
+    for first, end in sorted(got):
+        if first > following:
+            missing.append((following, first))
+        following = max(following, end)
+    return [*missing, (following, total)] if following < total else missing

@@ -202,6 +202,21 @@ def test_a_run_that_cannot_keep_up_does_not_claim_its_horizon(tmp_path: Path) ->
     assert finished.summary["reached_s"] < 2000.0
 
 
+def test_a_reader_that_leaves_does_not_end_the_run(tmp_path: Path) -> None:
+    command = noack_command(
+        "run", "lane_following", "--runs", str(tmp_path), *EPHEMERAL,
+        *settings(speed=2.0, horizon_s=4.0),
+    )  # fmt: skip
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert "events" in process.stderr.readline()
+        process.stderr.close()
+        assert process.wait(timeout=60) == 0
+    assert len(load_record(tmp_path / "latest")["plant_step"]) == 2001
+
+
 def test_a_run_under_way_is_not_touched_by_a_summary(start: Start) -> None:
     running = start(*settings(speed=2.0, horizon_s=6.0))
     wait_recording(running)

@@ -61,10 +61,12 @@ def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN) -> Decoder
     return Decoder(Flow(flow), dimension, run_id, KEY)
 
 
-def assert_rejected(decoder: Decoder, data: bytes, reason: Rejection) -> None:
+def assert_rejected(
+    decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True
+) -> None:
     """The datagram is rejected for that reason, is counted once, and leaves no other trace."""
     accepted, rejected = decoder.accepted, dict(decoder.rejected)
-    assert decoder.decode(data) is None
+    assert decoder.decode(data, from_peer=from_peer) is None
     counted = {key: n - rejected[key] for key, n in decoder.rejected.items() if n != rejected[key]}
     assert counted == {reason: 1}
     assert decoder.accepted == accepted
@@ -122,7 +124,7 @@ def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
 
 def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
     listed = re.findall(r"^\| (\d) \| `(\w+)` \|", PAGE, re.MULTILINE)
-    assert [int(order) for order, _ in listed] == list(range(1, 9))
+    assert [int(order) for order, _ in listed] == list(range(1, 10))
     assert [reason for _, reason in listed] == ["length", *(reason for reason, _ in FAULTS)]
     assert {reason for _, reason in listed} == {reason.value for reason in Rejection}
 
@@ -237,6 +239,7 @@ FAULTS = [
     ("run", {"run_id": RUN + 1}),
     ("flow", {"flow": 3}),
     ("tag", {"key": OTHER_KEY}),
+    ("source", {"from_peer": False}),
     ("stale", {"sequence": 8}),
     ("not_finite", {"values": [0.0, math.nan, 0.0]}),
 ]
@@ -251,7 +254,8 @@ def test_of_several_faults_the_first_in_order_is_counted(first: int) -> None:
         faults = {"values": [0.0, 0.0, 0.0], "sequence": 9} | fault
         for (_, other), present in zip(FAULTS[first + 1 :], others, strict=True):
             faults |= other if present else {}
-        assert_rejected(decoder, datagram(**faults), Rejection(reason))
+        from_peer = faults.pop("from_peer", True)
+        assert_rejected(decoder, datagram(**faults), Rejection(reason), from_peer=from_peer)
     assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=9)) is not None
 
 

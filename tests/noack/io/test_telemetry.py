@@ -6,9 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.record import merge_rows
 from noack.io import telemetry
-from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notices_of
+from noack.io.telemetry import (
+    NOTICES,
+    TelemetryBuffer,
+    first_row,
+    missing_ranges,
+    notices_of,
+)
 from noack.machine import Notice, Record
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
@@ -110,17 +115,21 @@ def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject)
     sent = len(wire.batches)
     lost = data.draw(st.sets(st.integers(0, sent - 1)))
     arrived = [batch for k, batch in enumerate(wire.batches) if k not in lost]
-    missing, _ = merge_rows([(f, np.frombuffer(p, ROW)) for _, f, _, p in arrived], ROW)
-    end = max((first + rows for _, first, rows, _ in arrived), default=0)
-    if end < buffer.totals()["one"]:
-        missing.append((end, count))
+    missing = missing_ranges([(first, first + n) for _, first, n, _ in arrived], count)
     again = Wire()
     assert buffer.resend({"one": missing}, again) == len(lost) == len(again.batches)
     assert again.batches == [batch for k, batch in enumerate(wire.batches) if k in lost]
     everything = arrived + again.batches
-    missing, rows = merge_rows([(f, np.frombuffer(p, ROW)) for _, f, _, p in everything], ROW)
-    assert missing == []
+    assert missing_ranges([(first, first + n) for _, first, n, _ in everything], count) == []
+    payloads = [p for _, _, _, p in sorted(everything, key=lambda batch: batch[1])]
+    rows = np.frombuffer(b"".join(payloads), ROW)
     assert rows["number"].tolist() == list(range(count))
+
+
+def test_missing_ranges_are_half_open() -> None:
+    assert missing_ranges([(7, 9), (2, 4), (3, 5)], 12) == [(0, 2), (5, 7), (9, 12)]
+    assert missing_ranges([], 0) == []
+    assert missing_ranges([(0, 5), (2, 3)], 5) == []
 
 
 def test_every_batch_that_overlaps_a_missing_range_is_sent_again() -> None:
