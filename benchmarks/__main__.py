@@ -2,7 +2,7 @@
 
 import sys
 
-from benchmarks import demo_run, lateness, latency, machines, startup
+from benchmarks import demo_run, latency, lateness, machines, startup
 from benchmarks._report import run
 
 if __name__ == "__main__":

@@ -61,10 +61,11 @@ def ping(count: int, period_s: float, *, asked: bool) -> Ping:
         try:
             sender.wait(timeout=count * period_s + 30)
             found = json.loads(_said(receiver))
-        except (subprocess.TimeoutExpired, ValueError):
+        except (subprocess.TimeoutExpired, ValueError, IndexError):
             raise MeasurementError("the ping through the bare relay did not end") from None
-    p50_ns, p99_ns = np.quantile(found["latencies_ns"], [0.5, 0.99])
-    return Ping(p50_ns / 1e3, p99_ns / 1e3, len(found["latencies_ns"]), found["granted"])
+    latencies_ns, granted = found["latencies_ns"], found["granted"]
+    p50_us, p99_us = (float(quantile) / 1e3 for quantile in np.quantile(latencies_ns, [0.5, 0.99]))
+    return Ping(p50_us, p99_us, len(latencies_ns), granted)
 
 
 @contextlib.contextmanager

@@ -16,18 +16,18 @@ from benchmarks._ping import ping
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
 from benchmarks._runs import noack
 
-ROUNDS = 3
-ROUND_S = 10.0
+ROUNDS = 5
+ROUND_S = 5.0
 PERIOD_S = 0.002
 GOAL = Goal("<=", 3)
 
 _EVERY_MEASUREMENT = (
     "run", "lane_following",
     "--set", f"horizon_s={ROUND_S}",
-    "--set", 'mode="zoh"',
-    "--set", "trigger.beta=1e-6",
+    "--set", "trigger.beta=1e-9",
     "--set", 'network.loss={model="lossless"}',
 )  # fmt: skip
+_ASKED = {True: "real-time settings", False: "no settings"}
 _PLAIN = ("--set", "realtime.enabled=false")
 
 
@@ -75,13 +75,12 @@ def _refused(granted: Mapping[str, str]) -> set[str]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure both sides in turn, with and without real-time settings."""
-    rows = []
+    ours: dict[bool, list[Sample]] = {asked: [] for asked in _ASKED}
+    pings: dict[bool, list[Sample]] = {asked: [] for asked in _ASKED}
     refused: set[str] = set()
-    ours: dict[bool, list[Sample]] = {True: [], False: []}
-    pings: dict[bool, list[Sample]] = {True: [], False: []}
     for number in range(ROUNDS):
-        for asked in (True, False):
-            say(f"round {number + 1} of {ROUNDS}, {'with' if asked else 'no'} real-time settings")
+        for asked, settings in _ASKED.items():
+            say(f"round {number + 1} of {ROUNDS}, {settings}")
             bare = ping(round(ROUND_S / PERIOD_S), PERIOD_S, asked=asked)
             pings[asked].append(Sample(bare.p50_us, bare.p99_us, bare.received))
             summary = noack(*_EVERY_MEASUREMENT, *(() if asked else _PLAIN)).summary
@@ -89,9 +88,11 @@ def measure(options: argparse.Namespace) -> list[Row]:
             ours[asked].append(Sample(found["p50"], found["p99"], found["updates"]))
             for granted in (bare.granted, *summary["realtime"].values()):
                 refused |= _refused(granted)
-    for asked, name in ((True, "real-time settings"), (False, "no settings")):
-        rows += rows_of(name, ours[asked], pings[asked], sorted(refused) if asked else ())
-    return rows
+    return [
+        row
+        for asked, settings in _ASKED.items()
+        for row in rows_of(settings, ours[asked], pings[asked], sorted(refused) if asked else ())
+    ]
 
 
 BENCHMARK = Benchmark("latency", "One-way latency", measure)

@@ -11,17 +11,19 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
 from benchmarks._ticks import FIFO_PRIORITY, LOOPS, Ticks, ticks
 
-ROUNDS = 5
-ROUND_S = 2
+ROUNDS = 9
+ROUND_S = 1
 PERIOD_US = 1000
 GOAL = Goal("<=", 1.5)
 _HISTOGRAM_US = 20_000
+_ASKED = {True: "real-time settings", False: "no settings"}
 
 
 def quantile_of(histogram: Mapping[int, int], share: float) -> float:
@@ -35,8 +37,16 @@ def quantile_of(histogram: Mapping[int, int], share: float) -> float:
     raise ValueError("an empty histogram has no quantiles")
 
 
-def cyclictest() -> tuple[float, float] | str:
-    """Lateness p50 and p99 in µs of a round of cyclictest, or why there is none."""
+class Kernel(NamedTuple):
+    """Lateness in a round of cyclictest, µs."""
+
+    p50_us: float
+    p99_us: float
+    max_us: float
+
+
+def cyclictest() -> Kernel | str:
+    """Lateness in a round of cyclictest, or why there is none."""
     program = shutil.which("cyclictest")
     if program is None:
         return "cyclictest is not installed (Debian: apt-get install rt-tests)"
@@ -50,61 +60,49 @@ def cyclictest() -> tuple[float, float] | str:
         if done.returncode != 0 or not found.is_file():
             said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[0]
             return f"cyclictest failed, said {said!r}"
-        counts = json.loads(found.read_text())["thread"]["0"]["histogram"]
-    histogram = {int(low_us): int(count) for low_us, count in counts.items()}
-    return quantile_of(histogram, 0.5), quantile_of(histogram, 0.99)
+        thread = json.loads(found.read_text())["thread"]["0"]
+    max_us = float(thread["max"])
+    histogram = {int(low_us): int(count) for low_us, count in thread["histogram"].items()}
+    return Kernel(quantile_of(histogram, 0.5), quantile_of(histogram, 0.99), max_us)
 
 
 def rows_of(
     loops: Mapping[tuple[str, bool], list[Ticks]],
-    cyclic: list[tuple[float, float]],
+    kernel: Sequence[Kernel],
     no_cyclictest: str | None,
 ) -> list[Row]:
     """Return the rows from all rounds.
 
     Args:
         loops: by loop and whether it asked for the real-time settings, its rounds.
-        cyclic: cyclictest's rounds, p50 and p99.
+        kernel: cyclictest's rounds.
         no_cyclictest: why there are none.
     """
     ours = loops["run_loop", True]
     fifo = ours[0].granted["sched_fifo"]
-    unjudged = no_cyclictest or (None if fifo == "granted" else f"SCHED_FIFO {fifo}")
-    rows = []
-    for index, quantile in enumerate(("p50", "p99")):
-        value = median(t[index] for t in cyclic) if cyclic else None
-        rows.append(
-            Row(
-                f"run_loop, {quantile}, real-time settings",
-                median(t[index] for t in ours),  # type: ignore[misc]
-                "µs",
-                Peer("cyclictest", value),
-                GOAL if quantile == "p99" else None,
-                unjudged=unjudged if quantile == "p99" else None,
-            )
-        )
-    for asked, settings in ((True, "real-time settings"), (False, "no settings")):
-        for kind in LOOPS:
-            if kind != "run_loop":
-                rows.append(
-                    Row(
-                        f"run_loop, p99, {settings}",
-                        median(t.p99_us for t in loops["run_loop", asked]),
-                        "µs",
-                        Peer(f"{kind} loop", median(t.p99_us for t in loops[kind, asked])),
-                    )
-                )
-    rows.append(
-        Row("run_loop, max, real-time settings", max(t.max_us for t in ours), "µs",
-            note=f"of {len(ours)} rounds of {ROUND_S} s")
-    )  # fmt: skip
-    return rows
+    unjudged = no_cyclictest if fifo == "granted" else f"SCHED_FIFO {fifo}"
+    note = f"of all {len(ours)} rounds of {ROUND_S} s; the peer's is the machine's own"
+    return [
+        Row(f"tick lateness p50, {_ASKED[True]}", median(t.p50_us for t in ours), "µs",
+            Peer("cyclictest", median(k.p50_us for k in kernel) if kernel else None)),
+        Row(f"tick lateness p99, {_ASKED[True]}", median(t.p99_us for t in ours), "µs",
+            Peer("cyclictest", median(k.p99_us for k in kernel) if kernel else None),
+            GOAL, unjudged=unjudged),
+        Row(f"tick lateness max, {_ASKED[True]}", max(t.max_us for t in ours), "µs",
+            Peer("cyclictest", max((k.max_us for k in kernel), default=None)), note=note),
+        *(
+            Row(f"tick lateness p99, {settings}",
+                median(t.p99_us for t in loops["run_loop", asked]), "µs",
+                Peer(f"{kind} loop", median(t.p99_us for t in loops[kind, asked])))
+            for asked, settings in _ASKED.items() for kind in LOOPS if kind != "run_loop"
+        ),
+    ]  # fmt: skip
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Run all loops in turn, several times."""
     loops: dict[tuple[str, bool], list[Ticks]] = {}
-    cyclic: list[tuple[float, float]] = []
+    kernel: list[Kernel] = []
     missing: str | None = None
     for number in range(ROUNDS):
         say(f"round {number + 1} of {ROUNDS}")
@@ -112,13 +110,13 @@ def measure(options: argparse.Namespace) -> list[Row]:
         if isinstance(found, str):
             missing = found
         else:
-            cyclic.append(found)
-        for asked in (True, False):
+            kernel.append(found)
+        for asked in _ASKED:
             for kind in LOOPS:
                 loops.setdefault((kind, asked), []).append(
                     ticks(kind, ROUND_S, PERIOD_US, asked=asked)
                 )
-    return rows_of(loops, cyclic, missing)
+    return rows_of(loops, kernel, missing)
 
 
 BENCHMARK = Benchmark("lateness", "Lateness of a 1 kHz loop", measure)

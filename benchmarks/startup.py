@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, run, say
@@ -20,34 +21,32 @@ ROUNDS = 5
 GOAL_S = Goal("<", 3)
 ROOT = Path(__file__).parents[1]
 
-_LIBRARIES = "import numpy, scipy.linalg, pydantic, zenoh"
+_IMPORT_LIBRARIES = (
+    "import numpy, scipy.linalg, pydantic, zenoh, sys; print('ready', file=sys.stderr)"
+)
 _SHORT = ("--set", "horizon_s=1")
 
 
-def started_s() -> float:
-    """Wall seconds from the start of ``noack run`` to the first control step.
+def started() -> tuple[float, float | None]:
+    """Start a short run.
+
+    Returns:
+        Wall seconds from the start of ``noack run`` to the first control step, and what the run's
+        summary says about the launch alone, if it does.
 
     Raises:
         MeasurementError: the run failed or showed no progress.
     """
-    bound_s = noack("run", "lane_following", *_SHORT).first_step_s
-    if bound_s is None:
+    found = noack("run", "lane_following", *_SHORT)
+    if found.first_step_s is None:
         raise MeasurementError("the run showed no progress line")
-    return bound_s
+    return found.first_step_s, found.summary.get("startup_s")
 
 
 def imported_s() -> float:
-    """Wall seconds that a bare Python takes to import the libraries and end."""
-    begun_s, at_end_s = _span([sys.executable, "-c", f"{_LIBRARIES}; {_STAMP}"])
-    return at_end_s - begun_s
-
-
-_STAMP = "import sys, time; print(time.monotonic(), file=sys.stderr)"
-
-
-def _span(command: list[str]) -> tuple[float, float]:
-    finished = execute(command)
-    return finished.begun_s, float(finished.lines[-1].text)
+    """Wall seconds from the start of a bare Python until it has imported the libraries."""
+    finished = execute([sys.executable, "-c", _IMPORT_LIBRARIES])
+    return finished.lines[-1].at_s - finished.begun_s
 
 
 def copy_repository(target: Path) -> None:
@@ -85,28 +84,38 @@ def installed_s() -> float:
     return bound_s
 
 
-def measure(options: argparse.Namespace) -> list[Row]:
-    """Start several short runs, and the alternative in turn."""
-    ours_s, imports_s = [], []
-    for number in range(ROUNDS):
-        say(f"round {number + 1} of {ROUNDS}")
-        ours_s.append(started_s())
-        imports_s.append(imported_s())
-    value_s, peer_s = median(ours_s), median(imports_s)
+def rows_of(
+    ours_s: Sequence[float], launches_s: Sequence[float], imports_s: Sequence[float]
+) -> list[Row]:
+    """Return the rows from the rounds of both sides, wall seconds."""
+    value_s = median(ours_s)
     rows = [
         Row("noack run → first control step", value_s, "s", goal=GOAL_S,
             note="upper bound: includes a progress line's way through the recorder"),
-        Row("noack run → first control step, per import", value_s, "s",
-            Peer("Python that imports the libraries", peer_s)),
+        Row("the same, against a bare import", value_s, "s",
+            Peer("Python that imports the libraries", median(imports_s))),
     ]  # fmt: skip
-    if options.install:
-        say("make demo in an empty folder")
-        rows.append(Row("make demo → first control step", installed_s(), "s", note=_pip_note()))
+    if launches_s:
+        rows.append(Row("of it, from launch to time 0, as the run says", median(launches_s), "s"))
     return rows
 
 
-def _pip_note() -> str:
-    return "downloads included, unless pip had them in its cache"
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Start several short runs, and the alternative in turn."""
+    ours_s, launches_s, imports_s = [], [], []
+    for number in range(ROUNDS):
+        say(f"round {number + 1} of {ROUNDS}")
+        total_s, launch_s = started()
+        ours_s.append(total_s)
+        imports_s.append(imported_s())
+        if launch_s is not None:
+            launches_s.append(launch_s)
+    rows = rows_of(ours_s, launches_s, imports_s)
+    if options.install:
+        say("make demo in an empty folder")
+        note = "a new environment and the pinned dependencies; downloaded, or from pip's cache"
+        rows.append(Row("make demo → first control step", installed_s(), "s", note=note))
+    return rows
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ import socket
 from collections import Counter
 
 from netem.link import Datagram
-from noack.io.udp import MAX_UDP_BYTES, Address, busiest, kernel_drops, text_of
+from noack.io.udp import MAX_UDP_BYTES, Address, SourceCount, kernel_drops, text_of
 
 
 class Relay:
@@ -29,7 +29,7 @@ class Relay:
         self._source = source
         self._flows: dict[Address, int] = {}
         self._foreign = 0
-        self.received_from: Counter[Address] = Counter()
+        self._sources = SourceCount()
         self.sent = 0
         self.send_errors: Counter[str] = Counter()
 
@@ -43,7 +43,7 @@ class Relay:
             data, source = self._endpoint.recvfrom(MAX_UDP_BYTES)
         except OSError:
             return None
-        self.received_from[source] += 1
+        self._sources.add(source)
         if self._source is not None and source != self._source:
             self._foreign += 1
             return None
@@ -64,7 +64,7 @@ class Relay:
             "destination": text_of(self._destination),
             "sent": self.sent,
             "send_errors": dict(self.send_errors),
-            "received_from": busiest(self.received_from),
+            "received_from": self._sources.busiest(),
             "rejected": {"source": self._foreign} if self._foreign else {},
             "lost_in_kernel": kernel_drops(self._endpoint),
         }

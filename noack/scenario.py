@@ -288,6 +288,8 @@ class Realtime(Section):
     """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
     fifo_priority: Annotated[int, Field(ge=1, le=98)] = 50
     """SCHED_FIFO priority."""
+    pin_cores: bool = True
+    """With SCHED_FIFO: neighbours in the loop run on different cores."""
     spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
     """Busy-wait this long before each deadline; starves the others on a shared core."""
 

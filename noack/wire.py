@@ -20,6 +20,7 @@ of another. Content is read only after the tag has been verified.
 
 import hashlib
 import hmac
+import math
 import struct
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
@@ -160,6 +161,7 @@ class Decoder:
         self._flow = flow
         self._size_bytes = datagram_bytes(dimension)
         self._dimension = dimension
+        self._vector = struct.Struct(f"<{dimension}d")
         self._run_id = run_id
         self._tag = _Tagger(key)
         self._newest = -1
@@ -184,22 +186,24 @@ class Decoder:
 
     def _examine(self, datagram: bytes, *, from_peer: bool) -> Message | Rejection:
         # Cheap tests of the outer form come first: they shed junk and name the commonest mistakes.
-        header = read_header(datagram)
-        if header is None or header.version != VERSION:
-            return Rejection.LENGTH if len(datagram) < HEADER_BYTES else Rejection.VERSION
-        if len(datagram) != self._size_bytes or header.dimension != self._dimension:
+        if len(datagram) < HEADER_BYTES:
             return Rejection.LENGTH
-        if header.run_id != self._run_id:
+        magic, version, flow, dimension, _, run_id, sequence, t_ns = _HEADER.unpack_from(datagram)
+        if magic != MAGIC or version != VERSION:
+            return Rejection.VERSION
+        if len(datagram) != self._size_bytes or dimension != self._dimension:
+            return Rejection.LENGTH
+        if run_id != self._run_id:
             return Rejection.RUN
-        if header.flow != self._flow:
+        if flow != self._flow:
             return Rejection.FLOW
         if not hmac.compare_digest(self._tag(datagram[:-TAG_BYTES]), datagram[-TAG_BYTES:]):
             return Rejection.TAG
         if not from_peer:
             return Rejection.SOURCE
-        if header.sequence <= self._newest:
+        if sequence <= self._newest:
             return Rejection.STALE
-        vector = np.frombuffer(datagram, "<f8", self._dimension, HEADER_BYTES).astype(np.float64)
-        if not np.isfinite(vector).all():
+        entries = self._vector.unpack_from(datagram, HEADER_BYTES)
+        if not all(map(math.isfinite, entries)):
             return Rejection.NOT_FINITE
-        return Message(self._flow, header.sequence, header.t_ns, vector)
+        return Message(self._flow, sequence, t_ns, np.array(entries))

@@ -28,7 +28,7 @@ from noack.io.udp import Address, MessageSocket, bind
 from noack.machine import Machine
 from noack.records import OWNER, tables
 from noack.resolve import Loop, loop_of
-from noack.topology import LEGS, RECORDER, SENDER
+from noack.topology import LEGS, LOOP_ROLES, RECORDER, SENDER
 from noack.wire import Decoder, Encoder, Flow, Message
 
 T = TypeVar("T")
@@ -130,10 +130,11 @@ class Node:
         telemetry = TelemetryBuffer(owned, self.plane.publish_telemetry)
         grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
+        place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
             closing(bind(port, self.role, f"ports.{self.role}")) as endpoint,
             # Taken before the barrier: locking memory may take a tenth of a second.
-            realtime(settings.enabled, settings.fifo_priority) as granted,
+            realtime(settings.enabled, settings.fifo_priority, place) as granted,
         ):
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             try:

@@ -22,13 +22,22 @@ _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 
 
 @contextmanager
-def realtime(enabled: bool, fifo_priority: int) -> Iterator[dict[str, str]]:
+def realtime(
+    enabled: bool, fifo_priority: int, place: int | None = None
+) -> Iterator[dict[str, str]]:
     """Take the real-time settings for the calling thread and undo them at the end.
+
+    Args:
+        enabled: whether to ask for any.
+        fifo_priority: SCHED_FIFO priority.
+        place: the process's number along the loop; neighbours get different cores, so that a
+            process does not stand in the way of the one it wakes. None leaves the choice to the
+            system.
 
     Yields:
         For each setting ``"granted"``, or ``"refused: why"``, or ``"not asked for"``.
     """
-    settings = ("sched_fifo", "timer_slack", "memory_lock", "cpu_dma_latency")
+    settings = ("memory_lock", "timer_slack", "sched_fifo", "affinity", "cpu_dma_latency")
     granted = dict.fromkeys(settings, "not asked for")
     with contextlib.ExitStack() as undo:
         gc.collect()
@@ -36,9 +45,13 @@ def realtime(enabled: bool, fifo_priority: int) -> Iterator[dict[str, str]]:
         gc.disable()
         undo.callback(gc.enable)
         if enabled:
-            granted["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
-            granted["timer_slack"] = _attempt(_timer_slack)
+            # Locking memory takes a tenth of a second: at real-time priority it would hold up
+            # whatever else runs on this core.
             granted["memory_lock"] = _attempt(_memory_lock)
+            granted["timer_slack"] = _attempt(_timer_slack)
+            granted["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
+            if place is not None and granted["sched_fifo"] == "granted":
+                granted["affinity"] = _attempt(lambda: _affinity(place, undo))
             granted["cpu_dma_latency"] = _attempt(lambda: _cpu_dma_latency(undo))
         yield granted
 
@@ -66,6 +79,14 @@ def _fifo(priority: int, undo: contextlib.ExitStack) -> None:
         ):
             os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(max(rank, 1)))
     undo.callback(os.sched_setscheduler, 0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _affinity(place: int, undo: contextlib.ExitStack) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        raise OSError(0, "there is only one core")
+    os.sched_setaffinity(0, {cores[place % len(cores)]})
+    undo.callback(os.sched_setaffinity, 0, set(cores))
 
 
 def _libc() -> ctypes.CDLL:

@@ -18,6 +18,8 @@ LOOPBACK = "127.0.0.1"
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
 _REPORTED_SOURCES = 16
+_READ_BYTES = 2048
+"""More than any datagram of the loop has; what is longer is cut and rejected by its length."""
 MAX_UDP_BYTES = 65_535
 
 
@@ -118,7 +120,7 @@ class MessageSocket:
         self._sends = sends
         self._source = source
         self._destination = destination
-        self.received_from: Counter[Address] = Counter()
+        self._sources = SourceCount()
         self.sent = 0
         self.send_errors: Counter[str] = Counter()
 
@@ -129,13 +131,13 @@ class MessageSocket:
     def receive(self) -> Message | None:
         """Take one datagram; None if there was none or it was rejected."""
         try:
-            data, source = self._endpoint.recvfrom(MAX_UDP_BYTES)
+            data, source = self._endpoint.recvfrom(_READ_BYTES)
         except BlockingIOError:
             return None
         except OSError as error:  # an ICMP error of an earlier send is reported here
             self.send_errors[str(error)] += 1
             return None
-        self.received_from[source] += 1
+        self._sources.add(source)
         return self._decoder.decode(data, from_peer=source == self._source)
 
     def send(self, message: Message) -> None:
@@ -156,7 +158,7 @@ class MessageSocket:
             "destination": text_of(self._destination),
             "sent": self.sent,
             "send_errors": dict(self.send_errors),
-            "received_from": busiest(self.received_from),
+            "received_from": self._sources.busiest(),
             "accepted": self._decoder.accepted,
             "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
             "lost_in_kernel": kernel_drops(self._endpoint),
@@ -167,9 +169,31 @@ class MessageSocket:
         self._endpoint.close()
 
 
-def busiest(sources: Counter[Address]) -> dict[str, int]:
-    """The sources that sent most; a flood from many ports must not flood the report."""
-    return {text_of(source): n for source, n in sources.most_common(_REPORTED_SOURCES)}
+class SourceCount:
+    """Counts datagrams by source address, cheaply while the source stays the same."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[Address] = Counter()
+        self._last: Address | None = None
+        self._run = 0
+
+    def add(self, source: Address) -> None:
+        """Count one datagram."""
+        if source == self._last:
+            self._run += 1
+            return
+        self._fold()
+        self._last, self._run = source, 1
+
+    def busiest(self) -> dict[str, int]:
+        """The sources that sent most; a flood from many ports must not flood the report."""
+        self._fold()
+        return {text_of(source): n for source, n in self._counts.most_common(_REPORTED_SOURCES)}
+
+    def _fold(self) -> None:
+        if self._last is not None and self._run:
+            self._counts[self._last] += self._run
+            self._run = 0
 
 
 def text_of(address: Address) -> str:

@@ -11,8 +11,10 @@ from benchmarks._report import Benchmark, MeasurementError
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS, Ticks
 from benchmarks.latency import Sample
+from benchmarks.lateness import Kernel
 
 NAMES = ("demo_run", "latency", "lateness", "startup", "machines")
+KERNEL = Kernel(12.0, 20.0, 60.0)
 ROOT = Path(__file__).parents[2]
 
 
@@ -74,7 +76,7 @@ def rounds(fifo: str) -> dict[tuple[str, bool], list[Ticks]]:
 
 
 def test_lateness_is_judged_against_cyclictest() -> None:
-    rows = lateness.rows_of(rounds("granted"), [(12.0, 20.0)] * 3, None)
+    rows = lateness.rows_of(rounds("granted"), [KERNEL] * 3, None)
     (judged,) = [row for row in rows if row.goal is not None]
     assert judged.peer is not None
     assert judged.peer.name == "cyclictest"
@@ -83,16 +85,16 @@ def test_lateness_is_judged_against_cyclictest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fifo", "cyclic", "missing", "why"),
+    ("fifo", "kernel", "missing", "why"),
     [
-        ("refused: Operation not permitted", [(12.0, 20.0)], None, "Operation not permitted"),
+        ("refused: Operation not permitted", [KERNEL], None, "Operation not permitted"),
         ("granted", [], "cyclictest is not installed", "not installed"),
     ],
 )
 def test_lateness_is_not_judged_without_sched_fifo_or_cyclictest(
-    fifo: str, cyclic: list[tuple[float, float]], missing: str | None, why: str
+    fifo: str, kernel: list[Kernel], missing: str | None, why: str
 ) -> None:
-    rows = lateness.rows_of(rounds(fifo), cyclic, missing)
+    rows = lateness.rows_of(rounds(fifo), kernel, missing)
     (judged,) = [row for row in rows if row.goal is not None]
     assert judged.holds is None
     assert why in judged.as_json()["note"]
