@@ -24,6 +24,8 @@ from noack.io.realtime import realtime
 PING_BYTES = 80
 """As long as a state update with four states."""
 FIFO_PRIORITY = 50
+PLACES = {"sender": 1, "relay": 2, "receiver": 3}
+"""The sensor's, the emulator's and the controller's places along the loop."""
 _STAMP = struct.Struct("<q")
 _END = b"end"
 _SETTLE_S = 0.3
@@ -122,7 +124,7 @@ def main() -> None:
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
-        realtime(options.realtime, FIFO_PRIORITY) as granted,
+        realtime(options.realtime, FIFO_PRIORITY, PLACES[options.role]) as granted,
     ):
         endpoint.bind(("127.0.0.1", 0))
         if options.to:
