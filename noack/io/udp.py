@@ -92,83 +92,6 @@ def kernel_drops(endpoint: socket.socket) -> int | None:
     return next((int(f[-1]) for line in lines if (f := line.split())[9] == inode), None)
 
 
-class MessageSocket:
-    """A process's one socket in the loop: receives one flow, sends another.
-
-    Args:
-        endpoint: a bound socket, from :func:`bind`.
-        decoder: takes the flow that the process receives.
-        encoder: makes the datagrams that it sends.
-        sends: the flow that it sends.
-        source: who sends to it; what comes from elsewhere is never acted on.
-        destination: where it sends.
-    """
-
-    def __init__(
-        self,
-        endpoint: socket.socket,
-        decoder: Decoder,
-        encoder: Encoder,
-        sends: Flow,
-        *,
-        source: Address,
-        destination: Address,
-    ) -> None:
-        self._endpoint = endpoint
-        self._decoder = decoder
-        self._encoder = encoder
-        self._sends = sends
-        self._source = source
-        self._destination = destination
-        self._sources = SourceCount()
-        self.sent = 0
-        self.send_errors: Counter[str] = Counter()
-
-    def fileno(self) -> int:
-        """File descriptor to wait on."""
-        return self._endpoint.fileno()
-
-    def receive(self) -> Message | None:
-        """Take one datagram; None if there was none or it was rejected."""
-        try:
-            data, source = self._endpoint.recvfrom(_READ_BYTES)
-        except BlockingIOError:
-            return None
-        except OSError as error:  # an ICMP error of an earlier send is reported here
-            self.send_errors[str(error)] += 1
-            return None
-        self._sources.add(source)
-        return self._decoder.decode(data, from_peer=source == self._source)
-
-    def send(self, message: Message) -> None:
-        """Send a message; a failure is counted, as nobody would learn of it anyway."""
-        if message.flow is not self._sends:
-            raise ValueError(f"this process sends {self._sends.name}, not {message.flow.name}")
-        try:
-            self._endpoint.sendto(self._encoder.encode(message), self._destination)
-            self.sent += 1
-        except OSError as error:
-            self.send_errors[str(error)] += 1
-
-    def report(self) -> dict[str, object]:
-        """Counters, for the run's summary."""
-        return {
-            "local": text_of(self._endpoint.getsockname()),
-            "sends": self._sends.name.lower(),
-            "destination": text_of(self._destination),
-            "sent": self.sent,
-            "send_errors": dict(self.send_errors),
-            "received_from": self._sources.busiest(),
-            "accepted": self._decoder.accepted,
-            "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
-            "lost_in_kernel": kernel_drops(self._endpoint),
-        }
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._endpoint.close()
-
-
 class SourceCount:
     """Counts datagrams by source address, cheaply while the source stays the same."""
 
@@ -194,6 +117,108 @@ class SourceCount:
         if self._last is not None and self._run:
             self._counts[self._last] += self._run
             self._run = 0
+
+
+class CountingSocket:
+    """A bound socket with one destination that accounts for what passes through it.
+
+    It stays unconnected: a connected one would fail a send for an earlier one's ICMP error, which
+    in the network emulator is a loss beyond the cap.
+
+    Args:
+        endpoint: from :func:`bind`.
+        destination: where it sends.
+    """
+
+    def __init__(self, endpoint: socket.socket, destination: Address) -> None:
+        self._endpoint = endpoint
+        self._destination = destination
+        self._sources = SourceCount()
+        self._sent = 0
+        self.send_errors: Counter[str] = Counter()
+
+    def fileno(self) -> int:
+        """File descriptor to wait on."""
+        return self._endpoint.fileno()
+
+    def take(self, most_bytes: int) -> tuple[bytes, Address] | None:
+        """Take one datagram, cut at ``most_bytes``, with its source; None if there was none."""
+        try:
+            data, source = self._endpoint.recvfrom(most_bytes)
+        except OSError:
+            return None
+        self._sources.add(source)
+        return data, source
+
+    def put(self, data: bytes) -> None:
+        """Send a datagram; a failure is counted, as nobody would learn of it anyway."""
+        try:
+            self._endpoint.sendto(data, self._destination)
+            self._sent += 1
+        except OSError as error:
+            self.send_errors[str(error)] += 1
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        return {
+            "local": text_of(self._endpoint.getsockname()),
+            "destination": text_of(self._destination),
+            "sent": self._sent,
+            "send_errors": dict(self.send_errors),
+            "received_from": self._sources.busiest(),
+            "lost_in_kernel": kernel_drops(self._endpoint),
+        }
+
+
+class MessageSocket(CountingSocket):
+    """A process's one socket in the loop: receives one flow, sends another.
+
+    Args:
+        endpoint: a bound socket, from :func:`bind`.
+        decoder: takes the flow that the process receives.
+        encoder: makes the datagrams that it sends.
+        sends: the flow that it sends.
+        source: who sends to it; what comes from elsewhere is never acted on.
+        destination: where it sends.
+    """
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        decoder: Decoder,
+        encoder: Encoder,
+        sends: Flow,
+        *,
+        source: Address,
+        destination: Address,
+    ) -> None:
+        super().__init__(endpoint, destination)
+        self._decoder = decoder
+        self._encoder = encoder
+        self._sends = sends
+        self._source = source
+
+    def receive(self) -> Message | None:
+        """Take one datagram; None if there was none or it was rejected."""
+        taken = self.take(_READ_BYTES)
+        if taken is None:
+            return None
+        data, source = taken
+        return self._decoder.decode(data, from_peer=source == self._source)
+
+    def send(self, message: Message) -> None:
+        """Send a message."""
+        if message.flow is not self._sends:
+            raise ValueError(f"this process sends {self._sends.name}, not {message.flow.name}")
+        self.put(self._encoder.encode(message))
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        return super().report() | {
+            "sends": self._sends.name.lower(),
+            "accepted": self._decoder.accepted,
+            "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
+        }
 
 
 def text_of(address: Address) -> str:
