@@ -225,9 +225,13 @@ def netem(context: typer.Context) -> int:
 @command(_FILES)
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
     """Check a scenario and print it resolved: defaults, named models and draws made explicit."""
+    from cosim.tables import print_assumptions
     from noack.resolve import resolve
+    from noack.theory.assumptions import assumptions
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
+    verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
+    print_assumptions(Console(stderr=True), verdicts)
     if json:
         _print_json(resolved.model_dump(mode="json"))
     else:
@@ -254,7 +258,12 @@ def _run(
     # Each process of a run waits for the slowest: what is not needed yet is imported later.
     from cosim.launch import launch
     from cosim.progress import PatientConsole, progress_line
+    from noack.resolve import resolve
+    from noack.theory.assumptions import Verdict, assumptions
 
+    for assumption in assumptions(resolve(scenario)):
+        if assumption.verdict == Verdict.VIOLATED and assumption.source == "Theorem 2":
+            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
     ending = None
     try:
         with progress_line(PatientConsole(stderr=True), scenario) as watcher:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from cosim.launch import Watcher
 from noack.scenario import Scenario
@@ -27,12 +27,7 @@ class PatientConsole(Console):
 def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
     """Show a run's progress while the context lasts."""
     live = console.is_terminal
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[account]}"),
-        TimeRemainingColumn(elapsed_when_finished=True),
-    )
+    columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     shown = 0
     live_told = False
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
@@ -44,16 +39,16 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
 
         def started(run_dir: Path) -> None:
             nonlocal task
-            task = progress.add_task(scenario.name, total=scenario.horizon_s, account="")
+            task = progress.add_task(scenario.name, total=scenario.horizon_s)
 
         def account(account: dict[str, Any]) -> None:
             nonlocal shown, live_told
             if account["live"] and not live_told:
                 live_told = True
                 console.print(account["live"], highlight=False, soft_wrap=True)
-            text = _account(account)
+            text = _account(account, scenario.horizon_s)
             if task is not None:
-                progress.update(task, completed=account["t_s"], account=text)
+                progress.update(task, completed=account["t_s"], description=text)
             due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
             if not live and due > shown:
                 shown = due
@@ -62,10 +57,10 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
         yield Watcher(waiting, started, account)
 
 
-def _account(account: dict[str, Any]) -> str:
-    norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.4f}"
+def _account(account: dict[str, Any], horizon_s: float) -> str:
+    norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.3g}"
     return (
-        f"t {account['t_s']:7.3f} s  events {account['events']}  "
+        f"{account['t_s']:.1f}/{horizon_s:g} s  events {account['events']}  "
         f"delivered {account['deliveries']}  longest drop run {account['longest_drop_run']}  "
         f"‖x‖ {norm}"
     )

@@ -91,6 +91,10 @@ def _summarise(
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
         "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[in_common]),
         "identity_residual_max": _or_none(np.max, residual[in_common]),
+        "identity_residual_relative": _or_none(
+            lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),
+            residual[in_common],
+        ),
         "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES},
         "latency_us": _latency(record),
         "realtime": {role: report["realtime"] for role, report in record.reports.items()},

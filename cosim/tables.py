@@ -1,5 +1,9 @@
 """The tables that a person sees at the end of a run."""
 
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -18,19 +22,21 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     console.print(_run_table(summary))
     console.print(_timing_table(summary))
     _print_realtime(console, summary["realtime"])
-    _print_assumptions(console, summary["assumptions"])
+    print_assumptions(console, summary["assumptions"])
     for violation in summary["assumption_violations"]:
         console.print(
             f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
             f"seen by {violation['process']}: {escape(violation['what'])}"
         )
+    for warning in _warnings(summary):
+        console.print(f"[bold yellow]warning:[/] {escape(warning)}", highlight=False)
     if outcome.status:
         console.print(f"[bold red]the run failed:[/] {escape(outcome.reason)}")
     console.print(
         f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True, markup=False
     )
     console.print(
-        f"look at it     noack view {outcome.run_dir / RECORDING_FILE}",
+        f"look at it     {_program()} view {outcome.run_dir / RECORDING_FILE}",
         highlight=False,
         soft_wrap=True,
         markup=False,
@@ -38,7 +44,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
 
 
 def _run_table(summary: Summary) -> Table:
-    table = Table(title=f"{summary['scenario']}, {_mode(summary)}, M = {summary['mansd'] + 1}")
+    table = Table(title=f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}")
     table.add_column("quantity")
     table.add_column("value", justify="right")
     events, deliveries = summary["events"], summary["deliveries"]
@@ -46,10 +52,10 @@ def _run_table(summary: Summary) -> Table:
     rows = (
         ("events (transmissions)", str(events)),
         ("deliveries", str(deliveries)),
-        ("  of these forced by MANSD", str(summary["forced_deliveries"])),
+        ("  of these forced (t_0 or cap)", str(summary["forced_deliveries"])),
         ("dropped by the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
         ("longest drop run", f"{summary['longest_drop_run']} (at most {summary['mansd']})"),
-        ("assumption violations", str(len(summary["assumption_violations"]))),
+        ("drop runs beyond M − 1", str(len(summary["assumption_violations"]))),
         ("shortest inter-event time", _seconds(summary["inter_event_min_s"])),
         ("median inter-event time", _seconds(summary["inter_event_median_s"])),
         ("median time between deliveries", _seconds(summary["inter_delivery_median_s"])),
@@ -57,7 +63,7 @@ def _run_table(summary: Summary) -> Table:
         ("‖x‖ at the end", _number(summary["final_state_norm"])),
         ("largest ‖e_s‖, ‖e_c‖",
          f"{_number(summary['sup_e_s_norm'])}, {_number(summary['sup_e_c_norm'])}"),
-        ("identity (I1), largest residual", _number(summary["identity_residual_max"])),
+        ("identity (I1), relative residual", _number(summary["identity_residual_relative"])),
         ("missing samples", str(summary["missing_samples"])),
         ("lost outside the emulator", str(summary["lost_outside_netem"])),
     )  # fmt: skip
@@ -87,22 +93,38 @@ def _timing_table(summary: Summary) -> Table:
 def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
     """One line for all processes that were granted the same."""
     roles_by_settings: dict[str, list[str]] = {}
-    for role, granted in realtime.items():
-        text = ", ".join(f"{name} {verdict}" for name, verdict in granted.items())
+    for role in sorted(realtime):
+        verdicts = realtime[role]
+        text = ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
+        if set(verdicts.values()) == {"granted"}:
+            text = "all granted"
         roles_by_settings.setdefault(text, []).append(role)
     for text, roles in roles_by_settings.items():
-        console.print(f"real-time settings of {', '.join(roles)}: {text}", highlight=False)
+        whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
+        console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
 
 
-def _print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> None:
-    console.print("the paper's assumptions")
+def print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> None:
+    """Print the paper's assumptions with their verdicts."""
+    table = Table.grid(padding=(0, 2))
     for assumption in assumptions:
         holds = assumption["verdict"] == Verdict.HOLDS
-        mark = "[green]holds   [/]" if holds else "[yellow]violated[/]"
-        console.print(
-            f"  {mark}  {assumption['what']} ({assumption['source']}): {assumption['why']}",
-            highlight=False,
+        table.add_row(
+            "[green]holds[/]" if holds else "[yellow]violated[/]",
+            escape(f"{assumption['what']} ({assumption['source']}): {assumption['why']}"),
         )
+    console.print("the paper's assumptions, for this scenario:")
+    console.print(table)
+
+
+def _warnings(summary: Summary) -> Iterator[str]:
+    late = summary["lateness_us"]["plant"]
+    if late["steps"] and late["late_steps"] > 0.01 * late["steps"]:
+        share = 100 * late["late_steps"] / late["steps"]
+        yield f"{share:.0f} % of the plant's steps were late: lower speed or plant.rate_hz"
+    first, last = summary["initial_state_norm"], summary["final_state_norm"]
+    if first is not None and last is not None and last > 10 * first > 0:
+        yield f"‖x‖ grew from {first:.3g} to {last:.3g}: the loop diverges"
 
 
 def _mode(summary: Summary) -> str:
@@ -123,3 +145,10 @@ def _number(value: float | None) -> str:
 
 def _whole(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}"
+
+
+def _program() -> str:
+    """How the person called us, so that the next command can be typed alike."""
+    program = Path(sys.argv[0])
+    inside = program.is_absolute() and program.is_relative_to(Path.cwd())
+    return str(program.relative_to(Path.cwd()) if inside else program)

@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         prog="noack netem",
         description="A UDP relay that loses datagrams, but never more than MANSD in a row per "
         "flow. Without --listen it joins the run that `noack record SCENARIO` has opened.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add_options(parser)
     alone = parser.add_argument_group("on its own")
@@ -128,7 +129,8 @@ def _parse_loss(text: str) -> Loss:
         return TypeAdapter[Loss](Loss).validate_python({"model": model, **settings})
     except ValidationError as error:
         first = error.errors()[0]
-        raise CallerError(f"--loss {text}: {first['loc'][-1]}: {first['msg']}") from None
+        what = first["msg"].replace("Input should", "should")
+        raise CallerError(f"--loss {text}: {first['loc'][-1]}: {what}") from None
     except ValueError:
         raise CallerError(f"--loss {text}: probabilities are numbers from 0 to 1") from None
 

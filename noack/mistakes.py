@@ -21,6 +21,7 @@ _REMEDIES = {
     "string_pattern_mismatch": "use letters, digits, _ and -, beginning with a letter or digit, "
     "at most 64",
     "too_short": "needs at least one entry",
+    "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",
 }
 
 

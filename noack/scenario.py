@@ -162,7 +162,7 @@ class Plant(Section):
 
 
 class DecayingTrigger(Section):
-    """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)  (eq:thre)."""
+    """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
 
     policy: Literal["decaying"] = "decaying"
     """The event-triggering policy."""

@@ -46,6 +46,7 @@ class ViewFeed:
         }
         self._types = tables(self._loop.n, self._loop.m)
         self._track: ControllerTrack = initial_track(scenario)
+        self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
@@ -76,7 +77,8 @@ class ViewFeed:
             until_ns = reach_ns - int(_LAG_S * NS_PER_S * self._scenario.speed)
         self._packets(self._take(NETEM_PACKET, None))
         self._inputs(steps)
-        self._deliveries(deliveries)
+        self._undrawn.append(deliveries)
+        self._deliveries(until_ns)
         self._lateness("plant", self._take(PLANT_STEP, None))
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
 
@@ -111,7 +113,12 @@ class ViewFeed:
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
         self._track = self._track.since(keep)
 
-    def _deliveries(self, rows: Rows) -> None:
+    def _deliveries(self, until_ns: int | None) -> None:
+        """Draw deliveries once the network's word on them, from another process, must be in."""
+        waiting = np.concatenate(self._undrawn)
+        ready = np.full(len(waiting), True) if until_ns is None else waiting["t_ns"] <= until_ns
+        self._undrawn = [waiting[~ready]]
+        rows = waiting[ready]
         if not len(rows):
             return
         forced = np.array([int(sequence) in self._forced for sequence in rows["sequence"]])

@@ -93,6 +93,8 @@ class Node:
         )
         self._joining = False
         self.clock = RunClock(start["epoch_ns"], self.scenario.speed)
+        if not self.ticket.launched:
+            print(f"noack {self.role}: started", file=sys.stderr)
         return {role: (host, port) for role, (host, port) in start["addresses"].items()}
 
     def run_messages(self, machine: Machine[Message]) -> None:

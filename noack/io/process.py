@@ -8,7 +8,7 @@ import traceback
 from collections.abc import Callable, Sequence
 
 from noack.errors import ExitStatus, NoackError
-from noack.io.node import Node
+from noack.io.node import HORIZON, Node
 from noack.io.plane import Plane
 from noack.io.signals import Signals
 from noack.io.ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
@@ -43,6 +43,9 @@ def run_process(
             traceback.print_exc()
             print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
             return ExitStatus.FAILED
+        if signals.received is None and not ticket.launched:
+            print(f"noack {role}: ended: {node.ended}", file=sys.stderr)
+            return ExitStatus.OK if node.ended == HORIZON else ExitStatus.FAILED
         return signals.status
 
 
@@ -81,7 +84,7 @@ def _admission(role: str, session: str, signals: Signals) -> Ticket:
         _TICKET_TIMEOUT_S,
         lambda: signals.received is not None,
         lambda path: print(
-            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r})",
+            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r}); Ctrl-C ends",
             file=sys.stderr,
         ),
     )

@@ -108,7 +108,7 @@ def _continuous_time(resolved: Scenario) -> Assumption:
     control_ms = 1e3 * resolved.controller_period_ns / NS_PER_S
     return Assumption(
         "the trigger watches continuously; network and input act at once",
-        "eq:thre, eq:ModCont",
+        "Section II",
         Verdict.VIOLATED,
         f"sampled every {period_ms:g} ms, input held for {control_ms:g} ms: "
         "‖e_s‖ may pass the threshold by what it grows in between",

@@ -1,15 +1,18 @@
 """A whole run of real processes, checked from its record against independent computations."""
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import rerun.chunk
 from scipy.linalg import expm
 
 from cosim.join import identity_residual, join_all
 from cosim.record import RunRecord, load_record
+from cosim.viewer import blueprint
 from netem.link import Datagram, update_link_of
 from noack.machine import Record
 from noack.records import Fate, tables
@@ -227,3 +230,21 @@ def test_any_reader_of_parquet_takes_the_record(finished: Finished, record: RunR
 def test_nothing_secret_is_readable_by_others(finished: Finished) -> None:
     for path in Path(finished.run_dir).rglob("*"):
         assert b'"key"' not in (path.read_bytes() if path.is_file() else b"")
+
+
+def test_the_recording_shows_what_the_record_says(finished: Finished, record: RunRecord) -> None:
+    reader = rerun.chunk.RrdReader(finished.run_dir / "recording.rrd")
+    (store,) = reader.recordings()
+    rows: Counter[str] = Counter()
+    for chunk in reader.stream(store=store):
+        batch = chunk.to_record_batch()
+        if blueprint.TIMELINE in batch.schema.names:
+            rows[chunk.entity_path.removeprefix("/")] += batch.num_rows
+    summary = finished.summary
+    assert rows[blueprint.FORCED] == summary["forced_deliveries"]
+    assert rows[blueprint.RECEPTION] == summary["deliveries"] - summary["forced_deliveries"]
+    assert rows[blueprint.DROP] == summary["drops"]
+    assert rows[blueprint.EVENT] == summary["events"]
+    assert rows[blueprint.INPUT] == len(record["controller_step"])
+    for name in record.loop.state_names:
+        assert rows[blueprint.state_path(name)] == len(record["sensor_measurement"])
