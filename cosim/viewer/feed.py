@@ -50,7 +50,6 @@ class ViewFeed:
         self._forced: set[int] = set()
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
-        self._reached_ns = -1
 
     def add(self, table: str, rows: Rows) -> None:
         """Take rows that follow those added before."""

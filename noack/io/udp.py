@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from noack.errors import CallerError
-from noack.wire import Decoder, Encoder, Flow, Message
+from noack.wire import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message
 
 Address = tuple[str, int]
 LOOPBACK = "127.0.0.1"
@@ -18,8 +18,8 @@ LOOPBACK = "127.0.0.1"
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
 _REPORTED_SOURCES = 16
-_READ_BYTES = 2048
-"""More than any datagram of the loop has; what is longer is cut and rejected by its length."""
+_READ_BYTES = MAX_DATAGRAM_BYTES + 1
+"""What is longer than any datagram of the loop is cut, and rejected by its length."""
 MAX_UDP_BYTES = 65_535
 
 
