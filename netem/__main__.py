@@ -96,9 +96,11 @@ def _alone(options: argparse.Namespace) -> ExitStatus:
         if destination == endpoint.getsockname():
             raise CallerError(f"--to {options.to}: leads back to --listen")
         listening = text_of(endpoint.getsockname())
-        print(f"noack netem: {listening} → {options.to}, Ctrl-C ends", file=sys.stderr, flush=True)
         relay = Relay(endpoint, destination)
         with Signals().handled() as signals:
+            # Said only now: before, a Ctrl-C would not yet have ended it well.
+            ready = f"noack netem: {listening} → {options.to}, Ctrl-C ends"
+            print(ready, file=sys.stderr, flush=True)
             run_loop(
                 link,
                 relay,
