@@ -21,6 +21,9 @@ class Verdict(StrEnum):
 
     HOLDS = "holds"
     VIOLATED = "violated"
+    NOT_NEEDED = "not needed"
+    PRESUPPOSED = "presupposed"
+    """Only a run can show it; every run is checked for it."""
 
 
 class Assumption(NamedTuple):

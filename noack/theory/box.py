@@ -1,0 +1,201 @@
+"""Robust certificates: bounds that hold for every plant of an uncertainty box around the model.
+
+With A = Â + Ã, B = B̂ + B̃ and |Ã|, |B̃| below the box's half-widths entry by entry, the plant is
+the model under its own mistakes w = Ã x + B̃ u, u = K x + p:
+
+    x' = (Â + B̂K) x + B̂ p + w
+
+Each |w_i| is bounded by the half-widths and the suprema of single coordinates, each coordinate by
+the peak gains (∫ of impulse responses) of the model's closed loop. That is a linear inequality
+between non-negative numbers; where its matrix has a spectral radius below 1 it can be solved, for
+all plants of the box at once, time-varying ones included.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.linear import Matrix, Vector
+from noack.theory.enclosure import NotDecayingError, Response, factors, response, response_until
+from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
+
+
+@dataclass(frozen=True)
+class BoxGains:
+    """All plants of a box, as :func:`noack.theory.certificate.solve` wants a plant.
+
+    Args:
+        error: the models' side.
+        A_model, B_model: the box's centre, (n, n) and (n, m).
+        halfwidth_A, halfwidth_B: the box, (n, n) and (n, m).
+        start: x(0) as a column, (n, 1); or a matrix whose image of the unit ball holds x(0).
+        alpha_per_s: α of the scaling.
+    """
+
+    error: ErrorGains
+    A_model: Matrix
+    B_model: Matrix
+    halfwidth_A: Matrix
+    halfwidth_B: Matrix
+    start: Matrix
+    alpha_per_s: float
+
+    @cached_property
+    def outputs(self) -> Mapping[Output, Matrix]:
+        """C by which x is looked at; the mistakes w come on top of ``MISMATCH``."""
+        return {
+            Output.STATE: np.eye(len(self.A_model)),
+            Output.WEIGHTED: self.error.weight,
+            Output.MISMATCH: self._split_nominal[1],
+            Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
+        }
+
+    @cached_property
+    def states(self) -> Mapping[Output, Coefficients]:
+        """sup‖C x‖ from x(0) and from the input error.
+
+        Raises:
+            NotDecayingError: the model decays too slowly, or the box is too large.
+        """
+        free, gain = self._mistakes
+        found = {
+            output: Coefficients(
+                gains.start + float(gains.from_mistakes @ free),
+                gains.pushed + float(gains.from_mistakes @ gain),
+            )
+            for output, gains in self._peaks.items()
+        }
+        nominal = found[Output.MISMATCH]
+        # sup‖(R_E x, w)‖ ≤ sup‖R_E x‖ + sup‖w‖
+        found[Output.MISMATCH] = Coefficients(
+            nominal.free + float(np.linalg.norm(free)), nominal.gain + float(np.linalg.norm(gain))
+        )
+        return found
+
+    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+        """What no input before ``start_s`` adds: p = −K x there, with x' = A x for every A.
+
+        No input makes no mistakes: w = Ã x then, which the bound of w covers.
+        """
+        if start_s == 0:
+            return 0.0, dict.fromkeys(self.outputs, 0.0)
+        R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
+        # ‖e^{As}‖ ≤ e^{μs}, and the logarithmic norm μ of a sum is at most the sum's.
+        mu = max(_logarithmic_norm(self.A_model) + box, 0.0) + self.alpha_per_s
+        size = float(np.linalg.norm(self.start, 2)) * math.exp(mu * start_s)
+        turn = float(np.linalg.norm(R @ self.A_model, 2)) + float(np.linalg.norm(R, 2)) * box
+        first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
+        error = first + start_s * turn * size
+        kick = error * start_s
+        from_kick = self._mistakes_of(kick * np.array([g.kicked for g in self._coordinates]))
+        found = {
+            output: kick * gains.kicked + float(gains.from_mistakes @ from_kick)
+            for output, gains in self._peaks.items()
+        }
+        found[Output.MISMATCH] += float(np.linalg.norm(from_kick))
+        return error, found
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        """How ‖e_s‖_W grows over ``until_s``, on a grid."""
+        H, W = self.error.scaled_H, self.error.weight
+        forced = np.concatenate([self._split_nominal[0], self._mistaken_rows], axis=1)
+        return Growth(
+            *(
+                response_until(H, D, until_s, cells).through(W)
+                for D in (self.error.inverse_weight, forced, self._input_matrix)
+            )
+        )
+
+    @cached_property
+    def _closed_loop(self) -> Matrix:
+        shift = self.alpha_per_s * np.eye(len(self.A_model))
+        return self.A_model + self.B_model @ self.error.K + shift
+
+    @cached_property
+    def _split_nominal(self) -> tuple[Matrix, Matrix]:
+        return factors(self.A_model + self.B_model @ self.error.K - self.error.H)
+
+    @cached_property
+    def _input_matrix(self) -> Matrix:
+        return self.B_model @ self.error.split_K[0]
+
+    @cached_property
+    def _rows(self) -> list[int]:
+        """Rows of A and B that are uncertain."""
+        uncertain = np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1).any(axis=1)
+        return [int(i) for i in np.flatnonzero(uncertain)]
+
+    @cached_property
+    def _mistaken_rows(self) -> Matrix:
+        return np.eye(len(self.A_model))[:, self._rows]
+
+    @cached_property
+    def _responses(self) -> tuple[Response, Response, list[Response]]:
+        """Of the model's closed loop to x(0), to p, and to each w_i."""
+        return (
+            response(self._closed_loop, self.start),
+            response(self._closed_loop, self._input_matrix),
+            [response(self._closed_loop, column[:, None]) for column in self._mistaken_rows.T],
+        )
+
+    def _peaks_at(self, C: Matrix) -> "_PeakGains":
+        start, pushed, mistaken = self._responses
+        forced = pushed.through(C)
+        return _PeakGains(
+            start.through(C).sup(),
+            forced.integral(),
+            forced.sup(),
+            np.array([w.through(C).integral() for w in mistaken]),
+        )
+
+    @cached_property
+    def _peaks(self) -> Mapping[Output, "_PeakGains"]:
+        return {output: self._peaks_at(C) for output, C in self.outputs.items()}
+
+    @cached_property
+    def _coordinates(self) -> list["_PeakGains"]:
+        """Of each coordinate of x and of K x."""
+        rows = np.concatenate([np.eye(len(self.A_model)), self.error.K])
+        return [self._peaks_at(row[None]) for row in rows]
+
+    @cached_property
+    def _halfwidths(self) -> Matrix:
+        """|w| ≤ these · |(x, u)|."""
+        return np.concatenate([self.halfwidth_A, self.halfwidth_B], axis=1)[self._rows]
+
+    def _mistakes_of(self, coordinates: Vector) -> Vector:
+        """sup|w| that follows from bounds of |(x, K x)| in which w was left out."""
+        from_w = np.array([gains.from_mistakes for gains in self._coordinates])
+        loop = self._halfwidths @ from_w
+        if len(loop) and np.abs(np.linalg.eigvals(loop)).max() >= 1:
+            raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+        solved: Vector = np.linalg.solve(np.eye(len(loop)) - loop, self._halfwidths @ coordinates)
+        return solved
+
+    @cached_property
+    def _mistakes(self) -> tuple[Vector, Vector]:
+        """sup|w_i| ≤ free_i + gain_i sup‖p‖."""
+        inputs = np.linalg.norm(self.error.split_K[0], axis=1)
+        pushed = np.array([gains.pushed for gains in self._coordinates])
+        pushed[len(self.A_model) :] += inputs  # u = K x + p
+        return (
+            self._mistakes_of(np.array([gains.start for gains in self._coordinates])),
+            self._mistakes_of(pushed),
+        )
+
+
+class _PeakGains(NamedTuple):
+    """sup‖C x‖ ≤ start + pushed · sup‖p‖ + kicked · ∫‖p‖ + from_mistakes · |w|."""
+
+    start: float
+    pushed: float
+    kicked: float
+    from_mistakes: Vector
+
+
+def _logarithmic_norm(matrix: Matrix) -> float:
+    return float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).max())

@@ -1,0 +1,280 @@
+"""Tight certificates: what is guaranteed of a loop, under which conditions, with which constants.
+
+For a trigger ‖e_s‖_W > βe^{−αt} that is tested every h seconds at the latest, a network that drops
+at most M − 1 updates in a row, and an input that is held, all signals scaled by e^{αt}:
+
+    sup‖C x‖    ≤ free_C + gain_C π                                     (plant, input error p)
+    sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
+    π = sup‖p‖  ≤ D_K β̃ + σ (sup‖KH x‖ + D_KH β̃) + r(σ) (sup‖x‖_W + D_W β̃) (input of age ≤ σ)
+    β̃ = sup‖e_s‖_W ≤ ḡβ + I_E sup‖R_E x‖ + I_B π                         (between two tests)
+
+with N = M − 1 + ⌈d/δ⌉ events missing at most. These are linear in π and β̃ and hold on every [0, T],
+so their solution bounds the run if the loop gain is below 1. The minimum inter-event time δ is the
+time that ‖e_s‖_W needs from 0 to β under these bounds; a δ for which it comes out no smaller than δ
+holds by induction over the events, so that the largest such δ is taken.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
+
+_LONGEST_S = 1e6
+_SETTLED = 1e-3
+_ATTEMPTS = 200
+_PICARD_ROUNDS = 8
+_COARSE, _FINE = 64, 256
+
+
+class Conditions(NamedTuple):
+    """What a certificate presupposes of network and schedule, in the plant's time."""
+
+    dropouts: int
+    """M − 1, the longest run of successive dropouts."""
+    sampling_s: float = 0.0
+    """h, the longest time between two tests of the trigger; 0 is a trigger that watches always."""
+    spacing_s: float = 0.0
+    """The shortest time between two tests; all others are its multiples."""
+    delay_s: float = 0.0
+    """d, the longest time from an event until the plant feels its update, if it is delivered."""
+    hold_s: float = 0.0
+    """σ, the greatest age of the model state behind the input that the plant feels."""
+    start_s: float = 0.0
+    """From here on the plant feels the controller's input; before, it feels none."""
+
+
+class Constants(NamedTuple):
+    """The constants of a certificate; ‖·‖_W is the trigger's norm, ‖·‖ the Euclidean."""
+
+    rate_per_s: float
+    """Every bound falls like e^{−rate·t}."""
+    missing_events: int
+    """N, events that the controller lacks at most."""
+    delta: float
+    """Δ: ‖e_c‖_W ≤ Δβe^{−αt}."""
+    overshoot: float
+    """β̃/β: ‖e_s‖_W ≤ β̃e^{−αt}."""
+    input_error: float
+    """π: ‖u − Kx‖ ≤ πe^{−αt}, once the plant feels the controller."""
+    state: float
+    """X: ‖x‖ ≤ Xe^{−αt}."""
+    state_weighted: float
+    """X_W: ‖x‖_W ≤ X_W e^{−αt}."""
+    mismatch: float
+    """‖E x‖ ≤ this · e^{−αt}: how fast the model parts from the plant."""
+    inter_event_s: float | None
+    """δ: no two events are closer; None if there is no such bound."""
+    loop_gain: float
+    """How strongly errors reproduce themselves; below 1."""
+
+
+class VoidError(ArithmeticError):
+    """There is no certificate; the message says why."""
+
+
+class Plant(Protocol):
+    """A plant, or all plants of an uncertainty box; see :mod:`noack.theory.gains`."""
+
+    @property
+    def states(self) -> Mapping[Output, Coefficients]:
+        """sup‖C x‖ from the start and from the input error."""
+        ...
+
+    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+        """What no input before ``start_s`` adds: sup‖p‖ there, and to every sup‖C x‖."""
+        ...
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        """How ‖e_s‖_W grows, on a grid."""
+        ...
+
+
+class Level(NamedTuple):
+    """The trigger's threshold, scaled."""
+
+    beta: float
+    """β: a test leaves ‖e_s‖_W ≤ β."""
+    reached: float | None
+    """The least ‖e_s‖_W of an event; None if it comes arbitrarily close to 0."""
+
+
+class Background(NamedTuple):
+    """What an earlier phase of the run leaves: lower limits of the bounds between two events."""
+
+    mismatch: float = 0.0
+    """Of sup‖R_E x‖."""
+    input_error: float = 0.0
+    """Of π."""
+
+
+_CLEAN = Background()
+
+
+def solve(
+    error: ErrorGains,
+    plant: Plant,
+    conditions: Conditions,
+    level: Level,
+    background: Background = _CLEAN,
+) -> Constants:
+    """Return the constants that are certified for all times.
+
+    Raises:
+        VoidError: the loop gain is not below 1.
+        NotDecayingError: a mode of the loop decays more slowly than the threshold.
+    """
+    step = _Step(error, plant, conditions, level, background)
+    if level.reached is None:
+        return step.constants(conditions.spacing_s, None)
+    spacing_s = _LONGEST_S
+    for _ in range(_ATTEMPTS):
+        found_s = step.inter_event_s(spacing_s)
+        if found_s >= spacing_s:
+            return step.constants(spacing_s, spacing_s)
+        # Down to the largest spacing that reproduces itself, from above.
+        spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
+        if spacing_s <= conditions.spacing_s:
+            return step.constants(conditions.spacing_s, conditions.spacing_s or None)
+    raise VoidError("no minimum inter-event time was found")
+
+
+class _Step:
+    """One round: from an assumed spacing of events to everything else."""
+
+    def __init__(
+        self,
+        error: ErrorGains,
+        plant: Plant,
+        conditions: Conditions,
+        level: Level,
+        background: Background,
+    ) -> None:
+        self._error, self._plant = error, plant
+        self._conditions, self._level, self._background = conditions, level, background
+        self._remainder = error.hold_remainder(conditions.hold_s)
+        self._start_error, start = plant.start_up(conditions.start_s)
+        self._states = {
+            output: Coefficients(free + start[output], gain)
+            for output, (free, gain) in plant.states.items()
+        }
+        self._stretch, self._mismatch_growth, self._input_growth = 1.0, 0.0, 0.0
+        if conditions.sampling_s > 0:
+            growth = plant.growth(conditions.sampling_s, _COARSE)
+            self._stretch = growth.start.sup_on_grid()
+            self._mismatch_growth = growth.mismatch.integral_on_grid()
+            self._input_growth = growth.input_error.integral_on_grid()
+
+    def constants(self, spacing_s: float, inter_event_s: float | None) -> Constants:
+        """Everything, given that no two events are closer than ``spacing_s``."""
+        events = self._missing(spacing_s)
+        shares = {
+            output: self._error.now(output) + self._error.missing(output, events, spacing_s)
+            for output in self._error.outputs
+        }
+        hold_s, states = self._conditions.hold_s, self._states
+        rate, weighted = states[Output.GAIN_RATE], states[Output.WEIGHTED]
+        mismatch = states[Output.MISMATCH]
+        # π = own π + from_e_s β̃ + input_fixed,   β̃ = from_p π + error_fixed
+        own = hold_s * rate.gain + self._remainder * weighted.gain
+        from_e_s = (
+            shares[Output.GAIN]
+            + hold_s * shares[Output.GAIN_RATE]
+            + self._remainder * shares[Output.WEIGHTED]
+        )
+        input_fixed = hold_s * rate.free + self._remainder * weighted.free
+        from_p = self._mismatch_growth * mismatch.gain + self._input_growth
+        error_fixed = (
+            self._stretch * self._level.beta
+            + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
+            + self._input_growth * max(self._start_error, self._background.input_error)
+        )
+        loop_gain = own + from_e_s * from_p
+        if not loop_gain < 1:
+            raise VoidError(f"the loop gain of the errors is {loop_gain:.3g}, not below 1")
+        input_error = (input_fixed + from_e_s * error_fixed) / (1 - loop_gain)
+        sensor_error = error_fixed + from_p * input_error
+        state = {output: free + gain * input_error for output, (free, gain) in states.items()}
+        return Constants(
+            self._error.alpha_per_s,
+            events,
+            shares[Output.WEIGHTED] * sensor_error / self._level.beta,
+            sensor_error / self._level.beta,
+            input_error,
+            state[Output.STATE],
+            state[Output.WEIGHTED],
+            state[Output.MISMATCH],
+            inter_event_s,
+            loop_gain,
+        )
+
+    def inter_event_s(self, spacing_s: float) -> float:
+        """The time that ‖e_s‖_W needs to the next event, given that spacing of those before."""
+        found = self.constants(spacing_s, None)
+        mismatch = self._states[Output.MISMATCH]
+        own = self._error.now(Output.GAIN)
+        others = found.input_error - own * found.overshoot * self._level.beta
+        assert self._level.reached is not None
+        found_s = first_passage_s(
+            self._plant,
+            self._level.reached,
+            max(mismatch.free + mismatch.gain * found.input_error, self._background.mismatch),
+            max(others, self._start_error, self._background.input_error),
+            own,
+        )
+        grid_s = self._conditions.spacing_s
+        return found_s if grid_s == 0 else grid_s * max(1, math.ceil(found_s / grid_s - 1e-9))
+
+    def _missing(self, spacing_s: float) -> int:
+        dropouts, delay_s = self._conditions.dropouts, self._conditions.delay_s
+        if delay_s == 0:
+            return dropouts
+        if spacing_s == 0:
+            raise VoidError("events may be arbitrarily close, so that any number may be under way")
+        return dropouts + math.ceil(delay_s / spacing_s)
+
+
+def first_passage_s(
+    plant: Plant, level: float, mismatch: float, input_error: float, own: float
+) -> float:
+    """A time before which ‖e_s‖_W, from 0, cannot reach ``level``.
+
+    With ρ(r) = sup_{s≤r} ‖e_s‖_W and e_c's own share of e_s counted as it grows,
+
+        ρ(r) ≤ ∫₀^r ‖W e^{Hs} L_E‖ sup‖R_E x‖ + ‖W e^{Hs} B U‖ (π' + own · ρ(r−s)) ds
+
+    which is iterated from ρ = ``level``; every iterate is a bound until the level is reached.
+
+    Args:
+        plant: gives the kernels.
+        level: of an event.
+        mismatch: sup‖R_E x‖.
+        input_error: π', the input error but for what the present e_s causes.
+        own: ‖K W^{−1}‖.
+    """
+    window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
+    while True:
+        growth = plant.growth(window_s, cells)
+        fixed = np.cumsum(growth.mismatch.area * mismatch + growth.input_error.area * input_error)
+        rho = np.full(cells, level)
+        for _ in range(_PICARD_ROUNDS):
+            echo = np.convolve(growth.input_error.area, rho)[:cells]
+            rho = np.minimum(level, fixed + own * echo)
+        crossed = np.flatnonzero(rho >= level)
+        if len(crossed) and cells == _COARSE:
+            window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE
+        elif len(crossed):
+            return float(growth.mismatch.edges_s[crossed[0]])
+        elif window_s >= _LONGEST_S or cells == _FINE:
+            return window_s
+        else:
+            window_s *= 2
+
+
+def _first_window_s(plant: Plant, level: float, mismatch: float, input_error: float) -> float:
+    """Where to look: twice the time at the speed of the start."""
+    start = plant.growth(1e-9, 1)
+    speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
+    return min(2 * level / speed, _LONGEST_S) if speed > 0 else _LONGEST_S

@@ -1,0 +1,305 @@
+"""Certificates of a scenario: which claims stand, on which assumptions, under which conditions."""
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from noack.clock import NS_PER_S
+from noack.linear import Matrix, spectral_abscissa
+from noack.resolve import Loop, loop_of
+from noack.scenario import Scenario
+from noack.theory.assumptions import Assumption, Verdict
+from noack.theory.box import BoxGains
+from noack.theory.certificate import (
+    Background,
+    Conditions,
+    Constants,
+    Level,
+    Plant,
+    VoidError,
+    solve,
+)
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.gains import ErrorGains, PlantGains, error_gains
+
+_SLOWER = 0.9
+_SCHEDULE_STEPS = 100_000
+
+PlantAt = Callable[[ErrorGains, Matrix, float], Plant]
+"""A plant, given the models' side, where x starts, and α."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is guaranteed of a loop."""
+
+    scope: str
+    """Of which plants."""
+    beta: float
+    alpha_per_s: float
+    floor: float
+    weighted: bool
+    """Whether the trigger's norm is weighted."""
+    conditions: Conditions
+    assumptions: tuple[Assumption, ...]
+    constants: Constants | None
+    """None if there is no certificate."""
+    floor_constants: Constants | None
+    """From ``floor_from_s`` on, with ε in the place of βe^{−αt} and no decay."""
+    void: str | None
+    """Why there is no certificate."""
+
+    @property
+    def floor_from_s(self) -> float:
+        """When βe^{−αt} falls below the floor ε; infinite without a floor."""
+        if self.floor == 0:
+            return math.inf
+        return max(math.log(self.beta / self.floor) / self.alpha_per_s, 0.0)
+
+    @property
+    def inter_event_s(self) -> float | None:
+        """No two events are closer than this."""
+        found = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
+        known = [value for value in found if value is not None]
+        return min(known) if known and len(known) == len(found) else None
+
+    def sensor_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.overshoot * level)
+
+    def controller_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_c‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.delta * level)
+
+    def state(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x‖ at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.state)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON knows it."""
+        found = asdict(self)
+        for key, value in (
+            ("constants", self.constants),
+            ("floor_constants", self.floor_constants),
+        ):
+            found[key] = None if value is None else value._asdict()
+        found["conditions"] = self.conditions._asdict()
+        found["assumptions"] = [assumption._asdict() for assumption in self.assumptions]
+        found["inter_event_s"] = self.inter_event_s
+        found["floor_from_s"] = None if self.floor == 0 else self.floor_from_s
+        return found
+
+    def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
+        if self.constants is None:
+            return np.full(len(t_s), np.nan)
+        level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
+        bound = scale(self.constants, level) * np.exp(-self.constants.rate_per_s * t_s)
+        if self.floor_constants is not None:
+            late = scale(self.floor_constants, self.floor)
+            bound = np.where(t_s < self.floor_from_s, bound, late)
+        return np.asarray(bound)
+
+
+def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
+    """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
+
+    In the plant's time: an update is felt from the first step on whose newest tick comes after it,
+    and the model state behind an input ages until the step after the one that latched it.
+    """
+    step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
+    phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
+    steps = min(math.lcm(step_ns, tick_ns) // step_ns + 2 * tick_ns // step_ns + 4, _SCHEDULE_STEPS)
+    grid_ns = step_ns * np.arange(1, steps + 1, dtype=np.int64)
+    # The plant steps before it takes what arrives at the same time.
+    newest_ns = phase_ns + (grid_ns - 1 - phase_ns) // tick_ns * tick_ns
+    felt = newest_ns >= phase_ns
+    hold_ns = int((grid_ns - newest_ns)[felt].max()) + step_ns
+    samples_ns = sample_ns * np.arange(max(len(grid_ns) * step_ns // (2 * sample_ns), 1))
+    first = np.searchsorted(newest_ns, samples_ns, side="left")
+    known = first < len(grid_ns)
+    delay_ns = int((grid_ns[first[known]] - samples_ns[known]).max())
+    late_ns = late_periods * step_ns
+    return Conditions(
+        dropouts=resolved.network.mansd,
+        sampling_s=sample_ns / NS_PER_S,
+        spacing_s=sample_ns / NS_PER_S,
+        delay_s=(delay_ns + late_ns) / NS_PER_S,
+        hold_s=(hold_ns + late_ns) / NS_PER_S,
+        start_s=(max(delay_ns, int(grid_ns[felt][0])) + late_ns) / NS_PER_S,
+    )
+
+
+def ideal_conditions(resolved: Scenario) -> Conditions:
+    """The paper's: a trigger that watches always, an instant network, an input that is not held."""
+    return Conditions(dropouts=resolved.network.mansd)
+
+
+def certify(resolved: Scenario, conditions: Conditions) -> Certificate:
+    """The certificate of a scenario's own plant."""
+    loop = loop_of(resolved)
+    closed = loop.A + loop.B @ loop.K
+
+    def plant(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
+
+    return _certify("the scenario's plant", resolved, loop, conditions, closed, plant)
+
+
+def certify_box(resolved: Scenario, conditions: Conditions) -> Certificate | None:
+    """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
+    loop, plant = loop_of(resolved), resolved.plant
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    box_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
+    box_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
+    closed = loop.A_model + loop.B_model @ loop.K
+
+    def box(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return BoxGains(error, loop.A_model, loop.B_model, box_A, box_B, start, alpha_per_s)
+
+    return _certify("every plant of the uncertainty box", resolved, loop, conditions, closed, box)
+
+
+def _certify(
+    scope: str,
+    resolved: Scenario,
+    loop: Loop,
+    conditions: Conditions,
+    closed_loop: Matrix,
+    plant_at: PlantAt,
+) -> Certificate:
+    trigger = resolved.trigger
+    beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+    decay = {
+        "the models": math.inf if not loop.H.any() else -spectral_abscissa(loop.H),
+        "A + BK": -spectral_abscissa(closed_loop),
+    }
+    held = not loop.H.any()
+    decays = not held and alpha < min(decay.values())
+    start = loop.x0[:, None]
+    first: Constants | None = None
+    late: Constants | None = None
+    void = None
+    try:
+        if decays and floor < beta:
+            first = _solve(loop, plant_at, start, conditions, alpha, Level(beta, beta))
+            if floor > 0:
+                late = _after_floor(loop, plant_at, conditions, resolved, first)
+        else:
+            slower = 0.0 if held or floor > 0 else _SLOWER * min(decay.values())
+            level = Level(max(beta, floor), floor or None)
+            first = _solve(loop, plant_at, start, conditions, max(slower, 0.0), level)
+    except (NotDecayingError, VoidError) as error:
+        first = late = None
+        void = str(error)
+    return Certificate(
+        scope, beta, alpha, floor, loop.weight is not None, conditions,
+        tuple(_assumptions(resolved, conditions, decay, held, first, void)),
+        first, late, void,
+    )  # fmt: skip
+
+
+def _solve(
+    loop: Loop,
+    plant_at: PlantAt,
+    start: Matrix,
+    conditions: Conditions,
+    alpha_per_s: float,
+    level: Level,
+) -> Constants:
+    error = error_gains(loop, alpha_per_s)
+    return solve(error, plant_at(error, start, alpha_per_s), conditions, level)
+
+
+def _after_floor(
+    loop: Loop, plant_at: PlantAt, conditions: Conditions, resolved: Scenario, first: Constants
+) -> Constants:
+    """Once the threshold is the floor: from whatever state the first phase leaves, without decay.
+
+    An event before then left at most βe^{−αt_k} = εe^{α(t_ε−t_k)}, so that Δ keeps α's kernels.
+    What the first phase leaves, left its mark up to one test or one inter-event time before.
+    """
+    trigger = resolved.trigger
+    error = error_gains(loop, trigger.alpha_per_s)
+    share = trigger.floor / trigger.beta
+    start = share * first.state * np.eye(loop.n)
+    back_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
+    earlier = share * math.exp(trigger.alpha_per_s * back_s)
+    background = Background(earlier * first.mismatch, earlier * first.input_error)
+    found = solve(
+        error,
+        plant_at(error, start, 0.0),
+        conditions._replace(start_s=0.0),
+        Level(trigger.floor, trigger.floor),
+        background,
+    )
+    return found._replace(rate_per_s=0.0)
+
+
+def _assumptions(
+    resolved: Scenario,
+    conditions: Conditions,
+    decay: dict[str, float],
+    held: bool,
+    constants: Constants | None,
+    void: str | None,
+) -> list[Assumption]:
+    alpha, network = resolved.trigger.alpha_per_s, resolved.network
+    rate = 0.0 if constants is None else constants.rate_per_s
+    if held:
+        why = "a hold does not decay at all: what is certified is bounded, not decaying"
+        models = Assumption(
+            "α is below the decay rate of the models", "(I1)", Verdict.VIOLATED, why
+        )
+    else:
+        models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
+    presupposed = [
+        f"at most {conditions.dropouts} successive dropouts after a delivered t_0",
+        f"the trigger is tested every {1e3 * conditions.sampling_s:g} ms"
+        if conditions.sampling_s
+        else "the trigger watches continuously",
+        f"the plant feels an update within {1e3 * conditions.delay_s:g} ms of its event",
+        f"the input in force is at most {1e3 * conditions.hold_s:g} ms old",
+        f"the plant feels the controller from {1e3 * conditions.start_s:g} ms on",
+    ]
+    enforced = "the network enforces it" if network.enforce_mansd else "enforcement is switched off"
+    checks = [enforced, *["every run is checked for it"] * 4]
+    verdicts = [Verdict.HOLDS if network.enforce_mansd else Verdict.PRESUPPOSED]
+    verdicts += [Verdict.PRESUPPOSED] * 4
+    gain = (
+        Assumption(
+            "the errors reproduce themselves with a gain below 1",
+            "certificate",
+            Verdict.HOLDS,
+            f"the gain is {constants.loop_gain:.3g}",
+        )
+        if constants is not None
+        else Assumption("there is a certificate", "certificate", Verdict.VIOLATED, void or "")
+    )
+    return [
+        models,
+        _rate("A + BK", "Theorem 2", alpha, decay["A + BK"], rate),
+        *(
+            Assumption(what, "conditions", verdict, why)
+            for what, verdict, why in zip(presupposed, verdicts, checks, strict=True)
+        ),
+        gain,
+        Assumption(
+            "A is unstable with distinct eigenvalues",
+            "Proposition 1",
+            Verdict.NOT_NEEDED,
+            "the bounds rest on (I1), which holds for every plant",
+        ),
+    ]
+
+
+def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
+    holds = alpha < decay
+    why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
+    if not holds:
+        why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
+    verdict = Verdict.HOLDS if holds else Verdict.VIOLATED
+    return Assumption(f"α is below the decay rate of {of}", source, verdict, why)

@@ -1,0 +1,231 @@
+"""What a certificate needs to know of a loop: how strongly each signal moves each other one.
+
+All signals are scaled by e^{αt}, so that a decaying bound becomes a constant one. With K = U R (U
+has orthonormal columns), the input error is p = u − K x, felt by the plant through B U:
+
+    x' = (A + BK) x + B p,      e_s' = H e_s − E x − B p,      E = A + BK − H
+
+and, by identity (I1), e_c is e_s and what the missing events left behind. The outputs of interest
+are the weighted norm W, the state itself, E x, and K H x (which a held input is wrong by).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.linear import Matrix
+from noack.resolve import Loop
+from noack.theory.enclosure import (
+    Kernel,
+    Response,
+    constant_kernel,
+    factors,
+    response,
+    response_until,
+)
+
+
+class Output(StrEnum):
+    """Through which output matrix C a state or error is looked at."""
+
+    STATE = "I"
+    WEIGHTED = "W"
+    MISMATCH = "E"
+    GAIN = "K"
+    GAIN_RATE = "KH"
+
+
+class Coefficients(NamedTuple):
+    """sup‖C x‖ ≤ ``free`` + ``gain`` · sup‖p‖."""
+
+    free: float
+    gain: float
+
+
+class Growth(NamedTuple):
+    """How ‖e_s‖_W grows after a reset or a sample."""
+
+    start: Kernel
+    """‖W e^{Hτ} W^{−1}‖"""
+    mismatch: Kernel
+    """‖W e^{Hτ} L_E‖, E = L_E R_E"""
+    input_error: Kernel
+    """‖W e^{Hτ} B U‖"""
+
+
+@dataclass(frozen=True)
+class ErrorGains:
+    """The models' side: depends on H, K and W only, not on the plant.
+
+    Args:
+        H: what the models integrate, (n, n).
+        K: gain, (m, n).
+        weight: W, (n, n).
+        alpha_per_s: α of the scaling.
+    """
+
+    H: Matrix
+    K: Matrix
+    weight: Matrix
+    alpha_per_s: float
+
+    @cached_property
+    def inverse_weight(self) -> Matrix:
+        """W^{−1}."""
+        return np.asarray(np.linalg.inv(self.weight))
+
+    @cached_property
+    def scaled_H(self) -> Matrix:
+        """H + αI."""
+        return self.H + self.alpha_per_s * np.eye(len(self.H))
+
+    @cached_property
+    def split_K(self) -> tuple[Matrix, Matrix]:
+        """U, R with K = U R."""
+        return factors(self.K)
+
+    @cached_property
+    def outputs(self) -> Mapping[Output, Matrix]:
+        """C by which e_c is looked at."""
+        R = self.split_K[1]
+        return {Output.WEIGHTED: self.weight, Output.GAIN: R, Output.GAIN_RATE: R @ self.H}
+
+    @cached_property
+    def kernels(self) -> Mapping[Output, Kernel]:
+        """‖C e^{(H+αI)τ} W^{−1}‖ for every output.
+
+        Raises:
+            NotDecayingError: α is not below the decay rate of e^{Hτ}.
+        """
+        if not self.scaled_H.any():  # a hold: what was missed stays missed
+            return {
+                output: constant_kernel(float(np.linalg.norm(C @ self.inverse_weight, 2)))
+                for output, C in self.outputs.items()
+            }
+        followed = response(self.scaled_H, self.inverse_weight)
+        found = {output: followed.through(C) for output, C in self.outputs.items()}
+        if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
+            norm = found[Output.WEIGHTED]
+            found[Output.WEIGHTED] = norm._replace(highest=np.minimum(norm.highest, 1.0))
+        return found
+
+    @cached_property
+    def contracts(self) -> bool:
+        """Whether ‖e^{(H+αI)τ}‖_W ≤ 1 for all τ: (H+αI)ᵀWᵀW + WᵀW(H+αI) ⪯ 0, to rounding."""
+        turned = self.weight @ self.scaled_H @ self.inverse_weight
+        size = float(np.linalg.norm(turned, 2))
+        return float(np.linalg.eigvalsh(turned + turned.T).max()) <= 1e-12 * size
+
+    def now(self, output: Output) -> float:
+        """‖C W^{−1}‖: the share of the present e_s."""
+        return float(np.linalg.norm(self.outputs[output] @ self.inverse_weight, 2))
+
+    def missing(self, output: Output, events: int, spacing_s: float) -> float:
+        """Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖: the share of N missing events, δ apart."""
+        return float(
+            self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
+        )
+
+    def hold_remainder(self, hold_s: float) -> float:
+        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, σ ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
+        if hold_s == 0:
+            return 0.0
+        followed = response_until(-self.H, self.inverse_weight, hold_s, 16)
+        second = followed.through(self.split_K[1] @ self.H @ self.H).sup_on_grid()
+        return 0.5 * hold_s**2 * second
+
+
+@dataclass(frozen=True)
+class PlantGains:
+    """The plant's side, for one known plant.
+
+    Args:
+        error: the models' side.
+        A, B: the plant, (n, n) and (n, m).
+        start: x(0) as a column, (n, 1); or a matrix whose image of the unit ball holds x(0).
+        alpha_per_s: α of the scaling; may differ from the models' side's.
+    """
+
+    error: ErrorGains
+    A: Matrix
+    B: Matrix
+    start: Matrix
+    alpha_per_s: float
+
+    @cached_property
+    def input_matrix(self) -> Matrix:
+        """B U."""
+        return self.B @ self.error.split_K[0]
+
+    @cached_property
+    def closed_loop(self) -> Matrix:
+        """A + BK + αI."""
+        return self.A + self.B @ self.error.K + self.alpha_per_s * np.eye(len(self.A))
+
+    @cached_property
+    def split_mismatch(self) -> tuple[Matrix, Matrix]:
+        """L_E, R_E with E = L_E R_E."""
+        return factors(self.A + self.B @ self.error.K - self.error.H)
+
+    @cached_property
+    def outputs(self) -> Mapping[Output, Matrix]:
+        """C by which x is looked at."""
+        return {
+            Output.STATE: np.eye(len(self.A)),
+            Output.WEIGHTED: self.error.weight,
+            Output.MISMATCH: self.split_mismatch[1],
+            Output.GAIN_RATE: self.error.outputs[Output.GAIN_RATE],
+        }
+
+    @cached_property
+    def states(self) -> Mapping[Output, Coefficients]:
+        """sup‖C x‖ from x(0) and from the input error.
+
+        Raises:
+            NotDecayingError: α is not below the decay rate of e^{(A+BK)τ}.
+        """
+        start = response(self.closed_loop, self.start)
+        return {
+            output: Coefficients(start.through(C).sup(), self._forced.through(C).integral())
+            for output, C in self.outputs.items()
+        }
+
+    @cached_property
+    def _forced(self) -> Response:
+        return response(self.closed_loop, self.input_matrix)
+
+    def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
+        """What no input at all before ``start_s`` adds: p = −K x there.
+
+        Returns:
+            sup‖p‖ over the start, and its contribution to every sup‖C x‖.
+        """
+        if start_s == 0:
+            return 0.0, dict.fromkeys(self.outputs, 0.0)
+        drift = self.A + self.alpha_per_s * np.eye(len(self.A))
+        free = response_until(drift, self.start, start_s)
+        error = free.through(self.error.split_K[1]).sup_on_grid()
+        return error, {
+            output: error * start_s * self._forced.through(C).sup()
+            for output, C in self.outputs.items()
+        }
+
+    def growth(self, until_s: float, cells: int) -> Growth:
+        """How ‖e_s‖_W grows over ``until_s``, on a grid."""
+        H, W = self.error.scaled_H, self.error.weight
+        return Growth(
+            *(
+                response_until(H, D, until_s, cells).through(W)
+                for D in (self.error.inverse_weight, self.split_mismatch[0], self.input_matrix)
+            )
+        )
+
+
+def error_gains(loop: Loop, alpha_per_s: float) -> ErrorGains:
+    """The models' side of a resolved loop."""
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    return ErrorGains(loop.H, loop.K, weight, alpha_per_s)

@@ -1,0 +1,235 @@
+"""Random lossy loops, simulated exactly and many at a time; independent of the project's machines.
+
+Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from noack.linear import Matrix, Vector, spectral_abscissa
+from noack.theory.certificate import Conditions, Constants, Level, solve
+from noack.theory.gains import ErrorGains, PlantGains
+
+Reals = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+RUNS = 25
+STEPS = 360
+
+
+@dataclass(frozen=True)
+class System:
+    """A loop with model mismatch, its trigger, and its schedule in steps of a fine grid."""
+
+    A: Matrix
+    B: Matrix
+    K: Matrix
+    H: Matrix
+    weight: Matrix
+    x0: Vector
+    alpha: float
+    beta: float
+    known_start: bool
+    mansd: int
+    step_s: float
+    sample_steps: int
+    """Steps between two tests of the trigger."""
+    delay_steps: int
+    """Most steps that an update is under way."""
+    hold_steps: int
+    """Steps between two inputs; 0: the plant feels K x_c at all times."""
+    lag_steps: int
+    """Steps by which an input is late."""
+
+    @property
+    def conditions(self) -> Conditions:
+        """What the certificate may presuppose of :func:`simulate`."""
+        steps = Steps(self)
+        felt = steps.delay + (steps.hold - 1 + steps.lag if steps.hold else 0)
+        sampling_s = self.sample_steps * self.step_s
+        return Conditions(
+            dropouts=self.mansd,
+            sampling_s=sampling_s,
+            spacing_s=sampling_s,
+            delay_s=felt * self.step_s,
+            hold_s=(steps.hold + steps.lag) * self.step_s,
+            start_s=felt * self.step_s,
+        )
+
+    def certify(self, conditions: Conditions | None = None) -> Constants:
+        error = ErrorGains(self.H, self.K, self.weight, self.alpha)
+        plant = PlantGains(error, self.A, self.B, self.x0[:, None], self.alpha)
+        level = Level(self.beta, self.beta)
+        return solve(error, plant, conditions or self.conditions, level)
+
+
+class Worst(NamedTuple):
+    """The largest values observed, each times e^{αt}; the shortest time between two events."""
+
+    sensor_error: float
+    controller_error: float
+    state: float
+    state_weighted: float
+    input_error: float
+    inter_event_s: float
+
+    def shares(self, certified: Constants, beta: float) -> dict[str, float]:
+        """Observed over certified; a bound that stands is at most 1."""
+        assert certified.inter_event_s is not None
+        return {
+            "sensor error": self.sensor_error / (certified.overshoot * beta),
+            "controller error": self.controller_error / (certified.delta * beta),
+            "state": self.state / certified.state,
+            "weighted state": self.state_weighted / certified.state_weighted,
+            "input error": self.input_error / certified.input_error,
+            "inter-event time": certified.inter_event_s / self.inter_event_s,
+        }
+
+
+def simulate(system: System, delivered: Flags, delays: NDArray[np.int64]) -> Worst:
+    """All runs at once.
+
+    Args:
+        system: the loop.
+        delivered: (runs, events) what the network lets through.
+        delays: (runs, events) steps that each update is under way.
+    """
+    runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
+    model, steps = _Propagators(system), Steps(system)
+    x = np.tile(system.x0, (runs, 1))
+    x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
+    # An update under way is kept as what it will be when it arrives; 0 in ``arrives`` is none.
+    arriving, arrives = np.zeros((runs, steps.delay + 1, n)), np.zeros((runs, steps.delay + 1), int)
+    newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
+    synchronised = np.full(runs, system.known_start)
+    commands: list[tuple[Reals, Flags]] = []
+    worst, shortest, every = np.zeros(5), 10**9, np.arange(runs)
+    for step in range(STEPS):
+        growth = np.exp(system.alpha * step * system.step_s)
+        worst[0] = max(worst[0], growth * np.linalg.norm((x_s - x) @ W, axis=1).max())
+        if step % steps.sample == 0:
+            event = growth * np.linalg.norm((x_s - x) @ W, axis=1) > system.beta
+            event |= step == 0 and not system.known_start
+            shortest = min(
+                shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
+            )
+            x_s, last_event = np.where(event[:, None], x, x_s), np.where(event, step, last_event)
+            put = np.flatnonzero(event & delivered[every, events])
+            under_way = delays[put, events[put]]
+            slot = (step + under_way) % (steps.delay + 1)
+            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model.late[under_way])
+            arrives[put, slot] = events[put] + 1
+            events = events + event
+        slot_now = step % (steps.delay + 1)
+        fresh = arrives[:, slot_now] > newest
+        x_c = np.where(fresh[:, None], arriving[:, slot_now], x_c)
+        newest = np.where(fresh, arrives[:, slot_now], newest)
+        arrives[:, slot_now] = 0
+        synchronised = synchronised | fresh
+        if steps.hold == 0 or step % steps.hold == 0:
+            commands.append((x_c @ K, synchronised))
+        else:
+            commands.append(commands[-1])
+        nothing = (np.zeros((runs, K.shape[1])), np.zeros(runs, bool))
+        u, feels = commands[step - steps.lag] if step >= steps.lag else nothing
+        u = np.where(feels[:, None], u, 0.0)
+        for i, value in enumerate(
+            (
+                np.linalg.norm((x_c - x) @ W, axis=1)[synchronised],
+                np.linalg.norm(x, axis=1),
+                np.linalg.norm(x @ W, axis=1),
+                np.linalg.norm(u - x @ K, axis=1)[feels],
+            )
+        ):
+            worst[i + 1] = max(worst[i + 1], growth * value.max(initial=0.0))
+        if steps.hold == 0:
+            together = np.concatenate([x, x_c], axis=1) @ model.both
+            x = np.where(feels[:, None], together[:, :n], x @ model.free)
+        else:
+            x = np.concatenate([x, u], axis=1) @ model.held
+        x_s, x_c = x_s @ model.model, x_c @ model.model
+    return Worst(*(float(value) for value in worst), shortest * system.step_s)
+
+
+class Steps:
+    """The schedule of a system, in steps."""
+
+    def __init__(self, system: System) -> None:
+        self.sample, self.delay = system.sample_steps, system.delay_steps
+        self.hold = system.hold_steps
+        self.lag = system.lag_steps if system.hold_steps else 0
+
+
+class _Propagators:
+    """Over one step, transposed, for rows of states."""
+
+    def __init__(self, system: System) -> None:
+        (n, m), step_s = system.B.shape, system.step_s
+        flow, held = np.zeros((2 * n, 2 * n)), np.zeros((n + m, n + m))
+        flow[:n, :n], flow[:n, n:], flow[n:, n:] = system.A, system.B @ system.K, system.H
+        held[:n, :n], held[:n, n:] = system.A, system.B
+        self.both = expm(flow * step_s).T
+        self.held = expm(held * step_s).T[:, :n]
+        self.free, self.model = expm(system.A * step_s).T, expm(system.H * step_s).T
+        self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
+
+
+def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[np.int64]]:
+    """Patterns of losses, at most M−1 in a row: hostile ones, and random ones of every severity."""
+    events = STEPS // system.sample_steps + 2
+    lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
+    lost[0] = True
+    lost[1] = False
+    if not system.known_start:
+        lost[:, 0] = False
+    run = np.zeros(RUNS, dtype=np.int64)
+    for event in range(events):
+        lost[:, event] &= run < system.mansd
+        run = np.where(lost[:, event], run + 1, 0)
+    delays = rng.integers(0, system.delay_steps + 1, (RUNS, events))
+    delays[:4] = system.delay_steps
+    return ~lost, delays
+
+
+@st.composite
+def systems(draw: st.DrawFn, **fixed: Any) -> System:
+    """Loops of every kind; ``fixed`` holds some of the drawn numbers."""
+
+    def choose(name: str, strategy: st.SearchStrategy[Any]) -> Any:
+        return fixed[name] if name in fixed else draw(strategy)
+
+    n, m = choose("n", st.integers(1, 5)), choose("m", st.integers(1, 2))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    H = rng.uniform(-1, 1, (n, n)) * choose("spread", st.sampled_from([1.0, 3.0]))
+    H -= (spectral_abscissa(H) + rng.uniform(0.5, 2.0)) * np.eye(n)
+    B_model, K = rng.uniform(-1, 1, (n, m)), rng.uniform(-1, 1, (m, n))
+    alpha = choose("alpha_share", st.sampled_from([0.2, 0.5, 0.8])) * -spectral_abscissa(H)
+    change_A, change_B = rng.uniform(-1, 1, (n, n)), rng.uniform(-1, 1, (n, m))
+    mismatch = choose("mismatch", st.sampled_from([0.0, 0.1, 0.5]))
+    while spectral_abscissa(H + mismatch * (change_A + change_B @ K)) >= -alpha:
+        mismatch /= 2
+    weighted = choose("weighted", st.booleans())
+    weight = rng.uniform(-1, 1, (n, n)) + 1.5 * np.eye(n) if weighted else np.eye(n)
+    speed = float(np.abs(np.linalg.eigvals(H)).max())
+    return System(
+        A=H - B_model @ K + mismatch * change_A,
+        B=B_model + mismatch * change_B,
+        K=K,
+        H=H,
+        weight=weight,
+        x0=rng.uniform(-1, 1, n),
+        alpha=alpha,
+        beta=choose("beta", st.sampled_from([0.01, 0.05, 0.3, 1.0])),
+        known_start=choose("known_start", st.booleans()),
+        mansd=choose("mansd", st.integers(0, 6)),
+        step_s=choose("step_share", st.sampled_from([0.002, 0.01, 0.03])) / speed,
+        sample_steps=choose("sample_steps", st.integers(1, 4)),
+        delay_steps=choose("delay_steps", st.integers(0, 4)),
+        hold_steps=choose("hold_steps", st.integers(0, 4)),
+        lag_steps=choose("lag_steps", st.integers(0, 2)),
+    )
