@@ -18,7 +18,7 @@ def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> Non
         changed: what differs between the machine of the run and this one, in words.
     """
     table = Table(title="replay, bit for bit")
-    table.add_column("rows of, messages from → to")
+    table.add_column("process, leg")
     for heading in ("recorded", "compared", "verdict"):
         table.add_column(heading, justify="right")
     for process in found.processes:
@@ -60,5 +60,5 @@ def _counts(recorded: int, compared: int) -> tuple[str, str]:
 def _verdict(compared: int, difference: Difference | None) -> str:
     if difference is not None:
         place = f"{difference.table}[{difference.row}].{difference.column}".rstrip(".")
-        return f"[red]differs[/] at {escape(place)}"
+        return f"[red]≠[/] {escape(place)}"
     return "bit-exact" if compared else "-"
