@@ -89,7 +89,7 @@ def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None) -> _Inp
         if numbers[whole] > whole:
             missing_from = whole
             if written == count:  # no row is missing, so one of them must have a wrong number
-                repeated = np.diff(numbers, append=numbers[-1:]) == 0
+                repeated = np.append(np.diff(numbers) == 0, False)
                 doubtful = int(np.flatnonzero(repeated | (numbers >= count))[0])
         if numbers[whole] < whole or written == count:
             missing_from = None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.record import Rows, RunRecord
@@ -43,11 +43,9 @@ FROM_OUTSIDE = ("input", "now_ns")
 """Columns that have tests of their own: no machine gives a process its order and its clock."""
 
 
-def changed(rows: Mapping[str, Rows], **settings: Any) -> RunRecord:
+def changed(rows: Mapping[str, Rows], reports: Any = RECORD.reports) -> RunRecord:
     every = {table: RECORD[table] for table in OWNER} | dict(rows)
-    return RunRecord(
-        RECORD.scenario, every, RECORD.notices, settings.get("reports", RECORD.reports), "simulated"
-    )
+    return RunRecord(RECORD.scenario, every, RECORD.notices, reports, "simulated")
 
 
 def flipped(table: str, row: int, column: str, byte: int, bit: int) -> RunRecord:
@@ -83,6 +81,7 @@ def test_a_run_is_replayed_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(("table", "column"), list(columns()))
+@settings(max_examples=40)  # for each of some forty columns
 @given(st.data())
 def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.DataObject) -> None:
     rows = RECORD[table]
@@ -105,6 +104,7 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
 
 
 @pytest.mark.parametrize("table", list(OWNER))
+@settings(max_examples=40)
 @given(st.data())
 def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
     row = data.draw(st.integers(0, len(RECORD[table]) - 1))
