@@ -23,7 +23,7 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run view summary
+.PHONY: demo demo-zoh run simulate view summary replay
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -33,11 +33,17 @@ demo-zoh: setup ## The same with zero-order hold instead of a model
 run: setup ## Run SCENARIO=FILE, all processes at once
 	@$(BIN)/noack run "$(SCENARIO)" $(FLAGS)
 
+simulate: setup ## Run SCENARIO=FILE in virtual time (a second or so)
+	@$(BIN)/noack simulate "$(SCENARIO)" $(ARGS)
+
 view: setup ## Open the last recording in the rerun viewer
 	@$(BIN)/noack view $(ARGS)
 
 summary: setup ## Show the last run's summary again
 	@$(BIN)/noack summary $(ARGS)
+
+replay: setup ## Feed the last run's machines their inputs again; compare bit for bit
+	@$(BIN)/noack replay $(ARGS)
 
 ##@ Five terminals, one process each (start `make record` in one, the others in any order)
 .PHONY: record plant sensor controller netem

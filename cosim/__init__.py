@@ -1,1 +1,8 @@
 """What sees the whole run: launching, recording, viewing, the command line."""
+
+import os
+
+# The processes of a run compute on one thread. What shall repeat their arithmetic bit for bit must,
+# too: with more, the exponential of a large matrix is rounded differently. numpy looks once, at
+# its import.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"

@@ -3,11 +3,12 @@
 import io
 import sys
 from collections.abc import Callable, Sequence
+from enum import StrEnum
 from functools import wraps
 from importlib.metadata import version
 from json import dumps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -18,6 +19,9 @@ from noack.scenario import Scenario
 from noack.scenario_file import dumps as scenario_toml
 from noack.scenario_file import json_schema, load
 from noack.topology import RECORDER, ROLES
+
+if TYPE_CHECKING:
+    from cosim.launch import Ending
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -132,6 +136,37 @@ def demo(
     return _run(loaded, runs, ROLES, None, live=live, json=json)
 
 
+class Trigger(StrEnum):
+    """When a simulated sensor looks at the threshold."""
+
+    SAMPLED = "sampled"
+    CONTINUOUS = "continuous"
+
+
+@command(_RUNS)
+def simulate(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    trigger: Annotated[
+        Trigger,
+        typer.Option(help="sampled: at each measurement, as a live run; continuous: at all times."),
+    ] = Trigger.SAMPLED,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
+    if trigger is Trigger.CONTINUOUS:
+        raise CallerError("--trigger continuous: not implemented yet; there is --trigger sampled")
+    loaded = load(find_scenario(scenario), settings or ())
+    from cosim.progress import PatientConsole, simulation_bar
+    from cosim.simulated_run import simulate_run
+
+    _warn_of_violations(loaded)
+    with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
+        ending = simulate_run(loaded, runs, progress=progress)
+    return _conclude(ending, json=json)
+
+
 @command(_RUNS)
 def view(
     recording: Annotated[
@@ -170,6 +205,32 @@ def summary(
     else:
         print_outcome(Console(), outcome)
     return ExitStatus.OK
+
+
+@command(_RUNS)
+def replay(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Feed every machine of a run its recorded inputs again; compare the outputs bit for bit."""
+    from cosim.environment import changed_since
+    from cosim.progress import PatientConsole
+    from cosim.record import load_record
+    from cosim.replay import replay as replay_record
+    from cosim.replay.table import print_replay
+
+    path = run_dir or latest_run(runs)
+    with PatientConsole(stderr=True).status("replaying"):
+        found = replay_record(load_record(path))
+    changed = changed_since(path)
+    if json:
+        _print_json(found.document() | {"changed_since": changed})
+    else:
+        print_replay(Console(), found, changed)
+    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
 @command(_PROCESSES)
@@ -258,12 +319,8 @@ def _run(
     # Each process of a run waits for the slowest: what is not needed yet is imported later.
     from cosim.launch import launch
     from cosim.progress import PatientConsole, progress_line
-    from noack.resolve import resolve
-    from noack.theory.assumptions import Verdict, assumptions
 
-    for assumption in assumptions(resolve(scenario)):
-        if assumption.verdict == Verdict.VIOLATED and assumption.source == "Theorem 2":
-            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
+    _warn_of_violations(scenario)
     ending = None
     try:
         with progress_line(PatientConsole(stderr=True), scenario) as watcher:
@@ -273,6 +330,19 @@ def _run(
     except OSError:  # a closed terminal is no reason to lose a run
         if ending is None:
             raise
+    return _conclude(ending, json=json)
+
+
+def _warn_of_violations(scenario: Scenario) -> None:
+    from noack.resolve import resolve
+    from noack.theory.assumptions import Verdict, assumptions
+
+    for assumption in assumptions(resolve(scenario)):
+        if assumption.verdict == Verdict.VIOLATED and assumption.source == "Theorem 2":
+            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
+
+
+def _conclude(ending: "Ending", *, json: bool) -> int:
     from cosim.conclude import conclude
     from cosim.tables import print_outcome
 

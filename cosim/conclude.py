@@ -3,9 +3,11 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from cosim.launch import Ending
-from cosim.record import finish_record, load_record
+from cosim.record import RunRecord, finish_record, load_record
+from cosim.replay import replay
 from cosim.run_dir import RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus
@@ -22,7 +24,7 @@ class Outcome:
 
 
 def conclude(ending: Ending) -> Outcome:
-    """Finish what a dead recorder left undone, and write the summary."""
+    """Finish what a dead recorder left undone, write the summary, and replay a live run."""
     run_dir = ending.run_dir
     with concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
@@ -33,9 +35,20 @@ def conclude(ending: Ending) -> Outcome:
         else:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
+        summary["replay"] = None
         (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+        if record.kind == "live":  # written once more, so that no replay can cost a summary
+            summary["replay"] = _replay(record)
+            (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
     end = summary["exit"]
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+
+
+def _replay(record: RunRecord) -> dict[str, Any]:
+    try:
+        return replay(record).verdict()
+    except Exception as error:  # whatever it is, the run itself went as it went
+        return {"bit_exact": None, "error": repr(error)}
 
 
 def reopen(run_dir: Path) -> Outcome:

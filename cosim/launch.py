@@ -5,7 +5,6 @@ directory with everything recorded so far.
 """
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -17,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cosim.coordinator import Coordinator
-from cosim.environment import environment
-from cosim.run_dir import ENVIRONMENT_FILE, SCENARIO_FILE, new_run_dir, point_to_latest, under_way
+from cosim.environment import write_environment
+from cosim.run_dir import SCENARIO_FILE, new_run_dir, point_to_latest, under_way
 from noack.errors import ExitStatus, MachineError, NeverStartedError
 from noack.io.node import HORIZON
 from noack.io.process import TICKET_ON_STDIN
@@ -94,7 +93,7 @@ def launch(
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
     (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved), encoding="utf-8")
-    (run_dir / ENVIRONMENT_FILE).write_text(json.dumps(environment(), indent=2), encoding="utf-8")
+    write_environment(run_dir, "live")
     ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
     run = _Run(ticket, run_dir, spawn, watcher or Watcher())
     with Signals().handled() as signals, contextlib.ExitStack() as stack:

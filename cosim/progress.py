@@ -1,7 +1,7 @@
 """The progress line that a person sees during a run."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from cosim.launch import Watcher
+from noack.clock import NS_PER_S
 from noack.scenario import Scenario
 
 _PLAIN_LINES = 10
@@ -55,6 +56,16 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
                 console.print(text, highlight=False, soft_wrap=True)
 
         yield Watcher(waiting, started, account)
+
+
+@contextmanager
+def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int], None]]:
+    """Show how far a simulation is while the context lasts, on a terminal only."""
+    columns = (BarColumn(), TextColumn("{task.completed:.1f}/{task.total:g} s simulated"))
+    disabled = not console.is_terminal
+    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
+        task = progress.add_task("", total=horizon_s)
+        yield lambda now_ns: progress.update(task, completed=now_ns / NS_PER_S)
 
 
 def _account(account: dict[str, Any], horizon_s: float) -> str:

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cosim.environment import Kind, kind_of
 from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
 from noack.errors import CallerError, MachineError
 from noack.io.spool import read_chunks
@@ -39,6 +40,7 @@ class RunRecord:
         rows: the rows of each table, in the order of the machine's inputs.
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
+        kind: live or simulated.
     """
 
     def __init__(
@@ -47,11 +49,13 @@ class RunRecord:
         rows: Mapping[str, Rows],
         notices: list[dict[str, Any]],
         reports: Mapping[str, dict[str, Any]],
+        kind: Kind = "live",
     ) -> None:
         self.scenario = scenario
         self.loop: Loop = loop_of(scenario)
         self.notices = notices
         self.reports = reports
+        self.kind: Kind = kind
         self._rows = rows
 
     def __getitem__(self, table: str) -> Rows:
@@ -63,20 +67,36 @@ def load_record(run_dir: Path) -> RunRecord:
     """Read the record of a run directory.
 
     Raises:
-        CallerError: it is not a run directory, or the run's record was never finished.
+        CallerError: it is not a run directory, or its record was never finished or is damaged.
     """
     folder = run_dir / RECORD
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     if not folder.is_dir():
-        raise CallerError(f"{run_dir}: has no numeric record")
+        raise CallerError(
+            f"{run_dir}: has no numeric record; `noack summary` finishes a run that was cut short"
+        )
     scenario = load(run_dir / SCENARIO_FILE)
     loop = loop_of(scenario)
     rows = {
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables(loop.n, loop.m).items()
     }
-    return RunRecord(scenario, rows, _read_notices(folder), _reports(run_dir))
+    return RunRecord(scenario, rows, _read_notices(folder), _reports(run_dir), kind_of(run_dir))
+
+
+def write_record(record: RunRecord, run_dir: Path) -> None:
+    """Write a record's tables and notices into its run directory.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    folder, loop = run_dir / RECORD, record.loop
+    folder.mkdir(exist_ok=True)
+    for table in tables(loop.n, loop.m):
+        _to_parquet(record[table], folder / f"{table}.parquet", loop)
+    with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
+        file.writelines(json.dumps(notice) + "\n" for notice in record.notices)
 
 
 def finish_record(run_dir: Path) -> RunRecord:
@@ -94,19 +114,16 @@ def finish_record(run_dir: Path) -> RunRecord:
         for table, dtype in tables(loop.n, loop.m).items()
     }
     notices = _notices(folder, spool)
+    record = RunRecord(scenario, rows, notices, _reports(run_dir), kind_of(run_dir))
     try:
-        folder.mkdir(exist_ok=True)
-        for table, array in rows.items():
-            _to_parquet(array, folder / f"{table}.parquet", loop)
-        with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
-            file.writelines(json.dumps(notice) + "\n" for notice in notices)
+        write_record(record, run_dir)
         if spool.is_dir():  # dropped in one step, so that nobody ever takes half a spool for all
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
             f"{folder}: the record cannot be written ({error}); it is kept in {spool}"
         ) from None
-    return RunRecord(scenario, rows, notices, _reports(run_dir))
+    return record
 
 
 def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
@@ -203,11 +220,21 @@ def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:
     scratch.replace(path)
 
 
+def _columns(dtype: np.dtype[np.void]) -> Iterator[str]:
+    """Yield the names of a table's columns in its file."""
+    for name in dtype.names or ():
+        shape = dtype[name].shape
+        yield from (f"{name}_{i}" for i in range(shape[0])) if shape else (name,)
+
+
 def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
     try:
         table = pq.read_table(path)
     except (OSError, pa.ArrowException) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None
+    for column in _columns(dtype):
+        if column not in table.column_names:
+            raise CallerError(f"{path}: has no column {column}, which this scenario's runs have")
     rows = np.zeros(table.num_rows, dtype)
     for name in dtype.names or ():
         field = dtype[name]

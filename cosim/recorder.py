@@ -11,6 +11,7 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from cosim.environment import Kind
 from cosim.record import RunRecord, finish_record, updates_in
 from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
@@ -196,24 +197,34 @@ class Recorder:
         self._out_of_order = True
 
 
-def open_view(scenario: Scenario, run_dir: Path, run_id: int, live: LiveView | None) -> RunView:
+def open_view(
+    scenario: Scenario,
+    run_dir: Path,
+    run_id: int,
+    live: LiveView | None,
+    kind: Kind = "live",
+) -> RunView:
     """Create the recording of a run."""
     loop = loop_of(scenario)
     return RunView(
         run_dir / RECORDING_FILE,
         run_id=f"{run_id:016x}",
         title=f"{scenario.name} ({scenario.mode})",
-        about=about(scenario),
+        about=about(scenario, kind),
         state_names=loop.state_names,
         input_names=loop.input_names,
-        processes=LOOP_ROLES,
+        processes=LOOP_ROLES if kind == "live" else (),
         live=live,
     )
 
 
-def about(scenario: Scenario) -> str:
+def about(scenario: Scenario, kind: Kind = "live") -> str:
     """Markdown that says what the view shows."""
     trigger, network = scenario.trigger, scenario.network
+    late = {
+        "live": "* **Lateness**: wall time by which each process acted after its input was due.",
+        "simulated": "* The run was **simulated**, in virtual time: nothing was ever late.",
+    }[kind]
     hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
     return f"""# {scenario.name}
 
@@ -229,7 +240,7 @@ M − 1 = {network.mansd} packets in a row. Nothing is acknowledged.
 * **Intervals**: time since the last broadcast, and since the last reception.
 * **Errors**: e_s = x_s − x against its threshold, and e_c = x_c − x, which nobody in the loop can
   measure.
-* **Lateness**: wall time by which each process acted after its input was due.
+{late}
 """
 
 
@@ -289,7 +300,7 @@ def _record_run(node: Node, *, live: bool) -> None:
 
 def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
     """Write a run's recording from its finished record."""
-    with open_view(record.scenario, run_dir, run_id, None) as view:
+    with open_view(record.scenario, run_dir, run_id, None, record.kind) as view:
         feed = ViewFeed(record.scenario, view)
         loop = loop_of(record.scenario)
         for table in tables(loop.n, loop.m):

@@ -59,7 +59,9 @@ def _summarise(
     if diverged_at_s is not None and exit_status == ExitStatus.OK:
         exit_status, reason = ExitStatus.FAILED, f"diverged: x is not finite at {diverged_at_s:g} s"
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
+    live = record.kind == "live"
     summary = {
+        "kind": record.kind,
         "startup_s": startup_s,
         "scenario": scenario.name,
         "mode": scenario.mode,
@@ -95,9 +97,9 @@ def _summarise(
             lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),
             residual[in_common],
         ),
-        "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES},
-        "latency_us": _latency(record),
-        "realtime": {role: report["realtime"] for role, report in record.reports.items()},
+        "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES if live},
+        "latency_us": _latency(record) if live else None,
+        "realtime": {role: report["realtime"] for role, report in record.reports.items() if live},
         "diverged_at_s": diverged_at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }

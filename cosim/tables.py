@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -20,8 +21,9 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
     """Print the tables at the end of a run."""
     summary = outcome.summary
     console.print(_run_table(summary))
-    console.print(_timing_table(summary))
-    _print_realtime(console, summary["realtime"])
+    if summary["lateness_us"]:  # in virtual time nothing is late
+        console.print(_timing_table(summary))
+        _print_realtime(console, summary["realtime"])
     print_assumptions(console, summary["assumptions"])
     for violation in summary["assumption_violations"]:
         console.print(
@@ -44,7 +46,9 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
 
 
 def _run_table(summary: Summary) -> Table:
-    table = Table(title=f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}")
+    simulated = ", simulated" if summary.get("kind") == "simulated" else ""
+    title = f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}{simulated}"
+    table = Table(title=title)
     table.add_column("quantity")
     table.add_column("value", justify="right")
     events, deliveries = summary["events"], summary["deliveries"]
@@ -66,10 +70,24 @@ def _run_table(summary: Summary) -> Table:
         ("identity (I1), relative residual", _number(summary["identity_residual_relative"])),
         ("missing samples", str(summary["missing_samples"])),
         ("lost outside the emulator", str(summary["lost_outside_netem"])),
+        *_replay_rows(summary.get("replay")),
     )  # fmt: skip
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    if verdict is None:
+        return
+    if verdict["bit_exact"] is None:
+        word = "not possible"
+    elif verdict["bit_exact"]:
+        word = f"bit-exact, {verdict['inputs']:,} inputs"
+    else:
+        found = verdict["first_difference"]
+        word = f"differs: {found['table']} row {found['row']} {found['column']}"
+    yield "replay", word if verdict.get("complete", True) else f"{word} (record incomplete)"
 
 
 def _timing_table(summary: Summary) -> Table:
@@ -118,8 +136,8 @@ def print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> No
 
 
 def _warnings(summary: Summary) -> Iterator[str]:
-    late = summary["lateness_us"]["plant"]
-    if late["steps"] and late["late_steps"] > 0.01 * late["steps"]:
+    late = summary["lateness_us"].get("plant")
+    if late and late["steps"] and late["late_steps"] > 0.01 * late["steps"]:
         share = 100 * late["late_steps"] / late["steps"]
         yield f"{share:.0f} % of the plant's steps were late: lower speed or plant.rate_hz"
     first, last = summary["initial_state_norm"], summary["final_state_norm"]

@@ -142,7 +142,7 @@ def layout(
         _plot("Control input u = K x_c", INPUT),
         rrb.Tabs(
             rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-            _plot("Lateness [µs]", "lateness", ["$origin/**"]),
+            *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
             rrb.TextLogView(
                 origin=LOG,
                 name="Log",

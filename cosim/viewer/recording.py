@@ -45,7 +45,7 @@ class RunView:
         about: Markdown shown beside the plots.
         state_names: names of the n coordinates of x.
         input_names: names of the m coordinates of u.
-        processes: names of the processes whose lateness is shown.
+        processes: names of the processes whose lateness is shown; none in a simulated run.
         live: shows the file while it is written.
 
     Raises:
@@ -150,7 +150,9 @@ class RunView:
         self._send(bp.DROP, self._times(t_ns), np.zeros(len(t_ns)))
 
     def lateness(self, process: str, t_ns: Nanoseconds, lateness_us: Floats) -> None:
-        """Add how late a process was, in microseconds (k,), at times (k,)."""
+        """Add how late a process was, in microseconds (k,), at times (k,), if that is shown."""
+        if process not in self._lateness:
+            return
         values = _shaped("lateness_us", lateness_us, (len(t_ns),))
         self._send(self._lateness[process], self._times(t_ns), values)
 

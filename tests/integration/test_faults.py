@@ -50,6 +50,8 @@ def test_a_killed_process_is_named_and_nothing_recorded_is_lost(start: Start, ro
         assert len(rows) > 10
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
     assert finished.summary["missing_samples"] == 0
+    assert finished.summary["replay"]["bit_exact"]
+    assert not finished.summary["replay"]["complete"]  # who was killed cannot say what is missing
     assert (finished.run_dir / "recording.rrd").stat().st_size > 0
     assert not (finished.run_dir / "spool").exists()
     assert running.left_behind() == []

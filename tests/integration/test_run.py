@@ -12,6 +12,7 @@ from scipy.linalg import expm
 
 from cosim.join import identity_residual, join_all
 from cosim.record import RunRecord, load_record
+from cosim.replay import replay
 from cosim.viewer import blueprint
 from netem.link import Datagram, update_link_of
 from noack.machine import Record
@@ -25,6 +26,7 @@ SUMMARY_KEYS = {
     "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",
     "longest_drop_run", "assumption_violations", "missing_samples", "lost_outside_netem",
     "inter_event_min_s", "final_state_norm", "lateness_us", "latency_us", "realtime", "exit",
+    "kind", "replay",
 }  # fmt: skip
 
 CASES = {
@@ -212,6 +214,16 @@ def test_identity_i1_holds_to_rounding_at_every_sample(record: RunRecord) -> Non
     assert np.array_equal(np.isnan(residual), ~in_common)
     # States of a few units, propagated some thousand times: far below any physical difference.
     assert residual[in_common].max() < 1e-11
+
+
+def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) -> None:
+    found = replay(record)
+    assert found.first_difference is None, str(found.first_difference)
+    assert found.gaps == []
+    assert found.inputs == sum(len(record[table]) for table in tables(1, 1))
+    assert all(leg.compared == leg.received > 0 for leg in found.messages)
+    assert finished.summary["replay"] == found.verdict()
+    assert finished.summary["kind"] == record.kind == "live"
 
 
 def test_the_state_converges(record: RunRecord, finished: Finished) -> None:

@@ -1,0 +1,126 @@
+"""Compares what each process sends in its replay with what the next one received in the run.
+
+What was lost under way was received by nobody and is not compared; what was received must have
+been sent, and bit for bit so.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+from cosim.record import Rows, RunRecord
+from cosim.replay.machines import Replayed, vector_of
+from cosim.replay.result import MessagesReplay, difference, first_entry
+from netem.link import Datagram
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    PACKET_HEAD_BYTES,
+    PLANT_ACTUATION,
+    SENSOR_MEASUREMENT,
+)
+from noack.wire import KEY_BYTES, Encoder, Header, Message, read_header
+
+
+def check_messages(
+    record: RunRecord, replayed: Mapping[str, Replayed]
+) -> tuple[MessagesReplay, ...]:
+    """Compare the messages of every leg of the loop."""
+    plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
+    measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant)
+    entering = _Received("sensor → netem", NETEM_PACKET, record, sensor)
+    updates = _Received("netem → controller", CONTROLLER_DELIVERY, record, sensor)
+    actuations = _Received("controller → plant", PLANT_ACTUATION, record, controller)
+    measurements.compare_vectors()
+    entering.compare_heads()
+    updates.compare_vectors()
+    updates.compare_with_survivors(replayed["netem"])
+    actuations.compare_vectors()
+    return tuple(one.result() for one in (measurements, entering, updates, actuations))
+
+
+class _Received:
+    """The messages of one leg, as they were received and as they are sent in the replay."""
+
+    def __init__(self, leg: str, table: str, record: RunRecord, sender: Replayed) -> None:
+        self._leg = leg
+        self._table = table
+        self._rows: Rows = record[table]
+        self._sent: Sequence[Message] = sender.sent  # numbered from 0, without gaps
+        self._all_sent = sender.account.whole
+        self._compared = 0
+        self._first: tuple[int, str, str, object, object] | None = None
+
+    def result(self) -> MessagesReplay:
+        found = None
+        if self._first is not None:
+            row, what, column, recorded, replayed = self._first
+            now_ns = int(self._rows["now_ns"][row])
+            found = difference(self._table, row, now_ns, what, column, recorded, replayed)
+        return MessagesReplay(self._leg, len(self._rows), self._compared, found)
+
+    def compare_vectors(self) -> None:
+        """Compare sequence number, time and vector of what a machine received."""
+        rows, column, newest = self._rows, vector_of(self._table), -1
+        fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), rows[column])
+        for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
+            if sequence <= newest:
+                self._differs(row, "not newer than what came before", "sequence", sequence)
+            newest = max(newest, sequence)
+            message = self._find(row, sequence, "sequence", sequence)
+            if message is None:
+                continue
+            if t_ns != message.t_ns:
+                self._differs(row, "was not sent so", "t_ns", t_ns, message.t_ns)
+            elif vector.tobytes() != message.vector.tobytes():
+                entry = first_entry(vector, message.vector)
+                if entry is not None:
+                    self._differs(row, "was not sent so", column + entry[0], *entry[1:])
+
+    def compare_heads(self) -> None:
+        """Compare what netem keeps of a datagram: its first bytes and its size."""
+        heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
+        headers = [read_header(head) for head in heads]
+        # The run's number is drawn for each run and recorded here only.
+        ids = Counter(header.run_id for header in headers if header is not None)
+        encoder = Encoder(ids.most_common(1)[0][0] if ids else 0, bytes(KEY_BYTES))
+        for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
+            message = self._find(row, -1 if header is None else header.sequence, "head", head)
+            if message is None:
+                continue
+            data = encoder.encode(message)
+            expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+            if head != expected:
+                self._differs(row, "was not sent so", "head", head, expected)
+            elif size != len(data):
+                self._differs(row, "was not sent so", "size_bytes", size, len(data))
+        for row, flow in enumerate(self._rows["flow"].tolist()):
+            if flow != 0:
+                self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
+
+    def compare_with_survivors(self, network: Replayed) -> None:
+        """Look whether the network let through what was received."""
+        if not network.account.whole:
+            return
+        survivors = {header.sequence for datagram in network.sent if (header := _header(datagram))}
+        for row, sequence in enumerate(self._rows["sequence"].tolist()):
+            if sequence not in survivors:
+                self._differs(row, "netem does not let it through", "sequence", sequence)
+
+    def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
+        """Return the message of a number, if it was sent; if that can be told at all."""
+        if 0 <= sequence < len(self._sent):
+            self._compared += 1
+            return self._sent[sequence]
+        if sequence < 0 or self._all_sent:
+            self._differs(row, "was never sent", column, value)
+        return None
+
+    def _differs(
+        self, row: int, what: str, column: str, recorded: object, replayed: object = None
+    ) -> None:
+        if self._first is None or row < self._first[0]:
+            self._first = (row, what, column, recorded, replayed)
+
+
+def _header(datagram: Datagram) -> Header | None:
+    return read_header(datagram.data)

@@ -1,0 +1,68 @@
+"""A simulated run: a run directory like a live run's, made in virtual time."""
+
+import json
+import secrets
+import shutil
+from pathlib import Path
+from typing import Protocol
+
+from cosim.environment import write_environment
+from cosim.launch import Ending
+from cosim.record import RunRecord, write_record
+from cosim.recorder import write_view
+from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, new_run_dir, point_to_latest, under_way
+from cosim.virtual import Progress, simulate
+from noack.errors import ExitStatus, MachineError
+from noack.io.node import HORIZON
+from noack.resolve import resolve
+from noack.scenario import Scenario
+from noack.scenario_file import dumps as scenario_toml
+
+
+class Simulator(Protocol):
+    """Turns a resolved scenario into the record of a run."""
+
+    def __call__(self, resolved: Scenario, *, progress: Progress | None) -> RunRecord:
+        """Simulate the run; tell ``progress`` how far it is."""
+        ...
+
+
+def simulate_run(
+    scenario: Scenario,
+    runs: Path,
+    simulator: Simulator = simulate,
+    progress: Progress | None = None,
+) -> Ending:
+    """Simulate a scenario into a new run directory; :func:`cosim.conclude.conclude` ends it.
+
+    A run that is broken off leaves nothing behind: it can be repeated.
+
+    Args:
+        scenario: as loaded; it is resolved here.
+        runs: where run directories are made.
+        simulator: makes the record.
+        progress: is told how far the run is.
+
+    Raises:
+        CallerError: the scenario's numbers are too large.
+        MachineError: the run directory cannot be written.
+    """
+    resolved = resolve(scenario)
+    run_dir = new_run_dir(runs, resolved.name)
+    run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
+    try:
+        with under_way(run_dir):
+            (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved), encoding="utf-8")
+            write_environment(run_dir, "simulated")
+            record = simulator(resolved, progress=progress)
+            reports = json.dumps(record.reports, indent=2)
+            (run_dir / REPORTS_FILE).write_text(reports, encoding="utf-8")
+            write_record(record, run_dir)
+            write_view(record, run_dir, run_id)
+    except BaseException as error:
+        shutil.rmtree(run_dir, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise MachineError(f"{run_dir}: cannot be written: {error}") from None
+        raise
+    point_to_latest(run_dir)
+    return Ending(run_dir, run_id, ExitStatus.OK, HORIZON)

@@ -1,0 +1,84 @@
+"""The replay at the end of a run can cost neither the run's good end nor its summary."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import cosim.conclude
+from cosim.conclude import reopen
+from cosim.environment import write_environment
+from cosim.record import write_record
+from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
+from cosim.virtual import simulate
+from noack.records import PLANT_STEP
+from noack.resolve import resolve
+from noack.scenario_file import dumps, validate
+
+
+@pytest.fixture
+def run_dir(content: dict[str, Any], tmp_path: Path) -> Path:
+    """A run without a summary that says it was live, its record a simulated one's."""
+    record = simulate(resolve(validate(content, "test")))
+    (tmp_path / SCENARIO_FILE).write_text(dumps(record.scenario))
+    write_environment(tmp_path, "live")
+    reports = {role: report | {"realtime": {}} for role, report in record.reports.items()}
+    (tmp_path / REPORTS_FILE).write_text(json.dumps(reports))
+    write_record(record, tmp_path)
+    return tmp_path
+
+
+def summary_of(run_dir: Path) -> dict[str, Any]:
+    summary: dict[str, Any] = json.loads((run_dir / SUMMARY_FILE).read_text())
+    return summary
+
+
+def test_the_summary_holds_the_verdict(run_dir: Path) -> None:
+    outcome = reopen(run_dir)
+    verdict = outcome.summary["replay"]
+    assert verdict["bit_exact"]
+    assert verdict["complete"]
+    assert verdict["inputs"] > 1000
+    assert summary_of(run_dir) == outcome.summary
+
+
+def test_a_difference_does_not_change_how_the_run_ended(run_dir: Path) -> None:
+    unharmed = reopen(run_dir)
+    (run_dir / SUMMARY_FILE).unlink()
+    record = cosim.conclude.load_record(run_dir)
+    record[PLANT_STEP]["u"][9, 0] = np.nan
+    write_record(record, run_dir)
+    harmed = reopen(run_dir)
+    assert harmed.status == unharmed.status
+    assert harmed.summary["replay"]["bit_exact"] is False
+    first = summary_of(run_dir)["replay"]["first_difference"]
+    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 9, "u_0")
+
+
+def test_a_replay_that_crashes_is_no_crash(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(record: object) -> None:
+        raise RuntimeError("a mistake of ours")
+
+    unharmed = reopen(run_dir)
+    (run_dir / SUMMARY_FILE).unlink()
+    monkeypatch.setattr(cosim.conclude, "replay", crash)
+    outcome = reopen(run_dir)
+    assert outcome.status == unharmed.status
+    assert outcome.summary["replay"]["bit_exact"] is None
+    assert "a mistake of ours" in summary_of(run_dir)["replay"]["error"]
+    assert outcome.summary | {"replay": None} == unharmed.summary | {"replay": None}
+
+
+def test_an_interrupted_replay_leaves_a_summary(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(record: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cosim.conclude, "replay", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        reopen(run_dir)
+    assert summary_of(run_dir)["replay"] is None
+    assert reopen(run_dir).summary["replay"] is None

@@ -1,0 +1,116 @@
+"""A live run and the simulated run of the same scenario: the same events, fates and states.
+
+The steps are 50 ms long, so that only a machine that stalls for 25 ms does anything later than its
+turn. What such a machine does from then on is another run: runs are compared up to there, and a
+live run that went wrong early is made anew.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.record import RunRecord, load_record
+from cosim.virtual import simulate
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from tests.integration.conftest import run_scenario, settings
+
+HORIZON_S = 2.0
+ENOUGH_S = 1.0
+ATTEMPTS = 4
+CASES = {
+    "model": {},
+    "zoh_from_known_state": {
+        "mode": "zoh",
+        "network__initial_sync": "known_state",
+        "plant__measure_every": 2,
+    },
+}
+
+SAME = {
+    PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
+    PLANT_ACTUATION: ("input", "sequence", "t_ns"),
+    SENSOR_MEASUREMENT: ("input", "sequence", "t_ns", "event"),
+    NETEM_PACKET: ("input", "sequence", "flow", "fate", "drop_run", "size_bytes"),
+    CONTROLLER_STEP: ("input", "sequence", "t_ns", "model_t_ns"),
+    CONTROLLER_DELIVERY: ("input", "sequence", "t_ns", "model_t_ns", "dropouts"),
+}
+CLOSE = {
+    PLANT_STEP: ("x", "u"),
+    PLANT_ACTUATION: ("u",),
+    SENSOR_MEASUREMENT: ("x", "x_s", "e_s_norm", "threshold"),
+    CONTROLLER_STEP: ("x_c", "u"),
+    CONTROLLER_DELIVERY: ("x", "x_c_before", "x_c"),
+}
+
+
+def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
+    """Time of the first thing that happened live in another turn than in the simulation.
+
+    The plant and the controller have two kinds of input each, and only their order is a race; it
+    shows in the ``input`` numbers. The plant's held actuation shows what got through in time.
+    """
+    first_ns = simulated.scenario.horizon_ns + 1
+    for table, columns in (
+        (PLANT_STEP, ("input", "actuation")),
+        (CONTROLLER_STEP, ("input",)),
+        (CONTROLLER_DELIVERY, ("input",)),
+    ):
+        count = min(len(live[table]), len(simulated[table]))
+        for column in columns:
+            other = live[table][column][:count] != simulated[table][column][:count]
+            if other.any():
+                first_ns = min(first_ns, int(simulated[table]["now_ns"][np.argmax(other)]))
+    return first_ns
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_a_live_run_does_what_the_simulated_run_does(
+    case: dict[str, object], tmp_path: Path
+) -> None:
+    values = {
+        "horizon_s": HORIZON_S,
+        "plant__rate_hz": 20.0,
+        "controller__rate_hz": 20.0,
+        "trigger__beta": 0.02,
+        "network__loss__probability": 0.6,
+    } | case
+    for _ in range(ATTEMPTS):
+        finished = run_scenario(tmp_path / "runs", *settings(**values))
+        assert finished.status == 0, finished.stderr
+        live = load_record(finished.run_dir)
+        simulated = simulate(live.scenario)
+        assert (simulated[SENSOR_MEASUREMENT]["event"] >= 0).sum() > 3
+        until_ns = in_turn_until_ns(live, simulated)
+        compare(live, simulated, until_ns)
+        if until_ns >= ENOUGH_S * 1e9:
+            break
+    else:
+        pytest.fail(f"{ATTEMPTS} live runs went another way within their first {ENOUGH_S} s")
+
+
+def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
+    compared = 0
+    for table, columns in SAME.items():
+        # A row's time in the simulation is its turn; live it may be late, but not out of turn.
+        rows = simulated[table][simulated[table]["now_ns"] < until_ns]
+        others = live[table][: len(rows)]
+        for column in columns:
+            np.testing.assert_array_equal(others[column], rows[column], f"{table}.{column}")
+        for column in CLOSE.get(table, ()):
+            # The same arithmetic in the same order, but perhaps another kernel of the BLAS.
+            np.testing.assert_allclose(
+                others[column], rows[column], rtol=1e-9, atol=1e-12, err_msg=f"{table}.{column}"
+            )
+        compared += len(rows)
+    assert until_ns < ENOUGH_S * 1e9 or compared > 60
+    if until_ns > simulated.scenario.horizon_ns:
+        for table in SAME:
+            assert len(live[table]) == len(simulated[table]), table
