@@ -1,0 +1,1 @@
+"""The loop in exact continuous time: matrix exponentials and root isolation, no integrator."""
