@@ -19,6 +19,7 @@ from noack.linear import Matrix, Vector
 _ROUNDING = 16 * np.finfo(float).eps
 _FINEST = 2.0**-52
 _NEWTON_STEPS = 100
+_NEWTON_RESOLUTION = 2.0**-50
 
 
 class CurveBasis:
@@ -96,21 +97,24 @@ def curve_basis(degree: int) -> CurveBasis:
 
 def _refine(taylor: Matrix, inside: float, outside: float) -> float:
     """Newton's method on |y(u)| = 1, bisecting when it leaves the bracket."""
-    powers = np.arange(len(taylor))
-    slopes = powers[1:, None] * taylor[1:]
+    degree, n = len(taylor) - 1, taylor.shape[1]
+    orders = np.arange(degree + 1.0)
+    both = np.zeros((degree + 1, 2 * n))
+    both[:, :n] = taylor
+    both[:-1, n:] = orders[1:, None] * taylor[1:]
     u = (inside + outside) / 2
     for _ in range(_NEWTON_STEPS):
-        monomials = u**powers
-        y, slope = monomials @ taylor, monomials[:-1] @ slopes
+        values = u**orders @ both
+        y, slope = values[:n], values[n:]
         excess, growth = float(y @ y) - 1.0, 2.0 * float(y @ slope)
         if excess > 0:
             outside = u
         else:
             inside = u
         following = u - excess / growth if growth else inside
-        if not inside < following < outside:
+        if not inside <= following <= outside:
             following = (inside + outside) / 2
-        if abs(following - u) <= 2.0**-53 * outside or following in (inside, outside):
+        if abs(following - u) <= _NEWTON_RESOLUTION * outside:
             return following
         u = following
     return u
