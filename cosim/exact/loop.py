@@ -101,7 +101,7 @@ class ContinuousLoop:
         self.generator[2 * n :, 2 * n :] = H - BK
         alpha = trigger.alpha_per_s
         scaled = self.generator + alpha * np.eye(3 * n)
-        self._flow = Flow(
+        self.flow = Flow(
             self.generator, 1.0 / max(growth_rate(self.generator), growth_rate(scaled))
         )
         self._floor_from_s = (
@@ -111,11 +111,11 @@ class ContinuousLoop:
 
     @cached_property
     def _decaying(self) -> "_Watch":
-        return _Watch(self._flow, self.generator, self._output, self.trigger.alpha_per_s)
+        return _Watch(self.flow, self.generator, self._output, self.trigger.alpha_per_s)
 
     @cached_property
     def _floored(self) -> "_Watch":
-        return _Watch(self._flow, self.generator, self._output, 0.0)
+        return _Watch(self.flow, self.generator, self._output, 0.0)
 
     @property
     def _output(self) -> Matrix:
@@ -161,19 +161,19 @@ class ContinuousLoop:
                     f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
                     "give trigger.floor or a shorter horizon"
                 )
-            z = self._flow.advance(z, self._floor_from_s - t_s)
+            z = self.flow.advance(z, self._floor_from_s - t_s)
             t_s = self._floor_from_s
         found = self._floored.first_exit(z, t_s, self.trigger.floor, until_s - t_s)
         return None if found is None else self._state(t_s + found[0], found[1])
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
         """The state at ``t_s`` ≥ ``state.t_s``, no event happening in between."""
-        return self._state(t_s, self._flow.advance(np.concatenate(state[1:]), t_s - state.t_s))
+        return self._state(t_s, self.flow.advance(np.concatenate(state[1:]), t_s - state.t_s))
 
     def sample(self, state: LoopState, t_s: Vector) -> Samples:
         """The states at many times ≥ ``state.t_s``, no event happening in between."""
         t_s = np.asarray(t_s, dtype=np.float64)
-        states = self._flow.sample(np.concatenate(state[1:]), t_s - state.t_s)
+        states = self.flow.sample(np.concatenate(state[1:]), t_s - state.t_s)
         return Samples(t_s, *np.split(states, 3, axis=1))
 
     def _state(self, t_s: float, z: Vector) -> LoopState:

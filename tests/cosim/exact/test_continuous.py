@@ -372,7 +372,7 @@ def test_a_loop_without_events_that_diverges_says_when() -> None:
     loop = loop_with(100 * one, one, 0 * one, 100 * one, np.ones(1))
     run = Case(loop, DecayingTrigger(0.5, 0.25), [False], True, 50.0).run()
     assert run.diverged_at_s is not None
-    window_s = run.system._flow.window_s
+    window_s = run.system.flow.window_s
     assert 0 <= run.diverged_at_s - math.log(1e100) / 100 <= window_s
     assert run.event_s.size == 0
     assert np.isfinite(run.at([0.0, run.reached_s]).x).all()
