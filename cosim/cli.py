@@ -155,9 +155,9 @@ def simulate(
     json: JsonOption = False,
 ) -> int:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
-    if trigger is Trigger.CONTINUOUS:
-        raise CallerError("--trigger continuous: not implemented yet; there is --trigger sampled")
     loaded = load(find_scenario(scenario), settings or ())
+    if trigger is Trigger.CONTINUOUS:
+        return _simulate_continuously(loaded, json=json)
     from cosim.progress import PatientConsole, simulation_bar
     from cosim.simulated_run import simulate_run
 
@@ -231,6 +231,30 @@ def replay(
     else:
         print_replay(Console(), found, changed)
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+
+
+@command(_RUNS)
+def compare(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Compare a run with the paper's loop in continuous time, effect by effect."""
+    from cosim.fidelity import compare as compare_record
+    from cosim.fidelity_table import print_fidelity
+    from cosim.progress import PatientConsole
+    from cosim.record import load_record
+
+    path = run_dir or latest_run(runs)
+    with PatientConsole(stderr=True).status("comparing"):
+        fidelity = compare_record(load_record(path))
+    if json:
+        _print_json(fidelity.as_json())
+    else:
+        print_fidelity(Console(), fidelity)
+    return ExitStatus.OK if fidelity.explained else ExitStatus.FAILED
 
 
 @command(_PROCESSES)
@@ -331,6 +355,22 @@ def _run(
         if ending is None:
             raise
     return _conclude(ending, json=json)
+
+
+def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
+    from cosim.exact.report import document, print_run, run_continuous
+    from cosim.progress import PatientConsole
+    from noack.resolve import resolve
+
+    _warn_of_violations(scenario)
+    resolved = resolve(scenario)
+    with PatientConsole(stderr=True).status("simulating"):
+        run = run_continuous(resolved)
+    if json:
+        _print_json(document(run, resolved))
+    else:
+        print_run(Console(), run, resolved)
+    return ExitStatus.OK if run.diverged_at_s is None else ExitStatus.FAILED
 
 
 def _warn_of_violations(scenario: Scenario) -> None:

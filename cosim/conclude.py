@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cosim.fidelity import fidelity_for_summary
 from cosim.launch import Ending
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
@@ -24,7 +25,7 @@ class Outcome:
 
 
 def conclude(ending: Ending) -> Outcome:
-    """Finish what a dead recorder left undone, write the summary, and replay a live run."""
+    """Finish what a dead recorder left undone, write the summary; replay and compare a live run."""
     run_dir = ending.run_dir
     with concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
@@ -35,10 +36,11 @@ def conclude(ending: Ending) -> Outcome:
         else:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
-        summary["replay"] = None
+        summary["replay"] = summary["fidelity"] = None
         (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
         if record.kind == "live":  # written once more, so that no replay can cost a summary
             summary["replay"] = _replay(record)
+            summary["fidelity"] = fidelity_for_summary(record)
             (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
     end = summary["exit"]
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from cosim.exact.loop import ContinuousLoop
-from cosim.exact.run import ContinuousRun, TooManyEventsError, simulate_continuous
+from cosim.exact.loop import ContinuousLoop, continuous_loop_of
+from cosim.exact.run import MAX_EVENTS, ContinuousRun, TooManyEventsError, simulate_continuous
 from cosim.exact.sampled import SampledLoop
 from cosim.record import RunRecord
 from cosim.schedule import IncomparableError, LiveRun, live_run
 from noack.linear import Matrix, Vector
-from noack.trigger.decaying import DecayingTrigger
+from noack.records import PLANT_STEP
 
 EXPLAINED = 0.1
 """The share of the difference that may remain unexplained."""
@@ -33,7 +33,8 @@ _ROUNDING = 1e-9
 _PARTED_PERIODS = 10
 """Events further apart than so many measurements are told: the event sequences have parted."""
 _LARGEST = 1e100
-_MAX_EVENTS = 20_000
+_STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
+"""A longer run is compared only if somebody asks: its end should not take longer than seconds."""
 _STAGES = ("sampling", "delay", "held actuation", "unexplained")
 
 
@@ -118,7 +119,7 @@ class Fidelity:
         return {**asdict(self), "explained": self.explained, "verdict": self.verdict}
 
     def compact(self) -> dict[str, Any]:
-        """The summary's share of it."""
+        """The summary's share of it; ``docs/record.md`` documents the keys."""
         return {
             "explained": self.explained,
             "explained_relative": self.explained_relative,
@@ -134,8 +135,28 @@ class Fidelity:
         }
 
 
-def compare(record: RunRecord) -> Fidelity:
+def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
+    """The comparison for a run's summary: all of it null but ``reason`` if there can be none."""
+    nothing: dict[str, Any] = dict.fromkeys(
+        ("explained", "explained_relative", "rms_x", "max_x", "rms_x_live", "shares",
+         "events_ideal", "events_live", "max_event_difference_s", "parted_event")
+    )  # fmt: skip
+    if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
+        return nothing | {"reason": "the run is long; `noack compare` compares it"}
+    try:
+        return compare(record, _EVENTS_AT_THE_END).compact()
+    except IncomparableError as error:
+        return nothing | {"reason": str(error)}
+    except Exception as error:  # whatever it is, the run itself went as it went
+        return nothing | {"reason": repr(error)}
+
+
+def compare(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
     """Compare a live run with the paper's loop, effect by effect.
+
+    Args:
+        record: the run's record.
+        max_events: events of the paper's loop; it has no end of them if it is unstable.
 
     Raises:
         IncomparableError: the run diverged, or its record is too short or incomplete.
@@ -143,10 +164,10 @@ def compare(record: RunRecord) -> Fidelity:
     live = live_run(record)
     schedule, scenario = live.schedule, record.scenario
     known = scenario.network.initial_sync == "known_state"
-    system = _system(record)
+    system = continuous_loop_of(scenario)
     period_s = schedule.period_ns * 1e-9
     t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
-    ideal = _ideal(system, live, float(t_s[-1]), known_start=known)
+    ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
     states, events_s = [ideal.at(t_s).x], [ideal.event_s]
     loop = SampledLoop(system, schedule, known_start=known)
     for delay, hold in ((False, False), (True, False), (True, True)):
@@ -187,16 +208,8 @@ def compare(record: RunRecord) -> Fidelity:
     )
 
 
-def _system(record: RunRecord) -> ContinuousLoop:
-    trigger = record.scenario.trigger
-    return ContinuousLoop(
-        record.loop,
-        DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, record.loop.weight),
-    )
-
-
 def _ideal(
-    system: ContinuousLoop, live: LiveRun, horizon_s: float, *, known_start: bool
+    system: ContinuousLoop, live: LiveRun, horizon_s: float, max_events: int, *, known_start: bool
 ) -> ContinuousRun:
     try:
         ideal = simulate_continuous(
@@ -204,11 +217,11 @@ def _ideal(
             horizon_s=horizon_s,
             delivered=live.schedule.delivered,
             known_start=known_start,
-            max_events=_MAX_EVENTS,
+            max_events=max_events,
         )
     except TooManyEventsError:
         raise IncomparableError(
-            f"the paper's loop has more than {_MAX_EVENTS} events, which accumulate"
+            f"the paper's loop has more than {max_events} events, which accumulate"
         ) from None
     if ideal.diverged_at_s is not None:
         raise IncomparableError(f"the paper's loop diverges at {ideal.diverged_at_s:g} s")

@@ -116,6 +116,6 @@ def _delays(
     taken: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
 ) -> Callable[[int], int]:
     """Recorded delays; for events that the run did not have, their median."""
-    usable = [int(delays[event]) for event in sorted(taken) if acted[event]]
+    usable = [int(delays[event]) for event in taken if event < len(delays) and acted[event]]
     usual = int(np.median(usable)) if usable else 0
     return lambda event: int(delays[event]) if event < len(delays) else usual

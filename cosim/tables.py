@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.conclude import Outcome
+from cosim.fidelity_table import summary_rows
 from cosim.run_dir import RECORDING_FILE
 from cosim.summary import Summary
 from noack.theory.assumptions import Verdict
@@ -71,6 +72,7 @@ def _run_table(summary: Summary) -> Table:
         ("missing samples", str(summary["missing_samples"])),
         ("lost outside the emulator", str(summary["lost_outside_netem"])),
         *_replay_rows(summary.get("replay")),
+        *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
     for row in rows:
         table.add_row(*row)

@@ -32,7 +32,8 @@ from cosim.exact.bernstein import curve_basis
 from cosim.exact.flow import CELLS, DEGREE, Flow, growth_rate, taylor_terms
 from noack.errors import CallerError
 from noack.linear import Matrix, Vector
-from noack.resolve import Loop
+from noack.resolve import Loop, loop_of
+from noack.scenario import Scenario
 from noack.trigger.decaying import DecayingTrigger
 
 _LARGEST = 1e100
@@ -185,6 +186,14 @@ def reset(state: LoopState, delivered: bool) -> LoopState:
     """The state after an event: e_s = 0, and e_c = 0 if the update arrives."""
     nothing = np.zeros_like(state.e_s)
     return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
+
+
+def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
+    """Return the exact loop of a resolved scenario."""
+    loop, trigger = loop_of(resolved), resolved.trigger
+    return ContinuousLoop(
+        loop, DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, loop.weight)
+    )
 
 
 class _Watch:

@@ -1,0 +1,244 @@
+"""Fidelity: explained where the record is the scenario's, and not where it is not."""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner, Result
+
+import cosim.fidelity
+from cosim.cli import app
+from cosim.fidelity import Fidelity, compare, fidelity_for_summary
+from cosim.record import Rows, RunRecord
+from cosim.schedule import IncomparableError
+from cosim.virtual import Network, simulate
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    OWNER,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from noack.resolve import resolve
+from noack.scenario_file import load
+
+LANE = Path(__file__).parents[2] / "scenarios" / "lane_following.toml"
+
+
+def lane(network: Network | None = None, *settings: str) -> RunRecord:
+    scenario = load(LANE, ["horizon_s=4", "plant.rate_hz=100", "controller.rate_hz=100", *settings])
+    return simulate(resolve(scenario), network)
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return lane()
+
+
+@pytest.fixture(scope="module")
+def fidelity(record: RunRecord) -> Fidelity:
+    return compare(record)
+
+
+def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
+    rows = {table: changed.get(table, record[table]) for table in OWNER}
+    return RunRecord(record.scenario, rows, record.notices, record.reports)
+
+
+def test_all_is_explained(fidelity: Fidelity) -> None:
+    # What remains is rounding, some 1e-15 of x, over a difference of some per cent of x.
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.explained
+    assert 1e-4 < fidelity.total.rms / fidelity.rms_live < 0.5
+    assert sum(stage.share for stage in fidelity.stages) == pytest.approx(1.0, rel=1e-9)
+    assert fidelity.stages[2].events == fidelity.stages[3].events == fidelity.events_live
+    assert fidelity.stages[3].max_event_difference_s == pytest.approx(0.0, abs=1e-9)
+    assert fidelity.stages[3].parted_event is None
+
+
+def test_the_figures_fit_together(fidelity: Fidelity) -> None:
+    for difference in (fidelity.total, *(stage.difference for stage in fidelity.stages)):
+        assert math.hypot(*difference.rms_by_state) == pytest.approx(difference.rms)
+        assert max(difference.max_by_state) <= difference.max * (1 + 1e-12)
+        assert difference.rms <= difference.max
+    assert fidelity.samples == 401
+    assert fidelity.compared_s == 4.0
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+@pytest.mark.parametrize("start", ["first_packet", "known_state"])
+def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) -> None:
+    settings = (f'mode="{mode}"', f'network.initial_sync="{start}"', "plant.measure_every=2",
+                "trigger.beta=0.02")  # fmt: skip
+    asked: list[int] = []
+
+    def network(data: bytes, now_ns: int) -> int | None:
+        asked.append(now_ns)
+        return None if len(asked) % 3 == 2 else 7_000_000 * (len(asked) % 5)
+
+    fidelity = compare(lane(network, *settings))
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.events_live > 3
+
+
+def test_delay_shows_as_delay() -> None:
+    prompt, late = (compare(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
+    sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
+    assert delay > 2 * prompt.stages[1].difference.rms
+    assert sampling == pytest.approx(prompt.stages[0].difference.rms)  # the same fates, no delay
+
+
+def test_a_start_without_actuation_shows_as_held_actuation() -> None:
+    """Known x(0), no event at all: the plant still waits for the first tick, 8 ms late."""
+    settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
+    fidelity = compare(lane(None, *settings))
+    sampling, delay, held, _ = fidelity.stages
+    assert fidelity.events_live == 0
+    assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
+    assert delay.difference.max == 0.0
+    assert held.share == pytest.approx(1.0)
+    assert held.max_event_difference_s is None
+
+
+def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
+    plant = record.scenario.plant
+    assert plant.A is not None
+    A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
+    other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
+    rows = {table: record[table] for table in OWNER}
+    fidelity = compare(RunRecord(other, rows, record.notices, record.reports))
+    assert fidelity.explained_relative > 0.1
+    assert not fidelity.explained
+    assert "too much" in fidelity.verdict
+
+
+def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
+    steps = record[PLANT_STEP].copy()
+    steps["x"][200:] += 0.1
+    assert not compare(with_rows(record, plant_step=steps)).explained
+
+
+def test_at_rest_there_is_nothing_to_explain() -> None:
+    fidelity = compare(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    assert fidelity.explained
+    assert fidelity.explained_relative == 0.0
+    assert "rounding" in fidelity.verdict
+
+
+def test_fates_of_events_that_the_run_did_not_have_are_the_networks() -> None:
+    """A sampled sensor that looks four times a second has fewer events than the paper's."""
+    fidelity = compare(lane(None, "plant.measure_every=25", 'mode="zoh"'))
+    assert fidelity.events_ideal > fidelity.events_live
+    assert fidelity.parted_event is not None
+    assert fidelity.explained_relative < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("table", "rows", "why"),
+    [
+        (SENSOR_MEASUREMENT, slice(5), "5 measurements"),
+        (SENSOR_MEASUREMENT, [*range(50), *range(51, 401)], "sensor's record"),
+        (PLANT_STEP, [*range(50), *range(51, 401)], "steps of the plant"),
+        (PLANT_STEP, slice(300), "steps of the plant"),
+        (CONTROLLER_STEP, slice(300), "controller's record"),
+        (CONTROLLER_STEP, [*range(50), *range(51, 400)], "controller's record"),
+        (CONTROLLER_DELIVERY, slice(1, None), "controller's record"),
+    ],
+)
+def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, why: str) -> None:
+    broken = with_rows(record, **{table: record[table][rows]})
+    with pytest.raises(IncomparableError, match=why):
+        compare(broken)
+    summary = fidelity_for_summary(broken)
+    assert why in summary.pop("reason")
+    assert set(summary.values()) == {None}
+
+
+def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecord) -> None:
+    """The sensor was the first to end."""
+    short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
+    fidelity = compare(short)
+    assert fidelity.samples == 250
+    assert fidelity.explained_relative < 1e-9
+
+
+def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
+    steps = record[PLANT_STEP].copy()
+    steps["x"][300:] = math.nan
+    with pytest.raises(IncomparableError, match="diverged"):
+        compare(with_rows(record, plant_step=steps))
+
+
+def test_a_loop_whose_events_accumulate_says_so() -> None:
+    unstable = lane(None, "model.parameters.gain=-1.0", "horizon_s=20")
+    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
+        compare(unstable, max_events=200)
+
+
+def test_the_summary_has_the_same_keys_whatever_happens(
+    record: RunRecord, fidelity: Fidelity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = fidelity_for_summary(record)
+    assert good == fidelity.compact()
+    json.dumps(good, allow_nan=False)
+
+    def broken(*_: object) -> Fidelity:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(cosim.fidelity, "compare", broken)
+    bad = fidelity_for_summary(record)
+    assert bad.keys() == good.keys()
+    assert bad["reason"] == "RuntimeError('a bug')"
+    monkeypatch.setattr(cosim.fidelity, "_STEPS_AT_THE_END", 100)
+    assert "noack compare" in fidelity_for_summary(record)["reason"]
+
+
+def noack(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    shorter = ("--set", "horizon_s=2", "--set", "plant.rate_hz=100")
+    done = noack("simulate", LANE, "--runs", folder, *shorter)
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_the_last_run_is_compared(simulated: Path) -> None:
+    done = noack("compare", "--runs", simulated)
+    assert done.exit_code == 0, done.output
+    assert "held actuation" in done.stdout
+    assert done.stderr == ""
+    document = json.loads(noack("compare", simulated / "latest", "--json").stdout)
+    assert document["explained"] is True
+    assert [stage["name"] for stage in document["stages"]] == [
+        "sampling", "delay", "held actuation", "unexplained"
+    ]  # fmt: skip
+
+
+def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(simulated / "latest", tmp_path / "run"))
+    path = run / "record" / "plant_step.parquet"
+    table = pq.read_table(path)
+    moved: Callable[[np.ndarray], np.ndarray] = lambda x: x + np.linspace(0, 1, len(x))  # noqa: E731
+    column = pa.array(moved(table["x_3"].to_numpy()))
+    pq.write_table(table.set_column(table.schema.get_field_index("x_3"), "x_3", column), path)
+    done = noack("compare", run)
+    assert done.exit_code == 1
+    assert "too much" in done.stdout
+    assert noack("compare", run, "--json").exit_code == 1
+
+
+def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    done = noack("compare", tmp_path)
+    assert done.exit_code == 2
+    assert "not a run directory" in done.stderr
