@@ -82,6 +82,7 @@ class SampledLoop:
         decaying = trigger.beta * np.exp(-trigger.alpha_per_s * self._steps_s)
         self._thresholds = np.maximum(decaying, trigger.floor)
 
+    @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> SampledRun:
         """Simulate; a state that is not finite any more stays so."""
         schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
@@ -111,13 +112,12 @@ class SampledLoop:
                 until = min(until, max(under_way[0].acts_ns // period_ns, step + 1))
             within = [update for update in under_way if update.acts_ns < until * period_ns]
             following = slice(step + 1, until + 1)
-            with np.errstate(all="ignore"):
-                if hold:
-                    states[following] = self._held(x, newest, step, until)
-                else:
-                    states[following] = self._continuous(x, [newest, *within], step, until)
-                x_s_block = self._model_steps[1 : until - step + 1] @ x_s
-                exceeds = self._exceeds(following, x_s_block - states[following])
+            if hold:
+                states[following] = self._held(x, newest, step, until)
+            else:
+                states[following] = self._continuous(x, [newest, *within], step, until)
+            x_s_block = self._model_steps[1 : until - step + 1] @ x_s
+            exceeds = self._exceeds(following, x_s_block - states[following])
             stops = schedule.measured[following] & (exceeds | (not in_common))
             taken = int(np.argmax(stops)) if stops.any() else until - step - 1
             x_s = x_s_block[taken]

@@ -226,6 +226,14 @@ def test_the_run_is_replayed_bit_for_bit(record: RunRecord, finished: Finished) 
     assert finished.summary["kind"] == record.kind == "live"
 
 
+def test_the_difference_to_the_papers_loop_is_explained(finished: Finished) -> None:
+    fidelity = finished.summary["fidelity"]
+    assert fidelity["reason"] is None
+    # All effects together give the run but for rounding: 1e-14 of x, over some per cent of it.
+    assert fidelity["explained_relative"] < 1e-6
+    assert 0 < fidelity["rms_x"] < 0.5 * fidelity["rms_x_live"]
+
+
 def test_the_state_converges(record: RunRecord, finished: Finished) -> None:
     norms = np.linalg.norm(record["plant_step"]["x"], axis=1)
     assert norms[-1] < 0.1 * norms[0]
