@@ -1,5 +1,6 @@
 """Fidelity: explained where the record is the scenario's, and not where it is not."""
 
+import itertools
 import json
 import math
 import shutil
@@ -15,9 +16,10 @@ from typer.testing import CliRunner, Result
 
 import cosim.fidelity
 from cosim.cli import app
+from cosim.exact.fates import network_fates
 from cosim.fidelity import Fidelity, compare, fidelity_for_summary
 from cosim.record import Rows, RunRecord
-from cosim.schedule import IncomparableError
+from cosim.schedule import IncomparableError, live_run
 from cosim.virtual import Network, simulate
 from noack.records import (
     CONTROLLER_DELIVERY,
@@ -132,7 +134,22 @@ def test_at_rest_there_is_nothing_to_explain() -> None:
     assert "rounding" in fidelity.verdict
 
 
-def test_fates_of_events_that_the_run_did_not_have_are_the_networks() -> None:
+def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_delays() -> None:
+    waits_ns = itertools.cycle([10_000_000, 10_000_000, 30_000_000])
+    late = lane(lambda data, now_ns: next(waits_ns), "trigger.beta=0.02")
+    schedule = live_run(late).schedule
+    events = int(late[SENSOR_MEASUREMENT]["event"].max()) + 1
+    assert events > 6
+    fates = network_fates(late.scenario)
+    beyond = range(events, events + 50)
+    assert [schedule.delivered(i) for i in beyond] == [fates(i) for i in beyond]
+    assert {schedule.delivered(i) for i in beyond} == {True, False}
+    # 10 ms under way, then 5 to the tick that uses it, or the next step.
+    assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
+    assert {schedule.delay_steps(i) for i in beyond} == {2}
+
+
+def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
     """A sampled sensor that looks four times a second has fewer events than the paper's."""
     fidelity = compare(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live

@@ -104,7 +104,9 @@ def cases(draw: st.DrawFn) -> Case:
     measured[draw(st.integers(0, 20))] = False
     names = tuple("abcd"[:n])
     loop = Loop(A, B, K, H, A, B, rng.uniform(-1, 1, n), None, names, names[:m])
-    delays = st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=5)
+    overtaking_within_a_step = st.just([27_000_000, 12_000_000])
+    anything = st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=5)
+    delays = st.one_of(overtaking_within_a_step, anything)
     return Case(
         loop,
         DecayingTrigger(draw(st.sampled_from([0.003, 0.03, 0.3])), 0.5, 1e-4),
