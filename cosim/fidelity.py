@@ -23,6 +23,7 @@ from cosim.exact.run import MAX_EVENTS, ContinuousRun, TooManyEventsError, simul
 from cosim.exact.sampled import SampledLoop
 from cosim.record import RunRecord
 from cosim.schedule import IncomparableError, LiveRun, live_run
+from noack.errors import NoackError
 from noack.linear import Matrix, Vector
 from noack.records import PLANT_STEP
 
@@ -145,7 +146,7 @@ def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
         return nothing | {"reason": "the run is long; `noack compare` compares it"}
     try:
         return compare(record, _EVENTS_AT_THE_END).compact()
-    except IncomparableError as error:
+    except NoackError as error:
         return nothing | {"reason": str(error)}
     except Exception as error:  # whatever it is, the run itself went as it went
         return nothing | {"reason": repr(error)}
