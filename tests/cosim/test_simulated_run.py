@@ -91,13 +91,6 @@ def test_the_recording_shows_the_run_without_lateness(runs: Path) -> None:
     assert not [path for path in paths if path.startswith("lateness")]
 
 
-def test_continuous_triggering_is_refused_in_one_line(tmp_path: Path) -> None:
-    done = noack("simulate", str(PATH), "--trigger", "continuous", "--runs", str(tmp_path / "runs"))
-    assert done.exit_code == 2
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "runs").exists()
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_is_broken_off_leaves_nothing_behind(tmp_path: Path, error: BaseException) -> None:
     def broken(resolved: Scenario, *, progress: Progress | None) -> RunRecord:
