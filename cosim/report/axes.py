@@ -26,7 +26,7 @@ Shown = tuple[Artist, str]
 
 TIME = "time t [s]"
 
-WIDTH_IN, LEFT_IN, RIGHT_IN, BELOW_IN = 10.0, 1.05, 0.2, 0.55
+WIDTH_IN, LEFT_IN, RIGHT_IN, BELOW_IN = 10.0, 1.15, 0.2, 0.55
 """A figure's width; what labels and ticks take at its left, right, and below an axes."""
 _ABOVE_IN, _LEGEND_ROW_IN, _TITLE_IN, _HANDLE_IN, _CHARACTER_IN = 0.34, 0.19, 2.3, 0.6, 0.075
 
@@ -50,10 +50,13 @@ def place(
     """Add axes, whose upper left corner is so far from the figure's."""
     whole_in = figure.get_figheight()
     bottom_in = whole_in - top_in - height_in
-    return figure.add_axes(
+    axes = figure.add_axes(
         (left_in / WIDTH_IN, bottom_in / whole_in, width_in / WIDTH_IN, height_in / whole_in),
         **shared,
     )
+    factor = axes.yaxis.get_offset_text()  # ×10⁻⁶; above the axes it would meet the title
+    factor.set(x=-0.05 / width_in, horizontalalignment="right")
+    return axes
 
 
 def single(
@@ -110,11 +113,11 @@ def finite(values: Reals, *, positive: bool = False) -> Reals:
     return np.where(shown, values, np.nan)
 
 
-def plain(name: str) -> str:
+def plain(name: str, longest: int = _LONGEST_NAME) -> str:
     """A user's name as it is, not taken for mathematics, on one line short enough for a label."""
     line = " ".join(name.split())
-    if len(line) > _LONGEST_NAME:
-        line = line[: _LONGEST_NAME - 1] + "…"
+    if len(line) > longest:
+        line = line[: longest - 1] + "…"
     return line.replace("$", r"\$")
 
 

@@ -50,6 +50,7 @@ _STATE = r"$\|x\|$ plant"
 _PERIOD = "one period"
 _UNIT = "[model units]"
 _MOST_STATES = 16
+_LONGEST_TITLE = 40
 _DECADES = 6
 _RANKS = 120
 _SHORTEST_US = 0.1  # a logarithmic axis has no zero
@@ -93,7 +94,7 @@ def paper_figure(
     height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, head_in(())
     width_in = (WIDTH_IN - RIGHT_IN) / columns - LEFT_IN
     # A last row that is not full leaves room for the numbers of the time axes above its gap.
-    gaps_in = [0.15] * (rows - 2) + [0.15 if drawn % columns == 0 else BELOW_IN] * (rows > 1)
+    gaps_in = [0.22] * (rows - 2) + [0.22 if drawn % columns == 0 else BELOW_IN] * (rows > 1)
     tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
     above_in = tops_in[-1] + height_in + BELOW_IN + head
     below_in = above_in + interval_in + head
@@ -134,7 +135,9 @@ def _state(axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals) -> list[Sho
 def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[Shown]) -> None:
     """Write title and legend above all states, which may be too narrow to bear them."""
     head = "MB-ET" if mode == "model" else "ZOH-ET"
-    text = ": ".join(filter(None, (head, plain(title)))) + (f" ({note})" if note else "")
+    text = ": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + (
+        f" ({note})" if note else ""
+    )
     y = 1 - 0.09 / figure.get_figheight()
     figure.text(LEFT_IN / WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
     handles, labels = zip(*shown, strict=True)

@@ -171,7 +171,7 @@ def _latency(record: RunRecord) -> Picture:
 
 
 def _dashed(curves: Sequence[Curve]) -> str:
-    return " Dashed: certified bounds." if curves else ""
+    return " Dashed: the bounds that are claimed." if curves else ""
 
 
 def _largest(values: Reals) -> str:

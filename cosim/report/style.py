@@ -36,6 +36,7 @@ _SETTINGS: dict[Any, Any] = {
     "axes.titlelocation": "left",
     "axes.titlesize": 10.5,
     "axes.titleweight": "bold",
+    "axes.titley": 1.0,
     "figure.dpi": 100,
     "figure.facecolor": PAPER,
     "font.family": "sans-serif",

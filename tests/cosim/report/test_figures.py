@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from cosim import palette
 from cosim.report import figures
 from cosim.report.save import inline, save
-from cosim.report.style import printed
+from cosim.report.style import printed, settings
 from tests.cosim.report.conftest import HOSTILE
 
 SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
@@ -88,6 +88,24 @@ def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> 
         assert (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
 
 
+def test_nothing_is_cut_off_and_no_texts_meet(drawn: dict[str, Figure]) -> None:
+    for name, figure in drawn.items():
+        with settings():
+            figure.draw_without_rendering()
+            box, size_in = figure.get_tightbbox(), figure.get_size_inches()
+            assert box.x0 >= 0, name
+            assert box.y0 >= 0, name
+            assert box.x1 <= size_in[0], name
+            assert box.y1 <= size_in[1], name
+            for axes in figure.axes:
+                heads = [*axes.texts, axes.title, axes.yaxis.get_offset_text(), axes._left_title]
+                legend = axes.get_legend()
+                heads += legend.get_texts() if legend else []
+                boxes = [text.get_window_extent() for text in heads if text.get_text()]
+                for i, one in enumerate(boxes):
+                    assert not any(one.overlaps(other) for other in boxes[:i]), name
+
+
 def test_a_figure_without_data_says_so() -> None:
     for name, figure in drawn_for("empty").items():
         for axes in figure.axes:
@@ -149,9 +167,9 @@ def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> Non
     x, none, no = np.zeros((3, 1)), np.zeros(0), np.zeros(0, bool)
     figure = figures.paper_figure(
         mode=mode, t_s=np.arange(3.0), x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=none,
-        dropped=no, received_s=none, forced=no, title="a draw",
+        dropped=no, received_s=none, forced=no, title="one draw out of 1,000",
     )  # fmt: skip
-    assert [text.get_text() for text in figure.texts] == [f"{head}: a draw"]
+    assert [text.get_text() for text in figure.texts] == [f"{head}: one draw out of 1,000"]
 
 
 def test_names_are_taken_literally() -> None:
