@@ -136,10 +136,14 @@ def marks(
     axes: Axes, t_s: Reals, values: Reals, label: str = "", size: float = 5.0, **style: Any
 ) -> list[Shown]:
     """Draw markers, smaller where there are many; named in the legend only if there are any."""
+    seen = np.isfinite(values)
+    t_s, values = t_s[seen], values[seen]
+    if not len(values):
+        return []
     keep = decimate(t_s, values, _MARKS)
-    style["markersize"] = size * min(max(math.sqrt(_CROWD / max(len(keep), 1)), 0.4), 1.0)
+    style["markersize"] = size * min(max(math.sqrt(_CROWD / len(keep)), 0.4), 1.0)
     (drawn,) = axes.plot(t_s[keep], values[keep], linestyle="none", clip_on=False, **style)
-    return [(drawn, label)] if np.isfinite(values).any() else []
+    return [(drawn, label)]
 
 
 def stems(axes: Axes, t_s: Reals, values: Reals, **style: Any) -> None:

@@ -155,10 +155,10 @@ def test_intervals_and_fates_are_drawn_where_they_belong() -> None:
         for line in axes.lines
         if line.get_marker() != "None"
     }
-    assert found["D"] == {0.0: pytest.approx(np.nan, nan_ok=True), 3.25: 1.75}
+    assert found["D"] == {3.25: 1.75}  # the first, at 0, has no interval
     assert found["o"] == {1.5: 1.5}  # the one received without force
     sent, lost = above.lines[1], above.lines[2]
-    assert sent.get_xdata().tolist() == [0.0, 1.5, 3.25]
+    assert sent.get_xdata().tolist() == [1.5, 3.25]
     assert lost.get_ydata().tolist() == [1.0, 1.5]
 
 
