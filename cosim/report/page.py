@@ -61,7 +61,7 @@ def page(
         ending=_ending(summary),
         verdict_tone="bad" if status else "doubt" if remarks else "good",
         remarks=remarks,
-        key_numbers=key_numbers(dict(summary)),
+        key_numbers=key_numbers({**summary, **dict.fromkeys(_FINDINGS)}),  # they have sections
         parameters=list(_parameters(scenario)),
         figures=figures,
         claims=[_claim(claim) for claim in claims],
