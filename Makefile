@@ -23,7 +23,7 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare
+.PHONY: demo demo-zoh run simulate view summary replay compare report
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -47,6 +47,9 @@ replay: setup ## Feed the last run's machines their inputs again; compare bit fo
 
 compare: setup ## Compare the last run with the paper's loop, effect by effect
 	@$(BIN)/noack compare $(ARGS)
+
+report: setup ## Write the last run's report anew, a page with all figures; print its path
+	@$(BIN)/noack report $(ARGS)
 
 ##@ Five terminals, one process each (start `make record` in one, the others in any order)
 .PHONY: record plant sensor controller netem

@@ -257,6 +257,25 @@ def compare(
     return ExitStatus.OK if fidelity.explained else ExitStatus.FAILED
 
 
+@command(_RUNS)
+def report(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Write a run's report anew, one page with all figures, and print where it is."""
+    from cosim.conclude import report_anew
+
+    path = report_anew(run_dir or latest_run(runs))
+    if json:
+        _print_json({"report": str(path)})
+    else:
+        print(path)
+    return ExitStatus.OK
+
+
 @command(_PROCESSES)
 def record(
     scenario: ScenarioArgument,

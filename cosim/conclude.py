@@ -1,6 +1,7 @@
 """The conclusion of a run: its record made whole, its summary written."""
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from cosim.fidelity import fidelity_for_summary
 from cosim.launch import Ending
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
-from cosim.run_dir import RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
+from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus
 
@@ -25,7 +26,7 @@ class Outcome:
 
 
 def conclude(ending: Ending) -> Outcome:
-    """Finish what a dead recorder left undone, write the summary; replay and compare a live run."""
+    """Finish what a dead recorder left undone; write summary and report."""
     run_dir = ending.run_dir
     with concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
@@ -42,6 +43,11 @@ def conclude(ending: Ending) -> Outcome:
             summary["replay"] = _replay(record)
             summary["fidelity"] = fidelity_for_summary(record)
             (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+        try:
+            _report(record, summary, run_dir)
+        except Exception as error:  # whatever it is: a run is none the worse for it
+            (run_dir / REPORT_FILE).unlink(missing_ok=True)
+            print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
     end = summary["exit"]
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
@@ -69,6 +75,23 @@ def reopen(run_dir: Path) -> Outcome:
     if (run_dir / SPOOL).is_dir():  # from a process that woke up after the end
         return conclude(Ending(run_dir, 0, status, reason, summary["startup_s"]))
     return Outcome(run_dir, status, reason, summary)
+
+
+def report_anew(run_dir: Path) -> Path:
+    """Write the report of an earlier run anew, and return its path.
+
+    Raises:
+        CallerError: it is not a run directory, or the run is still under way.
+        MachineError: the report cannot be written.
+    """
+    outcome = reopen(run_dir)
+    return _report(load_record(run_dir), outcome.summary, run_dir)
+
+
+def _report(record: RunRecord, summary: Summary, run_dir: Path) -> Path:
+    from cosim.report.write import write_report  # imports matplotlib, which no process needs sooner
+
+    return write_report(record, summary, run_dir)
 
 
 def _read_summary(run_dir: Path) -> Summary | None:

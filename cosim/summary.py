@@ -197,38 +197,53 @@ def _quantiles(late_us: NDArray[np.float64]) -> dict[str, float | None]:
     return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(late_us.max())}
 
 
-def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
-    """Wall time by which a process acted after what it acts on was due.
+def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
+    """Wall time by which a process acted after what it acts on was due, (k,).
 
     The plant and the controller have deadlines of their own; the sensor's is the measurement's grid
     time, the network's is the event's.
     """
-    scenario = record.scenario
-    table, period_ns = {
-        "plant": (PLANT_STEP, scenario.plant_period_ns),
-        "sensor": (SENSOR_MEASUREMENT, scenario.plant_period_ns * scenario.plant.measure_every),
-        "controller": (CONTROLLER_STEP, scenario.controller_period_ns),
-        "netem": (NETEM_PACKET, scenario.plant_period_ns),
-    }[role]
-    rows = record[table]
-    due_ns = rows["t_ns"]
     if role == "netem":
-        rows, _, due_ns = updates_in(rows)
-    late_us = (rows["now_ns"] - due_ns) / (1e3 * scenario.speed)
+        rows, _, due_ns = updates_in(record[NETEM_PACKET])
+    else:
+        steps = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
+        rows = record[steps[role]]
+        due_ns = rows["t_ns"]
+    late_us: NDArray[np.float64] = (rows["now_ns"] - due_ns) / (1e3 * record.scenario.speed)
+    return late_us
+
+
+def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
+    scenario = record.scenario
+    period_ns = {
+        "plant": scenario.plant_period_ns,
+        "sensor": scenario.plant_period_ns * scenario.plant.measure_every,
+        "controller": scenario.controller_period_ns,
+        "netem": scenario.plant_period_ns,
+    }[role]
+    late_us = lateness_us(record, role)
     late_steps = int((late_us * 1e3 * scenario.speed > period_ns).sum())
-    return {**_quantiles(late_us), "steps": len(rows), "late_steps": late_steps}
+    return {**_quantiles(late_us), "steps": len(late_us), "late_steps": late_steps}
 
 
-def _latency(record: RunRecord) -> dict[str, float | int | None]:
-    """Wall time from the sensor's event to the controller's update, one way."""
+def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Wall time from the sensor's event to the controller's update, one way.
+
+    Returns:
+        Event times in ns (d,) and latencies in µs (d,), of the updates that arrived.
+    """
     sensor, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
     events = sensor[sensor["event"] != NO_SEQUENCE]
     _, at_sensor, at_controller = np.intersect1d(
         events["event"], deliveries["sequence"], return_indices=True
     )
     taken_ns = deliveries["now_ns"][at_controller] - events["now_ns"][at_sensor]
-    latency_us = taken_ns / (1e3 * record.scenario.speed)
-    return {**_quantiles(latency_us), "updates": len(latency_us)}
+    return events["t_ns"][at_sensor], taken_ns / (1e3 * record.scenario.speed)
+
+
+def _latency(record: RunRecord) -> dict[str, float | int | None]:
+    _, taken_us = latency_us(record)
+    return {**_quantiles(taken_us), "updates": len(taken_us)}
 
 
 def dumps(summary: Summary) -> str:

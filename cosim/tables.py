@@ -11,7 +11,7 @@ from rich.table import Table
 
 from cosim.conclude import Outcome
 from cosim.fidelity_table import summary_rows
-from cosim.run_dir import RECORDING_FILE
+from cosim.run_dir import RECORDING_FILE, REPORT_FILE
 from cosim.summary import Summary
 from noack.theory.assumptions import Verdict
 
@@ -31,13 +31,15 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
             f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
             f"seen by {violation['process']}: {escape(violation['what'])}"
         )
-    for warning in _warnings(summary):
+    for warning in warnings_of(summary):
         console.print(f"[bold yellow]warning:[/] {escape(warning)}", highlight=False)
     if outcome.status:
         console.print(f"[bold red]the run failed:[/] {escape(outcome.reason)}")
     console.print(
         f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True, markup=False
     )
+    if (report := outcome.run_dir / REPORT_FILE).is_file():
+        console.print(f"report         {report}", highlight=False, soft_wrap=True, markup=False)
     console.print(
         f"look at it     {_program()} view {outcome.run_dir / RECORDING_FILE}",
         highlight=False,
@@ -52,9 +54,16 @@ def _run_table(summary: Summary) -> Table:
     table = Table(title=title)
     table.add_column("quantity")
     table.add_column("value", justify="right")
+    for row in key_numbers(summary):
+        table.add_row(*row)
+    return table
+
+
+def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
+    """What happened in a run: each quantity and its value, as a person reads them."""
     events, deliveries = summary["events"], summary["deliveries"]
     arrived = summary["drops"] + deliveries
-    rows = (
+    return (
         ("events (transmissions)", str(events)),
         ("deliveries", str(deliveries)),
         ("  of these forced (t_0 or cap)", str(summary["forced_deliveries"])),
@@ -74,9 +83,6 @@ def _run_table(summary: Summary) -> Table:
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
-    for row in rows:
-        table.add_row(*row)
-    return table
 
 
 def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
@@ -137,7 +143,8 @@ def print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> No
     console.print(table)
 
 
-def _warnings(summary: Summary) -> Iterator[str]:
+def warnings_of(summary: Summary) -> Iterator[str]:
+    """What a person should know before trusting the numbers of a run, a sentence each."""
     late = summary["lateness_us"].get("plant")
     if late and late["steps"] and late["late_steps"] > 0.01 * late["steps"]:
         share = 100 * late["late_steps"] / late["steps"]

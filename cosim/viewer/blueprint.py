@@ -26,6 +26,18 @@ from typing import Literal
 import rerun as rr
 import rerun.blueprint as rrb
 
+from cosim.palette import (
+    CONTROLLER,
+    DROPPED,
+    PLANT,
+    PROCESSES,
+    SENSOR,
+    SERIES,
+    THRESHOLD,
+    Colour,
+)
+from cosim.palette import FORCED as FORCED_COLOUR
+
 TIMELINE = "t"
 
 ABOUT = "about"
@@ -36,23 +48,6 @@ EVENT, EVENT_STEM = "event/interval", "event/stem"
 RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
 DROP = "drop"
 LOG = "log"
-
-# One colour, one meaning in every panel; all readable on a light and on a dark background.
-PLANT = (150, 150, 158)
-SENSOR = (38, 132, 255)
-CONTROLLER = (255, 128, 14)
-THRESHOLD = (225, 60, 75)
-FORCED_COLOUR = (200, 70, 200)
-DROPPED = (225, 60, 75)
-SERIES = (
-    (38, 132, 255),
-    (255, 128, 14),
-    (40, 165, 90),
-    (200, 70, 200),
-    (150, 110, 80),
-    (20, 175, 190),
-    (150, 150, 158),
-)
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
 
@@ -101,20 +96,20 @@ def styles(
     for i, process in enumerate(processes):
         found[lateness_path(process)] = rr.SeriesLines(
             names=process,
-            colors=SERIES[i % len(SERIES)],
+            colors=PROCESSES.get(process, SERIES[i % len(SERIES)]),
             widths=1.5,
             aggregation_policy="Max",
         )
     return found
 
 
-def _stem(name: str, colour: tuple[int, int, int]) -> rr.SeriesLines:
+def _stem(name: str, colour: Colour) -> rr.SeriesLines:
     return rr.SeriesLines(names=name, colors=colour, widths=1.5, aggregation_policy="Off")
 
 
 def _mark(
     name: str,
-    colour: tuple[int, int, int],
+    colour: Colour,
     marker: Literal["circle", "cross", "diamond"],
     size: float,
 ) -> rr.SeriesPoints:

@@ -53,6 +53,7 @@ def test_a_killed_process_is_named_and_nothing_recorded_is_lost(start: Start, ro
     assert finished.summary["replay"]["bit_exact"]
     assert not finished.summary["replay"]["complete"]  # who was killed cannot say what is missing
     assert (finished.run_dir / "recording.rrd").stat().st_size > 0
+    assert f"{role} died: killed by SIGKILL" in (finished.run_dir / "report.html").read_text()
     assert not (finished.run_dir / "spool").exists()
     assert running.left_behind() == []
 
@@ -177,6 +178,7 @@ def test_a_run_that_diverges_says_when_and_keeps_its_record(tmp_path: Path) -> N
     lost = ~np.isfinite(steps["x"]).all(axis=1)
     assert finished.summary["diverged_at_s"] == pytest.approx(steps["t_ns"][lost][0] * 1e-9)
     assert finished.summary["final_state_norm"] is None
+    assert "diverged: x is not finite" in (finished.run_dir / "report.html").read_text()
 
 
 def test_a_run_that_cannot_keep_up_does_not_claim_its_horizon(tmp_path: Path) -> None:

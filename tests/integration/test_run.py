@@ -84,6 +84,10 @@ def test_the_run_directory_holds_everything(finished: Finished) -> None:
         f"{role}.log" for role in ("plant", "sensor", "controller", "netem", "recorder")
     }
     assert not (run_dir / "spool").exists()
+    report = (run_dir / "report.html").read_text(encoding="utf-8")
+    assert report.count("<figure") == 7
+    assert "The run reached its horizon of 20 s." in report
+    assert "warning" not in finished.stderr
 
 
 def test_the_resolved_scenario_repeats_itself(record: RunRecord, finished: Finished) -> None:

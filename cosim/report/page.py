@@ -1,0 +1,214 @@
+"""The page of a run: what its summary says and its figures show, as one file of HTML."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from cosim.tables import key_numbers, warnings_of
+from noack.scenario import Scenario
+
+_NONE = "–"
+_MOST_ROWS = 40
+_TONES = {
+    "held": "good", "holds": "good",
+    "violated": "bad",
+    "void": "doubt",
+}  # fmt: skip
+_QUANTILES = {"p50": "median", "p99": "99 %", "p999": "99.9 %", "max": "largest"}
+_FINDINGS = {"fidelity": "Fidelity", "replay": "Replay"}
+
+
+class Embedded(NamedTuple):
+    """A figure as it stands in the page."""
+
+    name: str
+    markup: Markup
+    caption: str
+
+
+def page(
+    scenario: Scenario,
+    summary: Mapping[str, Any],
+    figures: Sequence[Embedded],
+    scenario_toml: str,
+    environment: Mapping[str, Any],
+) -> str:
+    """Return the report of a run as HTML; whatever is not a figure is escaped.
+
+    Args:
+        scenario: the resolved scenario.
+        summary: the content of ``summary.json``.
+        figures: the run's figures, in order.
+        scenario_toml: the resolved scenario as it stands in the run directory.
+        environment: the content of ``environment.json``; empty if there is none.
+    """
+    claims = _objects(summary.get("claims"))
+    remarks = list(_remarks(summary, claims))
+    status = summary["exit"]["status"]
+    kind = "simulated run" if summary.get("kind") == "simulated" else "live run"
+    hold = "model-based" if scenario.mode == "model" else "zero-order hold"
+    return _templates().get_template("report.html.jinja").render(
+        title=scenario.name,
+        subtitle=", ".join(
+            filter(None, (kind, hold, f"M − 1 = {scenario.network.mansd}", _started(environment)))
+        ),
+        description=scenario.description,
+        ending=_ending(summary),
+        verdict_tone="bad" if status else "doubt" if remarks else "good",
+        remarks=remarks,
+        key_numbers=key_numbers({**summary, **dict.fromkeys(_FINDINGS)}),  # they have sections
+        parameters=list(_parameters(scenario)),
+        figures=figures,
+        claims=[_claim(claim) for claim in claims],
+        assumptions=_objects(summary.get("assumptions")),
+        timing=list(_timing(summary)),
+        timing_headings=[*_QUANTILES.values(), "count", "late"],
+        findings=[
+            (heading, summary[key]) for key, heading in _FINDINGS.items() if summary.get(key)
+        ],
+        scenario_toml=scenario_toml,
+        environment=[(_words(key), _line(value)) for key, value in environment.items()],
+        most=_MOST_ROWS,
+    )  # fmt: skip
+
+
+@cache
+def _templates() -> Environment:
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    templates.filters |= {"shown": _shown, "words": _words, "tone": lambda w: _TONES.get(w, "")}
+    templates.tests["records"] = _are_records
+    return templates
+
+
+def _ending(summary: Mapping[str, Any]) -> str:
+    end = summary["exit"]
+    if not end["status"]:
+        return f"The run reached its horizon of {_shown(summary['horizon_s'])} s."
+    return (
+        f"The run failed (exit status {end['status']}): {end['reason']}. "
+        f"It reached {_shown(summary['reached_s'])} of {_shown(summary['horizon_s'])} s."
+    )
+
+
+def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """What a person should know before trusting the rest."""
+    yield from warnings_of(dict(summary))
+    violations = summary["assumption_violations"]
+    for violation in violations[:_MOST_ROWS]:
+        yield (
+            f"Assumption violated at t = {violation['t_s']:.3f} s, "
+            f"seen by {violation['process']}: {violation['what']}"
+        )
+    if len(violations) > _MOST_ROWS:
+        yield f"and {len(violations) - _MOST_ROWS} more such violations"
+    for verdict in ("violated", "void"):
+        count = sum(claim.get("verdict") == verdict for claim in claims)
+        if count:
+            yield f"{count} of {len(claims)} claims {verdict}: see Claims"
+    if summary["missing_samples"]:
+        where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
+        yield f"{summary['missing_samples']} samples are missing in the record: {where}"
+    if summary["lost_outside_netem"]:
+        where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
+        yield f"{summary['lost_outside_netem']} datagrams were lost outside the emulator: {where}"
+    for role, reasons in summary["rejected_datagrams"].items():
+        yield f"{role} rejected datagrams: {_shown(reasons)}"
+
+
+def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    trigger, network = scenario.trigger, scenario.network
+    every = scenario.plant.measure_every
+    loss = network.loss.model_dump()
+    model = loss.pop("model").replace("_", "-")
+    details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
+    yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
+    yield "trigger", "‖e_s‖ > max(β e^(−αt), ε)"
+    yield "β, α, ε", f"{trigger.beta:g}, {trigger.alpha_per_s:g} /s, {trigger.floor:g}"
+    yield "norm", "‖v‖₂" if trigger.weight is None else "‖W v‖₂, W in the scenario"
+    yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
+    yield "loss", f"{model} ({details})" if details else model
+    yield "start", network.initial_sync.replace("_", " ")
+    yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
+    yield "measurements", "every step" if every == 1 else f"every {every} steps"
+    yield (
+        "controller",
+        f"{scenario.controller.rate_hz:g} ticks/s, phase {scenario.controller.phase:g}",
+    )
+    yield "horizon", f"{scenario.horizon_s:g} s at speed {scenario.speed:g}"
+    x0 = np.array(scenario.plant.initial_state)
+    yield "‖x(0)‖", f"{np.linalg.norm(x0):.4g}, {len(x0)} states"
+    seeds = scenario.seeds
+    yield "seeds", f"plant {seeds.plant}, initial state {seeds.initial_state}, loss {seeds.loss}"
+
+
+def _claim(claim: Mapping[str, Any]) -> dict[str, str]:
+    texts = {key: _text(claim, key) for key in ("what", "source", "bound", "verdict", "why")}
+    numbers = {key: _shown(claim.get(key)) for key in ("certified", "observed", "ratio")}
+    since_s = claim.get("since_s")
+    return texts | numbers | {"since": "" if since_s is None else f"t = {_shown(since_s)} s"}
+
+
+def _text(mapping: Mapping[str, Any], key: str) -> str:
+    value = mapping.get(key)
+    return "" if value is None else str(value)
+
+
+def _timing(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
+    if summary.get("kind") == "simulated":
+        return
+    for role, late in (summary.get("lateness_us") or {}).items():
+        counts = [str(late["steps"]), str(late["late_steps"])]
+        yield f"{role} lateness", [*(_whole(late[key]) for key in _QUANTILES), *counts]
+    latency = summary.get("latency_us")
+    if latency:
+        quantiles = [_whole(latency[key]) for key in _QUANTILES]
+        yield "event → update", [*quantiles, str(latency["updates"]), ""]
+
+
+def _started(environment: Mapping[str, Any]) -> str:
+    started = environment.get("started")
+    return f"started {started}" if started else ""
+
+
+def _objects(value: Any) -> list[dict[str, Any]]:
+    return [entry for entry in value if isinstance(entry, dict)] if isinstance(value, list) else []
+
+
+def _are_records(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(e, dict) for e in value)
+
+
+def _words(key: str) -> str:
+    return str(key).replace("_", " ")
+
+
+def _whole(value: float | None) -> str:
+    return _NONE if value is None else f"{value:.0f}"
+
+
+def _line(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, list) else _shown(value)
+
+
+def _shown(value: Any) -> str:
+    """A value of JSON as a person reads it."""
+    if value is None:
+        return _NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{_words(key)} {_shown(entry)}" for key, entry in value.items())
+    return str(value)

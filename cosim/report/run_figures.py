@@ -1,0 +1,183 @@
+"""The figures of one run, drawn from its record."""
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cosim.join import Joined, join_all
+from cosim.record import RunRecord, updates_in
+from cosim.report import figures
+from cosim.report.axes import Curve
+from cosim.report.decimate import Reals
+from cosim.summary import latency_us, lateness_us
+from noack.clock import NS_PER_S
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+)
+from noack.topology import LOOP_ROLES
+
+Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals]
+"""A certified bound: label, what it bounds, times in s (k,), values (k,)."""
+
+
+class Picture(NamedTuple):
+    """A figure and what is said about it."""
+
+    name: str
+    figure: Figure
+    caption: str
+    description: str
+    """What it shows, for those who cannot see it."""
+
+
+def run_figures(
+    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
+) -> Iterator[Picture]:
+    """Draw the figures of a run.
+
+    Args:
+        record: the run's record, of any length, none included.
+        envelopes: certified bounds to be drawn beside what they bound.
+        timed: whether the processes' lateness means anything; in virtual time it does not.
+    """
+    with np.errstate(all="ignore"):  # a run that diverged has figures, too
+        joined = join_all(record)
+    yield _states(record, joined)
+    yield from _norms(record, joined, _bounding(envelopes, "e_c"), _bounding(envelopes, "x"))
+    yield _input(record)
+    yield _inter_event(record, _bounding(envelopes, "inter_event"))
+    if timed:
+        yield _lateness(record)
+        yield _latency(record)
+
+
+def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Curve]:
+    return [(label, t_s, values) for label, what, t_s, values in envelopes if what == quantity]
+
+
+def _states(record: RunRecord, joined: Joined) -> Picture:
+    packets, sequence, _ = updates_in(record[NETEM_PACKET])
+    measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
+    events = measurements[measurements["event"] != NO_SEQUENCE]
+    dropped = np.isin(events["event"], sequence[packets["fate"] == Fate.DROPPED])
+    forced = np.isin(deliveries["sequence"], sequence[packets["fate"] == Fate.FORCED])
+    scenario, names = record.scenario, record.loop.state_names
+    figure = figures.paper_figure(
+        mode=scenario.mode,
+        t_s=_seconds(joined.t_ns),
+        x=joined.x,
+        x_s=joined.x_s,
+        x_c=joined.x_c,
+        state_names=names,
+        broadcast_s=_seconds(events["t_ns"]),
+        dropped=dropped,
+        received_s=_seconds(deliveries["t_ns"]),
+        forced=forced,
+        title=scenario.name,
+    )
+    return Picture(
+        "states",
+        figure,
+        "States, and the time between broadcasts and between receptions. At every event x_s jumps "
+        "to x; x_c does so only when the packet survives. A cross is a packet that was lost, a "
+        "diamond one that only the bound on successive drops let through.",
+        f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
+        f"{len(events)} broadcasts, of which {int(dropped.sum())} were dropped, and for "
+        f"{len(deliveries)} receptions, of which {int(forced.sum())} were forced.",
+    )
+
+
+def _norms(
+    record: RunRecord, joined: Joined, e_c_bounds: list[Curve], x_bounds: list[Curve]
+) -> Iterator[Picture]:
+    t_s = _seconds(joined.t_ns)
+    yield Picture(
+        "errors",
+        figures.error_figure(t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, e_c_bounds),
+        "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset whenever it passes the threshold. The "
+        "controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, leaves it "
+        "while packets are lost." + _dashed(e_c_bounds),
+        "Error norms over time on a logarithmic axis: "
+        f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
+    )
+    steps = record[PLANT_STEP]
+    x, weight = steps["x"], record.loop.weight
+    with np.errstate(all="ignore"):
+        x_norm = np.linalg.norm(x if weight is None else x @ weight.T, axis=1)
+    yield Picture(
+        "state-norm",
+        figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, x_bounds),
+        "Norm of the plant's state." + _dashed(x_bounds),
+        "Norm of the state over time on a logarithmic axis"
+        + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
+    )
+
+
+def _input(record: RunRecord) -> Picture:
+    steps, names = record[CONTROLLER_STEP], record.loop.input_names
+    return Picture(
+        "input",
+        figures.input_figure(_seconds(steps["t_ns"]), steps["u"], names),
+        "Control input u = K x_c, held from one tick of the controller to the next. Inputs that "
+        "coincide are drawn inside each other.",
+        f"Control inputs {', '.join(names)} over time.",
+    )
+
+
+def _inter_event(record: RunRecord, lower_bounds: list[Curve]) -> Picture:
+    measurements = record[SENSOR_MEASUREMENT]
+    event_s = _seconds(measurements["t_ns"][measurements["event"] != NO_SEQUENCE])
+    return Picture(
+        "inter-event",
+        figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
+        "Time between successive transmissions, over time and as a histogram."
+        + _dashed(lower_bounds),
+        "Inter-event times on a logarithmic axis"
+        + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
+    )
+
+
+def _lateness(record: RunRecord) -> Picture:
+    scenario = record.scenario
+    period_us = scenario.plant_period_ns / (1e3 * scenario.speed)
+    late_us = {role: lateness_us(record, role) for role in LOOP_ROLES}
+    longest = ", ".join(f"{role} {_largest(late)} µs" for role, late in late_us.items())
+    return Picture(
+        "lateness",
+        figures.lateness_figure(late_us, period_us),
+        "Share of its steps in which a process acted at least so late. Plant and controller count "
+        "from their own deadlines, the sensor from the measurement's grid time, the network from "
+        "the event's.",
+        f"Complementary distribution of lateness on logarithmic axes; the latest: {longest}.",
+    )
+
+
+def _latency(record: RunRecord) -> Picture:
+    event_ns, taken_us = latency_us(record)
+    return Picture(
+        "latency",
+        figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
+        "Wall time from the sensor's event to the controller's update, one way.",
+        f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
+    )
+
+
+def _dashed(curves: Sequence[Curve]) -> str:
+    return " Dashed: the bounds that are claimed." if curves else ""
+
+
+def _largest(values: Reals) -> str:
+    values = values[np.isfinite(values)]
+    return f"{values.max():.3g}" if len(values) else "unknown"
+
+
+def _seconds(t_ns: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Reals:
+    return np.asarray(t_ns / NS_PER_S, dtype=np.float64)

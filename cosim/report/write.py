@@ -1,0 +1,62 @@
+"""Writes ``report.html`` into a run directory."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from cosim.record import RunRecord
+from cosim.report.page import Embedded, page
+from cosim.report.run_figures import Envelope, run_figures
+from cosim.report.save import inline
+from cosim.run_dir import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE
+from noack.errors import MachineError
+
+
+def write_report(
+    record: RunRecord,
+    summary: Mapping[str, Any],
+    run_dir: Path,
+    envelopes: Sequence[Envelope] = (),
+) -> Path:
+    """Write the report of a run, or write it anew.
+
+    Args:
+        record: the run's record.
+        summary: the run's summary.
+        run_dir: the run's directory.
+        envelopes: certified bounds to be drawn beside what they bound.
+
+    Returns:
+        The report's path.
+
+    Raises:
+        MachineError: it cannot be written.
+    """
+    timed = summary.get("kind") != "simulated"
+    figures = [
+        Embedded(
+            found.name, Markup(inline(found.figure, found.name, found.description)), found.caption
+        )
+        for found in run_figures(record, envelopes, timed=timed)
+    ]
+    path = run_dir / REPORT_FILE
+    scratch = path.with_suffix(".partial")
+    try:
+        scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
+        html = page(record.scenario, summary, figures, scenario_toml, _environment(run_dir))
+        scratch.write_text(html, encoding="utf-8")
+        scratch.replace(path)
+    except OSError as error:
+        raise MachineError(f"{path}: the report cannot be written: {error}") from None
+    return path
+
+
+def _environment(run_dir: Path) -> dict[str, Any]:
+    try:
+        said = json.loads((run_dir / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return said if isinstance(said, dict) else {}
