@@ -4,8 +4,10 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
+
+from cosim.claims.evaluate import as_json, claims_of
 from cosim.fidelity import fidelity_for_summary
 from cosim.launch import Ending
 from cosim.record import RunRecord, finish_record, load_record
@@ -37,12 +39,11 @@ def conclude(ending: Ending) -> Outcome:
         else:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
-        summary["replay"] = summary["fidelity"] = None
+        summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
         (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
-        if record.kind == "live":  # written once more, so that no replay can cost a summary
-            summary["replay"] = _replay(record)
-            summary["fidelity"] = fidelity_for_summary(record)
-            (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+        # Written once more, so that nothing that is found out afterwards can cost a summary.
+        summary |= _found_out(record)
+        (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
         try:
             _report(record, summary, run_dir)
         except Exception as error:  # whatever it is: a run is none the worse for it
@@ -52,11 +53,22 @@ def conclude(ending: Ending) -> Outcome:
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
 
-def _replay(record: RunRecord) -> dict[str, Any]:
+def _found_out(record: RunRecord) -> Summary:
+    """What needs more than the record's own numbers; a failure of it is a line in the summary."""
+    found: Summary = {}
+    if record.kind == "live":
+        try:
+            found["replay"] = replay(record).verdict()
+        except Exception as error:  # whatever it is, the run itself went as it went
+            found["replay"] = {"bit_exact": None, "error": repr(error)}
+        found["fidelity"] = fidelity_for_summary(record)
     try:
-        return replay(record).verdict()
-    except Exception as error:  # whatever it is, the run itself went as it went
-        return {"bit_exact": None, "error": repr(error)}
+        with np.errstate(all="ignore"):
+            claims = claims_of(record)
+            found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+    except Exception as error:  # likewise
+        print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+    return found
 
 
 def reopen(run_dir: Path) -> Outcome:
@@ -91,7 +103,12 @@ def report_anew(run_dir: Path) -> Path:
 def _report(record: RunRecord, summary: Summary, run_dir: Path) -> Path:
     from cosim.report.write import write_report  # imports matplotlib, which no process needs sooner
 
-    return write_report(record, summary, run_dir)
+    try:
+        with np.errstate(all="ignore"):
+            envelopes = claims_of(record).envelopes()
+    except Exception:  # the page is worth having without them
+        envelopes = []
+    return write_report(record, summary, run_dir, envelopes)
 
 
 def _read_summary(run_dir: Path) -> Summary | None:

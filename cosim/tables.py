@@ -26,6 +26,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         console.print(_timing_table(summary))
         _print_realtime(console, summary["realtime"])
     print_assumptions(console, summary["assumptions"])
+    print_claims(console, summary)
     for violation in summary["assumption_violations"]:
         console.print(
             f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
@@ -83,6 +84,31 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
+
+
+def print_claims(console: Console, summary: Summary) -> None:
+    """Print what was claimed of a run, and what became of it."""
+    claims = summary.get("claims")
+    if not claims:
+        return
+    table = Table(title="claims, and what this run says of them")
+    for heading in ("source", "claim", "used", "verdict"):
+        table.add_column(heading, justify="right" if heading == "used" else "left")
+    for claim in claims:
+        used = "-" if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %"
+        since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
+        colour = _CLAIM_COLOURS[claim["verdict"]]
+        table.add_row(
+            *(escape(claim[key]) for key in ("source", "bound")),
+            used,
+            f"[{colour}]{claim['verdict']}{since}[/]",
+        )
+    console.print(table)
+    for why in dict.fromkeys(c["why"] for c in claims if c["verdict"] != "held" and c["why"]):
+        console.print(f"not held: {why}", highlight=False, markup=False)
+
+
+_CLAIM_COLOURS = {"held": "green", "violated": "bold red", "void": "yellow"}
 
 
 def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:

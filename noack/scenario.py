@@ -242,6 +242,13 @@ class Network(Section):
     flow. known_state: sensor and controller start from x(0)."""
 
 
+class Certificate(Section):
+    """What the certificates of a run allow for, beyond the run's own schedule."""
+
+    late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
+    """Updates and inputs may be late by so many steps of the plant."""
+
+
 class Seeds(Section):
     """Seeds of the named random streams; they are independent of each other."""
 
@@ -312,6 +319,7 @@ class Scenario(Section):
     trigger: DecayingTrigger
     network: Network
     controller: Controller = Controller()
+    certificate: Certificate = Certificate()
     seeds: Seeds = Seeds()
     ports: Ports = Ports()
     realtime: Realtime = Realtime()

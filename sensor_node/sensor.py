@@ -11,7 +11,7 @@ from noack.machine import Output, Record
 from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.decaying import DecayingTrigger, trigger_of
 from noack.wire import Flow, Message
 
 
@@ -77,11 +77,11 @@ class Sensor:
 
 def sensor_of(resolved: Scenario) -> Sensor:
     """Return the sensor of a resolved scenario; of the plant it learns x(0) at the most."""
-    loop, trigger = loop_of(resolved), resolved.trigger
+    loop = loop_of(resolved)
     known = resolved.network.initial_sync == "known_state"
     return Sensor(
         loop.H,
-        DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, loop.weight),
+        trigger_of(resolved),
         loop.x0 if known else None,
         period_ns=resolved.plant_period_ns * resolved.plant.measure_every,
     )

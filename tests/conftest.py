@@ -1,6 +1,10 @@
-"""What all tests share: Hypothesis without wall time or chance, and a small scenario."""
+"""What all tests share: one thread, Hypothesis without wall time or chance, a small scenario."""
 
+import os
 from typing import Any
+
+# Before numpy is imported: threads only get into each other's way with small matrices.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import pytest
 from hypothesis import HealthCheck, settings

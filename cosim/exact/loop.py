@@ -34,7 +34,7 @@ from noack.errors import CallerError
 from noack.linear import Matrix, Vector
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.decaying import DecayingTrigger, trigger_of
 
 _LARGEST = 1e100
 """Beyond, a state is said to have diverged: squares and ratios must stay finite."""
@@ -190,10 +190,7 @@ def reset(state: LoopState, delivered: bool) -> LoopState:
 
 def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     """Return the exact loop of a resolved scenario."""
-    loop, trigger = loop_of(resolved), resolved.trigger
-    return ContinuousLoop(
-        loop, DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, loop.weight)
-    )
+    return ContinuousLoop(loop_of(resolved), trigger_of(resolved))
 
 
 class _Watch:

@@ -25,6 +25,7 @@ from noack.theory.certificate import (
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
+OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
 _SCHEDULE_STEPS = 100_000
 
@@ -51,6 +52,11 @@ class Certificate:
     """From ``floor_from_s`` on, with ε in the place of βe^{−αt} and no decay."""
     void: str | None
     """Why there is no certificate."""
+
+    @property
+    def source(self) -> str:
+        """What to call it beside a claim."""
+        return "certificate" if self.scope == OWN_PLANT else "box certificate"
 
     @property
     def floor_from_s(self) -> float:
@@ -145,7 +151,7 @@ def certify(resolved: Scenario, conditions: Conditions) -> Certificate:
     def plant(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
         return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
 
-    return _certify("the scenario's plant", resolved, loop, conditions, closed, plant)
+    return _certify(OWN_PLANT, resolved, loop, conditions, closed, plant)
 
 
 def certify_box(resolved: Scenario, conditions: Conditions) -> Certificate | None:

@@ -6,6 +6,8 @@ with r the last event whose packet the controller has, q the last event. It exte
 eq:LossEv2 to every drop pattern: x_s jumped by −e_s(t_k⁻) at each event; x_c missed those jumps.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from noack.linear import Matrix, Propagator, Vector
@@ -19,14 +21,14 @@ class MissedJumps:
     """
 
     def __init__(self, H: Matrix) -> None:
-        self._propagate = Propagator(H)
+        self.propagate = Propagator(H)
         self._jumps: dict[int, tuple[int, Vector]] = {}
         self._t_ns = 0
         self._total = np.zeros(H.shape[0])
 
     def advance_to(self, t_ns: int) -> None:
         """Propagate the sum of the missed jumps to time ``t_ns``."""
-        self._total = self._propagate(self._total, t_ns - self._t_ns)
+        self._total = self.propagate(self._total, t_ns - self._t_ns)
         self._t_ns = t_ns
 
     def event(self, sequence: int, e_s: Vector) -> None:
@@ -39,8 +41,12 @@ class MissedJumps:
         if self._jumps and next(iter(self._jumps)) <= sequence:  # numbered in order
             self._jumps = {k: jump for k, jump in self._jumps.items() if k > sequence}
             # Anew rather than by subtraction, so that no rounding outlives a delivery.
-            terms = [self._propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
+            terms = [self.propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
             self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
+
+    def jumps(self) -> Iterable[tuple[int, Vector]]:
+        """The missed jumps: when, and e_s(t_k⁻), shape (n,)."""
+        return self._jumps.values()
 
     def total(self) -> Vector:
         """Σ of the missed jumps at the present time, shape (n,)."""

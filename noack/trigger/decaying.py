@@ -9,6 +9,8 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 import math
 
 from noack.linear import Matrix, Vector, norm
+from noack.resolve import loop_of
+from noack.scenario import Scenario
 
 
 class DecayingTrigger:
@@ -36,3 +38,11 @@ class DecayingTrigger:
     def error_norm(self, e_s: Vector) -> float:
         """‖e_s‖_W of a sensor error of shape (n,)."""
         return norm(e_s if self.weight is None else self.weight @ e_s)
+
+
+def trigger_of(resolved: Scenario) -> DecayingTrigger:
+    """Return the trigger of a resolved scenario."""
+    trigger = resolved.trigger
+    return DecayingTrigger(
+        trigger.beta, trigger.alpha_per_s, trigger.floor, loop_of(resolved).weight
+    )

@@ -131,7 +131,7 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
     "no mismatch": (with_gains(ErrorGains, NoMismatch), {"mismatch": 0.5, "beta": 0.01}),
     "only the first moment": (
         with_gains(OnlyTheFirstMoment, PlantGains),
-        {"spread": 3.0, "mansd": 3, "alpha_share": 0.8, **INSTANT},
+        {"spread": 10.0, "n": 5, "mansd": 2, "alpha_share": 0.8, **INSTANT},
     ),
     "only the newest missing event": (
         with_gains(OnlyTheNewest, PlantGains), {"mansd": 6, **INSTANT},

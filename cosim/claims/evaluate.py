@@ -1,0 +1,300 @@
+"""Holds every claim about a run against its record."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.claims.observed import observe
+from cosim.claims.theorem_one import theorem_one
+from cosim.join import Joined, identity_residual, join_all
+from cosim.record import RunRecord
+from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.scenario import Scenario
+from noack.theory.certify import (
+    Certificate,
+    certify,
+    certify_box,
+    ideal_conditions,
+    nominal_conditions,
+)
+from noack.theory.monitor import ErrorMonitor
+from noack.theory.printed import Theorem2, theorem_2
+from noack.trigger.decaying import trigger_of
+
+Reals = NDArray[np.float64]
+
+# What an exact computation may miss by rounding: the record holds 20 s in 10,000 steps.
+_ROUNDING = 1e-9
+_IDENTITY = 1e-9
+
+
+class ClaimVerdict(StrEnum):
+    """What the run says of a claim."""
+
+    HELD = "held"
+    VIOLATED = "violated"
+    VOID = "void"
+    """The run left the conditions of the claim before it could be judged to the end."""
+
+
+class Claim(NamedTuple):
+    """One claim about a run and what became of it."""
+
+    what: str
+    source: str
+    bound: str
+    """The claim as a formula with its numbers."""
+    certified: float | None
+    """The claimed constant."""
+    observed: float | None
+    """What it would have had to be for this run."""
+    ratio: float | None
+    """Observed over certified for upper bounds, certified over observed for lower ones: how much
+    of the bound was used; at most 1 where it held."""
+    verdict: ClaimVerdict
+    since_s: float | None
+    """Since when it was violated, or void."""
+    why: str
+
+
+class Envelope(NamedTuple):
+    """A certified curve beside a measured one."""
+
+    label: str
+    quantity: Literal["e_c", "x", "inter_event"]
+    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖."""
+    t_s: Reals
+    values: Reals
+
+
+@dataclass(frozen=True)
+class Claims:
+    """The claims about one run.
+
+    Args:
+        record: the run's record.
+        joined: its samples.
+    """
+
+    record: RunRecord
+    joined: Joined
+
+    @cached_property
+    def certificates(self) -> list[Certificate]:
+        """The certificates of the run's scenario under its schedule."""
+        return scheduled_certificates(self.record.scenario)
+
+    @cached_property
+    def conditions(self) -> dict[str, float | None]:
+        """Largest observed value of each condition."""
+        return observe(self.record).summary()
+
+    def judge(self) -> list[Claim]:
+        """Every claim with its verdict."""
+        if not len(self.joined.t_ns) or not self._in_common.any():
+            return []
+        return [*self._identity(), *self._printed(), *self._certified()]
+
+    def envelopes(self) -> list[Envelope]:
+        """The certified curves, at the measurements."""
+        t_s = self._t_s
+        found = [Envelope("bound from (I1)", "e_c", t_s, self._bounds[0])]
+        for certificate in self.certificates:
+            if certificate.constants is not None:
+                label = f"certified for {certificate.scope}"
+                found.append(Envelope(label, "e_c", t_s, certificate.controller_error(t_s)))
+                found.append(Envelope(label, "x", t_s, certificate.state(t_s)))
+        if (theorem := self._theorem_2) is not None:
+            alpha = self.record.scenario.trigger.alpha_per_s
+            found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, theorem.state(t_s, alpha)))
+        return found
+
+    @cached_property
+    def _t_s(self) -> Reals:
+        return np.asarray(self.joined.t_ns * 1e-9)
+
+    @cached_property
+    def _in_common(self) -> NDArray[np.bool_]:
+        """Where sensor and controller have something in common: from the first delivery on."""
+        known = self.record.scenario.network.initial_sync == "known_state"
+        common = known | (self.joined.received != NO_SEQUENCE)
+        return np.asarray(np.isfinite(self.joined.e_c_norm) & common)
+
+    @cached_property
+    def _bounds(self) -> tuple[Reals, Reals]:
+        """The identity's and the printed bound of ‖e_c‖_W, (k,) each; NaN before the start."""
+        monitor = ErrorMonitor(self.record.loop.H, trigger_of(self.record.scenario))
+        rows = self.record[SENSOR_MEASUREMENT]
+        found = np.array(
+            [
+                monitor.sample(int(t_ns), e_s, int(event), int(received))
+                for t_ns, e_s, event, received in zip(
+                    rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], self.joined.received,
+                    strict=True,
+                )
+            ]
+        ).reshape(-1, 2)  # fmt: skip
+        found[~self._in_common] = np.nan
+        return found[:, 0], found[:, 1]
+
+    @cached_property
+    def _theorem_2(self) -> Theorem2 | None:
+        """With the uniform Δ of (I1) under the paper's conditions, which Theorem 1 lacks."""
+        scenario = self.record.scenario
+        ideal = certify(scenario, ideal_conditions(scenario)).constants
+        if ideal is None or ideal.rate_per_s != scenario.trigger.alpha_per_s:
+            return None
+        if self.record.loop.weight is not None or scenario.trigger.floor > 0:
+            return None
+        return theorem_2(
+            self.record.loop, scenario.trigger.beta, scenario.trigger.alpha_per_s, ideal.delta
+        )
+
+    @cached_property
+    def _inter_event_s(self) -> tuple[Reals, Reals]:
+        """Times of the events from the second on, and since the one before."""
+        rows = self.record[SENSOR_MEASUREMENT]
+        event_s = rows["t_ns"][rows["event"] != NO_SEQUENCE] * 1e-9
+        return event_s[1:], np.diff(event_s)
+
+    def _identity(self) -> Iterator[Claim]:
+        residual = identity_residual(self.record, self.joined)[self._in_common]
+        scale = max(float(np.abs(self.joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
+        yield _upper(
+            "the models differ by what was missed", "(I1)",
+            "‖x_c − x_s − Σ e^(H(t−t_k)) e_s(t_k)‖ ≤ {:.3g} max‖x_s‖", _IDENTITY,
+            self._t_s[self._in_common], residual / (_IDENTITY * scale), None, "",
+        )  # fmt: skip
+        yield self._controller_error(
+            "the controller's error is at most what was missed", "(I1)",
+            "‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖", None, self._bounds[0], None, "",
+        )  # fmt: skip
+
+    def _printed(self) -> Iterator[Claim]:
+        ideal = "assumes a trigger that watches always and a network and an input without delay"
+        yield self._controller_error(
+            "the paper's bound, line by line", "eq:LossEv3",
+            "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1], None, ideal,
+        )  # fmt: skip
+        trigger = self.record.scenario.trigger
+        delta = theorem_one(self.record, self.joined)
+        if delta is not None and trigger.floor == 0:
+            name = "Theorem 1" if self.record.loop.H.any() else "Theorem 3"
+            level = trigger.beta * np.exp(-trigger.alpha_per_s * self._t_s)
+            yield self._controller_error(
+                "the controller's error decays", f"{name}, Δ from this run's trajectory",
+                "‖e_c‖ ≤ {:.4g} βe^(−αt)", delta, delta * level, None, ideal,
+            )  # fmt: skip
+        if (theorem := self._theorem_2) is not None:
+            bound = theorem.state(self._t_s, trigger.alpha_per_s)
+            yield self._state("Theorem 2, eq:normXt", "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))",
+                              None, bound, None, ideal)  # fmt: skip
+            yield self._spacing("Theorem 2, eq:tau", theorem.inter_event_s, None, ideal)
+
+    def _certified(self) -> Iterator[Claim]:
+        for certificate in self.certificates:
+            if certificate.constants is None:
+                yield Claim(
+                    f"a certificate for {certificate.scope}", certificate.source, "none", None, None, None,
+                    ClaimVerdict.VOID, 0.0, certificate.void or "",
+                )  # fmt: skip
+                continue
+            left = observe(self.record).left(certificate.conditions)
+            constants, t_s, source = certificate.constants, self._t_s, certificate.source
+            rate = f"e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
+            suffix = "" if certificate.floor_constants is None else ", and the floor's share"
+            yield _upper(
+                "the sensor's error follows its threshold", source,
+                f"‖e_s‖ ≤ {{:.4g}} β{rate}{suffix}", constants.overshoot,
+                t_s, self.joined.e_s_norm / certificate.sensor_error(t_s), left, "",
+            )  # fmt: skip
+            yield self._controller_error(
+                "the controller's error is bounded", source,
+                f"‖e_c‖ ≤ {{:.4g}} β{rate}{suffix}", constants.delta,
+                certificate.controller_error(t_s), left, "",
+            )  # fmt: skip
+            yield self._state(
+                source, f"‖x‖ ≤ {{:.4g}} {rate}{suffix}", constants.state,
+                certificate.state(t_s), left, "",
+            )  # fmt: skip
+            if certificate.inter_event_s is not None:
+                yield self._spacing(source, certificate.inter_event_s, left, "")
+
+    def _controller_error(
+        self, what: str, source: str, bound: str, certified: float | None, values: Reals,
+        left: tuple[float, str] | None, why: str,
+    ) -> Claim:  # fmt: skip
+        here = self._in_common
+        # Rounding of x itself, where a bound is as small as that.
+        slack = _ROUNDING * np.linalg.norm(self.joined.x[here], axis=1)
+        shares = self.joined.e_c_norm[here] / (values[here] + slack)
+        return _upper(what, source, bound, certified, self._t_s[here], shares, left, why)
+
+    def _state(
+        self, source: str, bound: str, certified: float | None, values: Reals,
+        left: tuple[float, str] | None, why: str,
+    ) -> Claim:  # fmt: skip
+        shares = np.linalg.norm(self.joined.x, axis=1) / values
+        what = "the state is bounded and decays" if "e^" in bound else "the state is bounded"
+        return _upper(what, source, bound, certified, self._t_s, shares, left, why)
+
+    def _spacing(
+        self, source: str, certified_s: float, left: tuple[float, str] | None, why: str
+    ) -> Claim:
+        t_s, passed_s = self._inter_event_s
+        claim = _upper(
+            "events keep their distance", source, "t_(i+1) − t_i ≥ {:.4g} s", certified_s,
+            t_s, certified_s / passed_s, left, why,
+        )  # fmt: skip
+        ratio = claim.ratio
+        return claim._replace(observed=certified_s / ratio if ratio else None)
+
+
+def _upper(
+    what: str, source: str, bound: str, certified: float | None, t_s: Reals, shares: Reals,
+    left: tuple[float, str] | None, why: str,
+) -> Claim:  # fmt: skip
+    """Judge a bound from the share of it that was used, (k,), at times (k,)."""
+    text = bound.format(certified) if certified is not None else bound
+    until_s = math.inf if left is None else left[0]
+    judged = shares[t_s < until_s]
+    beyond = np.flatnonzero(~(judged <= 1 + _ROUNDING))
+    ratio = float(judged.max()) if len(judged) else None
+    if len(beyond):
+        verdict, since_s = ClaimVerdict.VIOLATED, float(t_s[beyond[0]])
+    elif left is not None:
+        verdict, since_s = ClaimVerdict.VOID, until_s
+        why = "; ".join(filter(None, [why, left[1]]))
+    else:
+        verdict, since_s = ClaimVerdict.HELD, None
+    observed = None if certified is None or ratio is None else certified * ratio
+    return Claim(what, source, text, certified, observed, ratio, verdict, since_s, why)
+
+
+def scheduled_certificates(scenario: Scenario) -> list[Certificate]:
+    """The certificates of a resolved scenario under its own schedule, with its allowance."""
+    conditions = nominal_conditions(scenario, scenario.certificate.late_periods)
+    found = [certify(scenario, conditions), certify_box(scenario, conditions)]
+    return [certificate for certificate in found if certificate is not None]
+
+
+def claims_of(record: RunRecord, joined: Joined | None = None) -> Claims:
+    """The claims about a run."""
+    return Claims(record, join_all(record) if joined is None else joined)
+
+
+def as_json(claims: Sequence[Claim]) -> list[dict[str, Any]]:
+    """As ``summary.json`` has it; what is not finite becomes null."""
+    return [{key: _plain(value) for key, value in claim._asdict().items()} for claim in claims]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    return str(value) if isinstance(value, StrEnum) else value

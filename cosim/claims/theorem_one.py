@@ -1,0 +1,67 @@
+"""Theorem 1's own Δ (eq:Normec), which exists after a run only: from its recorded trajectory."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.join import Joined
+from cosim.record import RunRecord
+from noack.linear import Propagator, spectral_abscissa
+from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.theory.printed import Interval, longest_interval_s, theorem_1
+
+Indices = NDArray[np.int64]
+
+
+def theorem_one(record: RunRecord, joined: Joined) -> float | None:
+    """The largest Δ over all stretches between two deliveries; None if there is none to be had.
+
+    Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this.
+    """
+    loop, trigger = record.loop, record.scenario.trigger
+    if loop.weight is not None:
+        return None
+    event = record[SENSOR_MEASUREMENT]["event"]
+    starts = np.flatnonzero(event != NO_SEQUENCE)
+    if not len(starts):
+        return None
+    longest_s = [
+        longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, _decay(record))
+        for interval in _intervals(record, joined, starts)
+    ]
+    delta = 1.0
+    stretch: list[float] = []
+    for index, start in enumerate(starts):
+        if joined.received[start] >= event[start]:
+            stretch = []  # this event was delivered: a new stretch begins
+        elif joined.received[start] != NO_SEQUENCE:
+            stretch.append(longest_s[index])
+            delta = max(delta, theorem_1(loop.H, trigger.alpha_per_s, stretch))
+    return delta if math.isfinite(delta) else None
+
+
+def _decay(record: RunRecord) -> float:
+    """κ, a rate at which the model decays: α where it can."""
+    H = record.loop.H
+    if not H.any():
+        return 0.0
+    return min(record.scenario.trigger.alpha_per_s, max(-spectral_abscissa(H), 0.0))
+
+
+def _intervals(record: RunRecord, joined: Joined, starts: Indices) -> list[Interval]:
+    """Between every event and the next."""
+    propagate = Propagator(record.loop.H)
+    found = []
+    for first, end in zip(starts, [*starts[1:], len(joined.t_ns) - 1], strict=True):
+        index = np.arange(first, end + 1)
+        ages_ns = joined.t_ns[index] - joined.t_ns[first]
+        model = [propagate(joined.x[first], int(age_ns)) for age_ns in ages_ns]
+        found.append(
+            Interval(
+                np.asarray(joined.t_ns[index] * 1e-9),
+                np.linalg.norm(joined.x[index], axis=1),
+                np.linalg.norm(np.array(model), axis=1),
+            )
+        )
+    return found
