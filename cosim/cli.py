@@ -33,6 +33,7 @@ app = typer.Typer(
 )
 
 _RUNS = "Runs"
+_THEORY = "Theory"
 _PROCESSES = "One process each, for a person with five terminals"
 _FILES = "Scenario files"
 
@@ -274,6 +275,40 @@ def report(
     else:
         print(path)
     return ExitStatus.OK
+
+
+@command(_THEORY)
+def certify(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    weight: Annotated[
+        str,
+        typer.Option(
+            help="The trigger's norm: `given` by the scenario, `identity`, or `chosen` here."
+        ),
+    ] = "given",
+    late: Annotated[
+        int | None,
+        typer.Option(help="Steps of the plant by which the schedule may be late.", min=0, max=1000),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Say what is guaranteed of a scenario, with which constants, under which conditions."""
+    from cosim.certify import print_study, study, with_weight
+    from cosim.progress import work_bar
+    from noack.resolve import resolve
+
+    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    allowed = resolved.certificate.late_periods if late is None else late
+    with work_bar("choosing the weight") as progress:
+        weighted, chosen = with_weight(resolved, weight, progress)
+    found = study(weighted, allowed, chosen)
+    if json:
+        _print_json(found.to_json())
+    else:
+        print_study(Console(), found)
+    certified = any(certificate.constants for _, certificate in found.certificates)
+    return ExitStatus.OK if certified else ExitStatus.FAILED
 
 
 @command(_PROCESSES)

@@ -59,6 +59,17 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
 
 
 @contextmanager
+def work_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """Show which share of some work is done while the context lasts, on a terminal only."""
+    console = PatientConsole(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn())
+    disabled = not console.is_terminal
+    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda share: progress.update(task, completed=share)
+
+
+@contextmanager
 def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int], None]]:
     """Show how far a simulation is while the context lasts, on a terminal only."""
     columns = (BarColumn(), TextColumn("{task.completed:.1f}/{task.total:g} s simulated"))

@@ -201,8 +201,8 @@ class Claims:
         for certificate in self.certificates:
             if certificate.constants is None:
                 yield Claim(
-                    f"a certificate for {certificate.scope}", certificate.source, "none", None, None, None,
-                    ClaimVerdict.VOID, 0.0, certificate.void or "",
+                    f"a certificate for {certificate.scope}", certificate.source, "none",
+                    None, None, None, ClaimVerdict.VOID, 0.0, certificate.void or "",
                 )  # fmt: skip
                 continue
             left = observe(self.record).left(certificate.conditions)

@@ -9,7 +9,7 @@ import numpy as np
 
 from noack.clock import NS_PER_S
 from noack.linear import Matrix, spectral_abscissa
-from noack.resolve import Loop, loop_of
+from noack.resolve import loop_of
 from noack.scenario import Scenario
 from noack.theory.assumptions import Assumption, Verdict
 from noack.theory.box import BoxGains
@@ -28,6 +28,11 @@ from noack.theory.gains import ErrorGains, PlantGains, error_gains
 OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
 _SCHEDULE_STEPS = 100_000
+
+_RESOLUTION = 1e-3
+
+Change = Callable[[Conditions, float], Conditions]
+"""Sets a time of the conditions."""
 
 PlantAt = Callable[[ErrorGains, Matrix, float], Plant]
 """A plant, given the models' side, where x starts, and α."""
@@ -145,104 +150,148 @@ def ideal_conditions(resolved: Scenario) -> Conditions:
 
 def certify(resolved: Scenario, conditions: Conditions) -> Certificate:
     """The certificate of a scenario's own plant."""
-    loop = loop_of(resolved)
-    closed = loop.A + loop.B @ loop.K
-
-    def plant(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
-        return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
-
-    return _certify(OWN_PLANT, resolved, loop, conditions, closed, plant)
+    return own_plant(resolved).certificate(conditions)
 
 
 def certify_box(resolved: Scenario, conditions: Conditions) -> Certificate | None:
     """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
+    scope = box(resolved)
+    return None if scope is None else scope.certificate(conditions)
+
+
+def own_plant(resolved: Scenario) -> "Scope":
+    """A scenario's own plant."""
+    loop = loop_of(resolved)
+
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
+
+    return Scope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at)
+
+
+def box(resolved: Scenario) -> "Scope | None":
+    """All plants in the scenario's uncertainty box; None if it has none."""
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
         return None
-    box_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
-    box_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
-    closed = loop.A_model + loop.B_model @ loop.K
+    half_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
+    half_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
 
-    def box(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
-        return BoxGains(error, loop.A_model, loop.B_model, box_A, box_B, start, alpha_per_s)
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return BoxGains(error, loop.A_model, loop.B_model, half_A, half_B, start, alpha_per_s)
 
-    return _certify("every plant of the uncertainty box", resolved, loop, conditions, closed, box)
-
-
-def _certify(
-    scope: str,
-    resolved: Scenario,
-    loop: Loop,
-    conditions: Conditions,
-    closed_loop: Matrix,
-    plant_at: PlantAt,
-) -> Certificate:
-    trigger = resolved.trigger
-    beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
-    decay = {
-        "the models": math.inf if not loop.H.any() else -spectral_abscissa(loop.H),
-        "A + BK": -spectral_abscissa(closed_loop),
-    }
-    held = not loop.H.any()
-    decays = not held and alpha < min(decay.values())
-    start = loop.x0[:, None]
-    first: Constants | None = None
-    late: Constants | None = None
-    void = None
-    try:
-        if decays and floor < beta:
-            first = _solve(loop, plant_at, start, conditions, alpha, Level(beta, beta))
-            if floor > 0:
-                late = _after_floor(loop, plant_at, conditions, resolved, first)
-        else:
-            slower = 0.0 if held or floor > 0 else _SLOWER * min(decay.values())
-            level = Level(max(beta, floor), floor or None)
-            first = _solve(loop, plant_at, start, conditions, max(slower, 0.0), level)
-    except (NotDecayingError, VoidError) as error:
-        first = late = None
-        void = str(error)
-    return Certificate(
-        scope, beta, alpha, floor, loop.weight is not None, conditions,
-        tuple(_assumptions(resolved, conditions, decay, held, first, void)),
-        first, late, void,
-    )  # fmt: skip
+    closed_loop = loop.A_model + loop.B_model @ loop.K
+    return Scope("every plant of the uncertainty box", resolved, closed_loop, plant_at)
 
 
-def _solve(
-    loop: Loop,
-    plant_at: PlantAt,
-    start: Matrix,
-    conditions: Conditions,
-    alpha_per_s: float,
-    level: Level,
-) -> Constants:
-    error = error_gains(loop, alpha_per_s)
-    return solve(error, plant_at(error, start, alpha_per_s), conditions, level)
+class Scope:
+    """Plants for which certificates are made; what depends on no condition is computed once.
 
-
-def _after_floor(
-    loop: Loop, plant_at: PlantAt, conditions: Conditions, resolved: Scenario, first: Constants
-) -> Constants:
-    """Once the threshold is the floor: from whatever state the first phase leaves, without decay.
-
-    An event before then left at most βe^{−αt_k} = εe^{α(t_ε−t_k)}, so that Δ keeps α's kernels.
-    What the first phase leaves, left its mark up to one test or one inter-event time before.
+    Args:
+        name: of which plants.
+        resolved: the scenario.
+        closed_loop: A + BK, the box's centre for a box, (n, n).
+        plant_at: gives their gains.
     """
-    trigger = resolved.trigger
-    error = error_gains(loop, trigger.alpha_per_s)
-    share = trigger.floor / trigger.beta
-    start = share * first.state * np.eye(loop.n)
-    back_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
-    earlier = share * math.exp(trigger.alpha_per_s * back_s)
-    background = Background(earlier * first.mismatch, earlier * first.input_error)
-    found = solve(
-        error,
-        plant_at(error, start, 0.0),
-        conditions._replace(start_s=0.0),
-        Level(trigger.floor, trigger.floor),
-        background,
-    )
-    return found._replace(rate_per_s=0.0)
+
+    def __init__(
+        self, name: str, resolved: Scenario, closed_loop: Matrix, plant_at: PlantAt
+    ) -> None:
+        self.name = name
+        self._resolved = resolved
+        self._loop = loop_of(resolved)
+        self._held = not self._loop.H.any()
+        self._decay = {
+            "the models": math.inf if self._held else -spectral_abscissa(self._loop.H),
+            "A + BK": -spectral_abscissa(closed_loop),
+        }
+        self._plant_at = plant_at
+        self._errors: dict[float, ErrorGains] = {}
+        self._plants: dict[tuple[float, float, bytes], Plant] = {}
+
+    def certificate(self, conditions: Conditions) -> Certificate:
+        """The certificate under some conditions; a void one says why."""
+        trigger = self._resolved.trigger
+        first: Constants | None = None
+        late: Constants | None = None
+        void = None
+        try:
+            first = self._first_phase(conditions)
+            if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
+                late = self._after_floor(conditions, first)
+        except (NotDecayingError, VoidError) as error:
+            first, void = None, str(error)
+        assumptions = _assumptions(self._resolved, conditions, self._decay, self._held, first, void)
+        return Certificate(
+            self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
+            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+        )  # fmt: skip
+
+    def largest(self, conditions: Conditions, change: Change, most_s: float = 10.0) -> float:
+        """The largest time for which ``change`` of the conditions leaves a certificate.
+
+        ``most_s`` if there always is one, 0 if there never is.
+        """
+
+        def stands(value_s: float) -> bool:
+            return self.certificate(change(conditions, value_s)).constants is not None
+
+        if stands(most_s):
+            return most_s
+        low, high = 0.0, most_s
+        while high > 1e-6 and high - low > _RESOLUTION * high:
+            middle = math.sqrt(low * high) if low > 0 else high / 4
+            low, high = (middle, high) if stands(middle) else (low, middle)
+        return low
+
+    def _first_phase(self, conditions: Conditions) -> Constants:
+        trigger, decay = self._resolved.trigger, min(self._decay.values())
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        start = self._loop.x0[:, None]
+        if not self._held and alpha < decay and floor < beta:
+            return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+        # A slower decay, or none, is certified instead; then no threshold is there to be reached.
+        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
+        level = Level(max(beta, floor), floor or None)
+        return self._solve(conditions, slower, slower, start, level)
+
+    def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
+        """Once the threshold is the floor: from any state the first phase leaves, without decay.
+
+        An event before then left at most βe^{−αt_k} = εe^{α(t_ε−t_k)}, so that Δ keeps α's kernels.
+        What the first phase leaves, left its mark up to one test or one inter-event time before.
+        """
+        trigger = self._resolved.trigger
+        share = trigger.floor / trigger.beta
+        start = share * first.state * np.eye(self._loop.n)
+        back_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
+        earlier = share * math.exp(trigger.alpha_per_s * back_s)
+        found = self._solve(
+            conditions._replace(start_s=0.0),
+            trigger.alpha_per_s,
+            0.0,
+            start,
+            Level(trigger.floor, trigger.floor),
+            Background(earlier * first.mismatch, earlier * first.input_error),
+        )
+        return found._replace(rate_per_s=0.0)
+
+    def _solve(
+        self,
+        conditions: Conditions,
+        error_alpha_per_s: float,
+        plant_alpha_per_s: float,
+        start: Matrix,
+        level: Level,
+        background: Background | None = None,
+    ) -> Constants:
+        if error_alpha_per_s not in self._errors:
+            self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
+        error = self._errors[error_alpha_per_s]
+        key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
+        if key not in self._plants:
+            self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
+        return solve(error, self._plants[key], conditions, level, background or Background())
 
 
 def _assumptions(

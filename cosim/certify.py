@@ -1,0 +1,255 @@
+"""The certificates of a scenario, as a person or a program wants to see them."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from noack.errors import CallerError
+from noack.linear import Matrix
+from noack.resolve import loop_of
+from noack.scenario import Scenario
+from noack.theory.assumptions import Verdict, assumptions
+from noack.theory.certificate import Conditions
+from noack.theory.certify import (
+    Certificate,
+    Scope,
+    box,
+    ideal_conditions,
+    nominal_conditions,
+    own_plant,
+)
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.printed import Theorem2, theorem_2
+from noack.theory.weight import choose_weight
+
+_MOST_S = 10.0
+_COLOURS = {
+    Verdict.HOLDS: "green",
+    Verdict.VIOLATED: "yellow",
+    Verdict.NOT_NEEDED: "dim",
+    Verdict.PRESUPPOSED: "cyan",
+}
+
+
+class Limits(NamedTuple):
+    """How far the schedule could go before a certificate is lost, one thing at a time."""
+
+    sampling_s: float
+    delay_s: float
+    hold_s: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that is certified of a scenario.
+
+    Args:
+        resolved: the resolved scenario.
+        certificates: under the paper's conditions and under the schedule's.
+        limits: by scope.
+        theorem_2: the paper's bounds, with Δ from the ideal certificate.
+        weight: W, if the tool chose it.
+    """
+
+    resolved: Scenario
+    certificates: Sequence[tuple[str, Certificate]]
+    limits: dict[str, Limits]
+    theorem_2: Theorem2 | None
+    weight: Matrix | None
+
+    def to_json(self) -> dict[str, Any]:
+        """As one document."""
+        theorem = None if self.theorem_2 is None else self.theorem_2._asdict()
+        return {
+            "scenario": self.resolved.name,
+            "weight": None if self.weight is None else self.weight.tolist(),
+            "paper": {
+                "assumptions": [a._asdict() for a in assumptions(self.resolved)],
+                "theorem_2": theorem,
+            },
+            "certificates": [
+                {"under": under, **certificate.to_json()}
+                for under, certificate in self.certificates
+            ],
+            "limits": {scope: limits._asdict() for scope, limits in self.limits.items()},
+        }
+
+
+def with_weight(
+    resolved: Scenario, which: str, progress: Callable[[float], None] = lambda share: None
+) -> tuple[Scenario, Matrix | None]:
+    """The scenario with the weight that was asked for, and W if it had to be chosen.
+
+    Raises:
+        CallerError: there is no such choice, or none can be made for this scenario.
+    """
+    weight: Matrix | None = None
+    if which == "given":
+        return resolved, None
+    if which == "chosen":
+        trigger = resolved.trigger
+        try:
+            weight = choose_weight(
+                loop_of(resolved), trigger.beta, trigger.alpha_per_s, resolved.network.mansd,
+                progress,
+            )  # fmt: skip
+        except NotDecayingError as error:
+            raise CallerError(f"--weight chosen: {error}") from None
+    elif which != "identity":
+        raise CallerError(f'--weight: given, identity or chosen, not "{which}"')
+    rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
+    trigger = resolved.trigger.model_copy(update={"weight": rows})
+    return resolved.model_copy(update={"trigger": trigger}), weight
+
+
+def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -> Study:
+    """Certify a scenario under the paper's conditions and under its own schedule."""
+    ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
+    scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
+    certificates = [("the paper's conditions", scope.certificate(ideal)) for scope in scopes]
+    certificates += [("the schedule", scope.certificate(scheduled)) for scope in scopes]
+    limits = {scope.name: _limits(scope, scheduled) for scope in scopes}
+    first = certificates[0][1].constants
+    trigger = resolved.trigger
+    theorem = (
+        theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, first.delta)
+        if first is not None and first.rate_per_s == trigger.alpha_per_s and not trigger.floor
+        and trigger.weight is None
+        else None
+    )  # fmt: skip
+    return Study(resolved, certificates, limits, theorem, weight)
+
+
+def _limits(scope: Scope, scheduled: Conditions) -> Limits:
+    return Limits(
+        scope.largest(
+            scheduled, lambda c, value: c._replace(sampling_s=value, spacing_s=value), _MOST_S
+        ),
+        scope.largest(
+            scheduled, lambda c, value: c._replace(delay_s=value, start_s=value), _MOST_S
+        ),
+        scope.largest(scheduled, lambda c, value: c._replace(hold_s=value), _MOST_S),
+    )
+
+
+def print_study(console: Console, found: Study) -> None:
+    """Print the tables."""
+    _print_constants(console, found)
+    _print_limits(console, found)
+    console.print("assumptions of the certificates under the schedule:")
+    certificate = next(c for under, c in found.certificates if under == "the schedule")
+    _print_assumptions(console, [a._asdict() for a in certificate.assumptions])
+    console.print("assumptions of the paper's theorems:")
+    _print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
+    if found.weight is not None:
+        rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
+        console.print(
+            f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+
+
+def _print_constants(console: Console, found: Study) -> None:
+    trigger = found.resolved.trigger
+    norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
+    table = Table(
+        title=f"{found.resolved.name}: what is certified, M = {found.resolved.network.mansd + 1}, "
+        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, errors in {norm}"
+    )
+    table.add_column("")
+    for under, certificate in found.certificates:
+        whose = "this plant" if certificate.source == "certificate" else "the whole box"
+        table.add_column(f"{under}, {whose}", justify="right")
+    printed = found.theorem_2 is not None
+    if printed:
+        table.add_column("printed (Theorem 2)", justify="right")
+    for label, values, of_theorem in _constants(found):
+        table.add_row(label, *values, *([of_theorem] if printed else []))
+    console.print(table)
+    for under, certificate in found.certificates:
+        if certificate.void:
+            console.print(
+                f"[yellow]void[/] under {under}, {certificate.scope}: {escape(certificate.void)}"
+            )
+
+
+def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
+    theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
+
+    def row(value: Callable[[Certificate], float | None]) -> list[str]:
+        return [_number(value(c)) if c.constants else "void" for c in all_certificates]
+
+    def constant(name: str) -> list[str]:
+        return row(lambda c: getattr(c.constants, name))
+
+    yield (
+        "every bound falls at [1/s]",
+        constant("rate_per_s"),
+        _number(found.resolved.trigger.alpha_per_s),
+    )
+    yield "updates missing at most", constant("missing_events"), "-"
+    yield (
+        "Δ, ‖e_c‖ ≤ Δ β e^(−αt)",
+        constant("delta"),
+        ("from the certificate" if theorem is not None else "-"),
+    )
+    yield "overshoot of ‖e_s‖ over its threshold", constant("overshoot"), "1"
+    yield "input error, ‖u − Kx‖ ≤ … e^(−αt)", constant("input_error"), "-"
+    yield (
+        "X, ‖x‖ ≤ X e^(−αt)",
+        constant("state"),
+        (_number(theorem.state_start + theorem.state_forced) if theorem is not None else "-"),
+    )
+    yield (
+        "least inter-event time [s]",
+        row(lambda c: c.inter_event_s),
+        (_number(theorem.inter_event_s) if theorem is not None else "-"),
+    )
+    yield "gain of the errors (< 1)", constant("loop_gain"), "-"
+    if any(c.floor_constants for c in all_certificates):
+        yield "floor reached at [s]", row(lambda c: c.floor_from_s), "-"
+        for label, name in (("Δ, ‖e_c‖ ≤ Δ ε then", "delta"), ("‖x‖ ≤ … then", "state")):
+            yield (
+                label,
+                row(
+                    lambda c, name=name: getattr(c.floor_constants, name, None)  # type: ignore[misc]
+                ),
+                "-",
+            )
+
+
+def _print_limits(console: Console, found: Study) -> None:
+    table = Table(title="largest certified values, the schedule otherwise as it is")
+    for heading in ("", "sampling period", "delay of an update", "age of the input"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for scope, limits in found.limits.items():
+        table.add_row(scope, *map(_limit, limits))
+    console.print(table)
+
+
+def _print_assumptions(console: Console, found: list[dict[str, Any]]) -> None:
+    table = Table.grid(padding=(0, 2))
+    for assumption in found:
+        verdict = Verdict(assumption["verdict"])
+        table.add_row(
+            f"[{_COLOURS[verdict]}]{verdict}[/]",
+            escape(f"{assumption['what']} ({assumption['source']}): {assumption['why']}"),
+        )
+    console.print(table)
+
+
+def _number(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return "none"
+    return f"{value:.4g}"
+
+
+def _limit(value_s: float) -> str:
+    if value_s <= 0:
+        return "none"
+    return "any" if value_s >= _MOST_S else f"{1e3 * value_s:.3g} ms"

@@ -1,0 +1,96 @@
+"""Chooses the weight W of the trigger's norm, so that the certificate says as much as it can.
+
+A factor W of P = WᵀW with (H+αI)ᵀP + P(H+αI) ⪯ 0 makes ‖·‖_W contract along the models, hence
+Δ = M on an instant network, the least there is. Among these, the one with the longest certified
+inter-event time is searched for (P solves the Lyapunov equation for some Q ⪰ 0; Q is varied). Its
+scale is such that ‖W e‖ ≤ β holds as much volume as ‖e‖ ≤ β: |det W| = 1.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from noack.linear import Matrix, spectral_abscissa
+from noack.resolve import Loop
+from noack.theory.certificate import Conditions, Level, VoidError, solve
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.gains import ErrorGains, PlantGains
+
+_ROUNDS = 250
+_MOST_FREE = 6
+
+
+def choose_weight(
+    loop: Loop,
+    beta: float,
+    alpha_per_s: float,
+    mansd: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Matrix:
+    """Return W, upper triangular, (n, n).
+
+    Args:
+        loop: a resolved loop; its own weight plays no part.
+        beta: β.
+        alpha_per_s: α.
+        mansd: M − 1.
+        progress: told the share of the work that is done.
+
+    Raises:
+        NotDecayingError: α is not below the decay rate of e^{Ht} and e^{(A+BK)t}.
+    """
+    from scipy.optimize import minimize
+
+    n = loop.n
+    for name, matrix in (("the models", loop.H), ("A + BK", loop.A + loop.B @ loop.K)):
+        if spectral_abscissa(matrix) + alpha_per_s >= 0:
+            raise NotDecayingError(f"α = {alpha_per_s:g} /s is not below the decay rate of {name}")
+    # Off-diagonal entries of Q are worth their cost for few states only.
+    free = np.tril_indices(n) if n <= _MOST_FREE else np.diag_indices(n)
+    rounds = 0
+
+    def shortfall(entries: Matrix) -> float:
+        nonlocal rounds
+        rounds += 1
+        progress(min(rounds / _ROUNDS, 1.0))
+        weight = _weight(loop.H, alpha_per_s, free, entries)
+        if weight is None:
+            return 0.0
+        error = ErrorGains(loop.H, loop.K, weight, alpha_per_s)
+        plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha_per_s)
+        try:
+            found = solve(error, plant, Conditions(mansd), Level(beta, beta))
+        except (VoidError, NotDecayingError):
+            return 0.0
+        return -(found.inter_event_s or 0.0)
+
+    start = np.eye(n)[free]
+    best = minimize(
+        shortfall, start, method="Nelder-Mead", options={"maxfev": _ROUNDS, "adaptive": True}
+    )
+    for entries in (best.x, start):
+        weight = _weight(loop.H, alpha_per_s, free, entries)
+        if weight is not None:
+            return weight
+    raise NotDecayingError("no Lyapunov function of the models was found")
+
+
+def _weight(
+    H: Matrix, alpha_per_s: float, free: tuple[Matrix, ...], entries: Matrix
+) -> Matrix | None:
+    """The factor for Q = L Lᵀ, with L's free entries; None where it is not one to rounding."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    n = len(H)
+    L = np.zeros((n, n))
+    L[free] = entries
+    Q = L @ L.T
+    Q += 1e-6 * np.trace(Q) / n * np.eye(n)
+    P = solve_continuous_lyapunov((H + alpha_per_s * np.eye(n)).T, -Q)
+    try:
+        weight = np.linalg.cholesky(0.5 * (P + P.T)).T
+    except np.linalg.LinAlgError:
+        return None
+    scale = float(np.exp(np.linalg.slogdet(weight)[1] / n))
+    found = np.asarray(weight / scale)
+    return found if ErrorGains(H, np.zeros((1, n)), found, alpha_per_s).contracts else None
