@@ -176,7 +176,7 @@ def test_findings_are_shown_whatever_they_hold(record: RunRecord, tmp_path: Path
     page, html, _ = written(
         record,
         tmp_path,
-        replay={"identical": True, "machines": {"plant": {"inputs": 10001, "first": None}}},
+        replay={"bit_exact": True, "machines": {"plant": {"inputs": 10001, "first": None}}},
         fidelity={
             "rms_x": 1.23456e-4,
             "parts": [{"of": "sampling", "share": 0.5}, {"of": "delay", "share": 0.25}],
@@ -186,9 +186,14 @@ def test_findings_are_shown_whatever_they_hold(record: RunRecord, tmp_path: Path
         },
     )
     check(page, html)
-    for text in ("Replay", "identical", "yes", "10001", "Fidelity", "rms x", "0.0001235", "0.25"):
+    for text in ("Replay", "bit exact", "yes", "10001", "Fidelity", "rms x", "0.0001235", "0.25"):
         assert text in page.text
     assert "and 60 more" in page.text
+    failed, _, _ = written(
+        record, tmp_path, replay={"bit_exact": False}, fidelity={"explained": False}
+    )
+    assert "differs from its record: see Replay" in failed.text
+    assert "is not explained: see Fidelity" in failed.text
     without, _, _ = written(record, tmp_path)
     assert "Fidelity" not in without.text
     assert "Replay" not in without.text
