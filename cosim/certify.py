@@ -27,6 +27,11 @@ from noack.theory.enclosure import NotDecayingError
 from noack.theory.printed import Theorem2, theorem_2
 from noack.theory.weight import choose_weight
 
+IDEAL = "paper"
+"""Under the paper's conditions: nothing is sampled, delayed or held."""
+SCHEDULE = "schedule"
+"""Under the scenario's own schedule and allowance."""
+
 _MOST_S = 10.0
 _COLOURS = {
     Verdict.HOLDS: "green",
@@ -111,8 +116,8 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
     """Certify a scenario under the paper's conditions and under its own schedule."""
     ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
     scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
-    certificates = [("the paper's conditions", scope.certificate(ideal)) for scope in scopes]
-    certificates += [("the schedule", scope.certificate(scheduled)) for scope in scopes]
+    certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]
+    certificates += [(SCHEDULE, scope.certificate(scheduled)) for scope in scopes]
     limits = {scope.name: _limits(scope, scheduled) for scope in scopes}
     first = certificates[0][1].constants
     trigger = resolved.trigger
@@ -142,7 +147,7 @@ def print_study(console: Console, found: Study) -> None:
     _print_constants(console, found)
     _print_limits(console, found)
     console.print("assumptions of the certificates under the schedule:")
-    certificate = next(c for under, c in found.certificates if under == "the schedule")
+    certificate = next(c for under, c in found.certificates if under == SCHEDULE)
     _print_assumptions(console, [a._asdict() for a in certificate.assumptions])
     console.print("assumptions of the paper's theorems:")
     _print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
@@ -163,18 +168,22 @@ def _print_constants(console: Console, found: Study) -> None:
     )
     table.add_column("")
     for under, certificate in found.certificates:
-        whose = "this plant" if certificate.source == "certificate" else "the whole box"
-        table.add_column(f"{under}, {whose}", justify="right")
+        whose = "plant" if certificate.source == "certificate" else "box"
+        table.add_column(f"{under},\n{whose}", justify="right")
     printed = found.theorem_2 is not None
     if printed:
-        table.add_column("printed (Theorem 2)", justify="right")
+        table.add_column("printed,\nTheorem 2", justify="right")
     for label, values, of_theorem in _constants(found):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
+    console.print(
+        "[dim]bounds × e^(−rate·t). paper: nothing sampled, delayed or held; "
+        "schedule: as the scenario runs, and late by what it allows[/]"
+    )
     for under, certificate in found.certificates:
         if certificate.void:
             console.print(
-                f"[yellow]void[/] under {under}, {certificate.scope}: {escape(certificate.void)}"
+                f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
             )
 
 
@@ -188,32 +197,32 @@ def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
         return row(lambda c: getattr(c.constants, name))
 
     yield (
-        "every bound falls at [1/s]",
+        "falls at, 1/s",
         constant("rate_per_s"),
         _number(found.resolved.trigger.alpha_per_s),
     )
-    yield "updates missing at most", constant("missing_events"), "-"
+    yield "updates missing", constant("missing_events"), "-"
     yield (
-        "Δ, ‖e_c‖ ≤ Δ β e^(−αt)",
+        "Δ, of ‖e_c‖/β",
         constant("delta"),
-        ("from the certificate" if theorem is not None else "-"),
+        ("(same)" if theorem is not None else "-"),
     )
-    yield "overshoot of ‖e_s‖ over its threshold", constant("overshoot"), "1"
-    yield "input error, ‖u − Kx‖ ≤ … e^(−αt)", constant("input_error"), "-"
+    yield "of ‖e_s‖/β", constant("overshoot"), "1"
+    yield "of ‖u − Kx‖", constant("input_error"), "-"
     yield (
-        "X, ‖x‖ ≤ X e^(−αt)",
+        "X, of ‖x‖",
         constant("state"),
         (_number(theorem.state_start + theorem.state_forced) if theorem is not None else "-"),
     )
     yield (
-        "least inter-event time [s]",
+        "inter-event, s",
         row(lambda c: c.inter_event_s),
         (_number(theorem.inter_event_s) if theorem is not None else "-"),
     )
-    yield "gain of the errors (< 1)", constant("loop_gain"), "-"
+    yield "error gain (< 1)", constant("loop_gain"), "-"
     if any(c.floor_constants for c in all_certificates):
-        yield "floor reached at [s]", row(lambda c: c.floor_from_s), "-"
-        for label, name in (("Δ, ‖e_c‖ ≤ Δ ε then", "delta"), ("‖x‖ ≤ … then", "state")):
+        yield "floor from, s", row(lambda c: c.floor_from_s), "-"
+        for label, name in (("then, of ‖e_c‖/ε", "delta"), ("then, of ‖x‖", "state")):
             yield (
                 label,
                 row(

@@ -9,12 +9,15 @@ scale is such that ‖W e‖ ≤ β holds as much volume as ‖e‖ ≤ β: |det
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.linear import Matrix, spectral_abscissa
 from noack.resolve import Loop
 from noack.theory.certificate import Conditions, Level, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains
+
+Indices = NDArray[np.int_]
 
 _ROUNDS = 250
 _MOST_FREE = 6
@@ -76,7 +79,7 @@ def choose_weight(
 
 
 def _weight(
-    H: Matrix, alpha_per_s: float, free: tuple[Matrix, ...], entries: Matrix
+    H: Matrix, alpha_per_s: float, free: tuple[Indices, ...], entries: Matrix
 ) -> Matrix | None:
     """The factor for Q = L Lᵀ, with L's free entries; None where it is not one to rounding."""
     from scipy.linalg import solve_continuous_lyapunov
