@@ -13,6 +13,8 @@ NETWORK: Colour = (40, 165, 90)
 THRESHOLD: Colour = (225, 60, 75)
 FORCED: Colour = (200, 70, 200)
 DROPPED: Colour = (225, 60, 75)
+BOUND: Colour = (150, 110, 80)
+CERTIFIED: Colour = (40, 165, 90)
 SERIES: tuple[Colour, ...] = (
     (38, 132, 255),
     (255, 128, 14),

@@ -239,7 +239,8 @@ M − 1 = {network.mansd} packets in a row. Nothing is acknowledged.
   x_c (reset only by what survives). Where x_c leaves the other two, packets were lost.
 * **Intervals**: time since the last broadcast, and since the last reception.
 * **Errors**: e_s = x_s − x against its threshold, and e_c = x_c − x, which nobody in the loop can
-  measure.
+  measure, below what is known of it: the bound from identity (I1), and the certified one, which
+  holds as long as nothing is later than the certificate allows (the summary's claims say so).
 {late}
 """
 

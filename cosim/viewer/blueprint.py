@@ -5,11 +5,13 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ========================  =================================================================
 ``about``                 Markdown text about the run (static)
 ``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
-``error/norm``            ‖e_s‖, threshold, ‖e_c‖ (3 scalars)
-``error/log10``           the same three as decimal logarithms
+``error/norm``            ‖e_s‖, threshold, ‖e_c‖, its bound from (I1) (4 scalars)
+``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
+``size/log10``            ‖x‖ and its certified bound as decimal logarithms (2 scalars)
 ``input``                 u = K x_c (m scalars)
 ``event/interval``        t_i − t_{i−1} in seconds, at every broadcast
 ``event/stem``            its stem: 0, interval, NaN
+``event/certified``       the certified least interval, at the start and the end of the run
 ``reception/interval``    the same between deliveries the loss model let through
 ``reception/forced``      the same for deliveries forced by the bound on successive dropouts
 ``reception/stem``        the stems of both
@@ -27,6 +29,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.palette import (
+    BOUND,
+    CERTIFIED,
     CONTROLLER,
     DROPPED,
     PLANT,
@@ -43,8 +47,9 @@ TIMELINE = "t"
 ABOUT = "about"
 ERROR = "error/norm"
 ERROR_LOG10 = "error/log10"
+SIZE_LOG10 = "size/log10"
 INPUT = "input"
-EVENT, EVENT_STEM = "event/interval", "event/stem"
+EVENT, EVENT_STEM, EVENT_CERTIFIED = "event/interval", "event/stem", "event/certified"
 RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
 DROP = "drop"
 LOG = "log"
@@ -71,15 +76,20 @@ def styles(
         colors=[PLANT, SENSOR, CONTROLLER],
         widths=[4.5, 1.5, 1.5],
     )
-    error = rr.SeriesLines(
-        names=["‖e_s‖ sensor", "threshold", "‖e_c‖ controller"],
-        colors=[SENSOR, THRESHOLD, CONTROLLER],
-        widths=[1.5, 2.0, 1.5],
-    )
+    errors = ["‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "bound (I1)", "certified"]
+    colours = [SENSOR, THRESHOLD, CONTROLLER, BOUND, CERTIFIED]
+    widths = [1.5, 2.0, 1.5, 1.0, 2.0]
     found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
         state_path(name): triple for name in state_names
     }
-    found[ERROR] = found[ERROR_LOG10] = error
+    found[ERROR] = rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4])
+    found[ERROR_LOG10] = rr.SeriesLines(names=errors, colors=colours, widths=widths)
+    found[SIZE_LOG10] = rr.SeriesLines(
+        names=["‖x‖ plant", "certified"], colors=[PLANT, CERTIFIED], widths=[2.5, 2.0]
+    )
+    found[EVENT_CERTIFIED] = rr.SeriesLines(
+        names="certified least interval", colors=CERTIFIED, widths=1.5
+    )
     m = len(input_names)
     found[INPUT] = rr.SeriesLines(
         names=list(input_names),
@@ -121,7 +131,7 @@ def layout(
 ) -> rrb.Blueprint:
     """Lay out the panels: states above the two kinds of interval, the rest at the side."""
     intervals = rrb.Horizontal(
-        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP]),
+        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
         _plot(
             "Receiving intervals [s]",
             "reception",
@@ -133,6 +143,7 @@ def layout(
         rrb.Tabs(
             _plot("Error norms, log10", ERROR_LOG10),
             _plot("Error norms", ERROR),
+            _plot("State norm, log10", SIZE_LOG10),
         ),
         _plot("Control input u = K x_c", INPUT),
         rrb.Tabs(

@@ -1,12 +1,13 @@
 """Feeds the view of a run from the tables of its record, as they grow or all at once."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.join import ControllerTrack, controller_track, initial_track, join
+from cosim.join import ControllerTrack, Joined, controller_track, initial_track, join
 from cosim.record import Rows, updates_in
 from cosim.viewer.recording import RunView
 from noack.clock import NS_PER_S
@@ -22,6 +23,9 @@ from noack.records import (
 )
 from noack.resolve import loop_of
 from noack.scenario import Scenario
+from noack.theory.certify import Certificate, certify, nominal_conditions
+from noack.theory.monitor import ErrorMonitor
+from noack.trigger.decaying import trigger_of
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""
@@ -48,6 +52,8 @@ class ViewFeed:
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
+        self._monitor = ErrorMonitor(self._loop.H, trigger_of(scenario))
+        self._known = scenario.network.initial_sync == "known_state"
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
 
@@ -95,6 +101,11 @@ class ViewFeed:
         if not len(rows):
             return
         joined = join(self._loop, rows, self._track, reach_ns)
+        t_s = np.asarray(joined.t_ns * 1e-9)
+        bounds = np.column_stack(
+            [self._bounds(rows, joined), self._certificate.controller_error(t_s)]
+        )
+        bounds[~self._known & (joined.received == NO_SEQUENCE)] = np.nan
         self._view.samples(
             joined.t_ns,
             joined.x,
@@ -103,6 +114,8 @@ class ViewFeed:
             joined.e_s_norm,
             joined.threshold,
             joined.e_c_norm,
+            bounds,
+            self._certificate.state(t_s),
         )
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
@@ -111,6 +124,23 @@ class ViewFeed:
         self._lateness("sensor", rows)
         keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
         self._track = self._track.since(keep)
+
+    @cached_property
+    def _certificate(self) -> Certificate:
+        """The certificate of the run, made when the run is under way: it takes its time."""
+        conditions = nominal_conditions(self._scenario, self._scenario.certificate.late_periods)
+        certificate = certify(self._scenario, conditions)
+        if certificate.inter_event_s is not None:
+            self._view.certified_interval(certificate.inter_event_s, self._scenario.horizon_ns)
+        return certificate
+
+    def _bounds(self, rows: Rows, joined: Joined) -> NDArray[np.float64]:
+        """The bound of ‖e_c‖ that (I1) gives, (k,)."""
+        samples = zip(
+            rows["t_ns"].tolist(), rows["x_s"] - rows["x"], rows["event"].tolist(),
+            joined.received.tolist(), strict=True,
+        )  # fmt: skip
+        return np.array([self._monitor.sample(*sample).identity for sample in samples])
 
     def _deliveries(self, until_ns: int | None) -> None:
         """Draw deliveries once the network's word on them, from another process, must be in."""

@@ -93,8 +93,22 @@ class RunView:
         e_s_norm: Floats,
         threshold: Floats,
         e_c_norm: Floats,
+        e_c_bounds: Floats,
+        x_bound: Floats,
     ) -> None:
-        """Add k samples: times (k,), states (k, n), error norms and threshold (k,)."""
+        """Add k samples.
+
+        Args:
+            t_ns: times (k,).
+            x: plant states (k, n).
+            x_s: the sensor's model (k, n).
+            x_c: the controller's model (k, n).
+            e_s_norm: ‖e_s‖ (k,).
+            threshold: of the trigger (k,).
+            e_c_norm: ‖e_c‖ (k,).
+            e_c_bounds: of e_c_norm, from (I1) and certified (k, 2); NaN for none.
+            x_bound: certified bound of ‖x‖ (k,); NaN for none.
+        """
         times = self._times(t_ns)
         k = len(t_ns)
         x, x_s, x_c = (
@@ -104,19 +118,26 @@ class RunView:
         triples = np.stack((x, x_s, x_c), axis=2)
         for i, entity in enumerate(self._states):
             self._send(entity, times, triples[:, i, :])
-        norms = np.stack(
-            [
-                _shaped(name, value, (k,))
-                for name, value in (
-                    ("e_s_norm", e_s_norm),
-                    ("threshold", threshold),
-                    ("e_c_norm", e_c_norm),
-                )
-            ],
-            axis=1,
-        )
-        self._send(bp.ERROR, times, norms)
-        self._send(bp.ERROR_LOG10, times, _log10(norms))
+        measured = [
+            _shaped(name, value, (k,))
+            for name, value in (
+                ("e_s_norm", e_s_norm),
+                ("threshold", threshold),
+                ("e_c_norm", e_c_norm),
+            )
+        ]
+        bounds = _shaped("e_c_bounds", e_c_bounds, (k, 2))
+        norms = np.column_stack([*measured, bounds])
+        # On a linear scale, a certified bound would flatten everything else.
+        self._send(bp.ERROR, times, norms[:, :4])
+        self._send(bp.ERROR_LOG10, times, _log10(norms, threshold))
+        sizes = np.column_stack([np.linalg.norm(x, axis=1), _shaped("x_bound", x_bound, (k,))])
+        self._send(bp.SIZE_LOG10, times, _log10(sizes, threshold))
+
+    def certified_interval(self, interval_s: float, until_ns: int) -> None:
+        """Draw the certified least time between two broadcasts, from 0 to ``until_ns``."""
+        ends_ns = np.array([0, until_ns], dtype=np.int64)
+        self._send(bp.EVENT_CERTIFIED, self._times(ends_ns), np.full(2, interval_s))
 
     def inputs(self, t_ns: Nanoseconds, u: Floats) -> None:
         """Add the control input u (k, m) at times (k,)."""
@@ -224,8 +245,8 @@ def _shaped(name: str, value: Floats, shape: tuple[int, ...]) -> Floats:
     return value
 
 
-def _log10(norms: Floats) -> Floats:
-    """Decimal logarithm of (‖e_s‖, threshold, ‖e_c‖) (k, 3), cut off below."""
-    threshold = np.nan_to_num(norms[:, 1:2], nan=0.0, posinf=0.0)
-    floor = np.maximum(_LOG_DEPTH * threshold, _LOG_FLOOR)
+def _log10(norms: Floats, threshold: Floats) -> Floats:
+    """Decimal logarithm of norms (k, series), cut off below the threshold (k,)."""
+    level = np.nan_to_num(threshold, nan=0.0, posinf=0.0)[:, None]
+    floor = np.maximum(_LOG_DEPTH * level, _LOG_FLOOR)
     return np.log10(np.maximum(norms, floor))

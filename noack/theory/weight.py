@@ -71,6 +71,7 @@ def choose_weight(
     best = minimize(
         shortfall, start, method="Nelder-Mead", options={"maxfev": _ROUNDS, "adaptive": True}
     )
+    progress(1.0)
     for entries in (best.x, start):
         weight = _weight(loop.H, alpha_per_s, free, entries)
         if weight is not None:

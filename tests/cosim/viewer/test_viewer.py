@@ -61,7 +61,8 @@ def add_samples(view: RunView, batches: int, n: int = 4, first: int = 0) -> None
         t_ns = times(batch * K)
         norm = t_ns.astype(np.float64) * 1e-9
         x: Floats = norm[:, None] + np.arange(n)
-        view.samples(t_ns, x, x + 100, x + 200, norm, norm + 1, norm + 2)
+        bounds = np.stack([norm + 3, norm + 4], axis=1)
+        view.samples(t_ns, x, x + 100, x + 200, norm, norm + 1, norm + 2, bounds, norm + 5)
 
 
 def read(path: Path, kind: str = "recording") -> dict[str, list[Any]]:
@@ -179,7 +180,12 @@ def test_every_sample_is_in_the_file_exactly(tmp_path: Path) -> None:
         x = t_ns * 1e-9 + i
         np.testing.assert_array_equal(values, np.stack((x, x + 100, x + 200), axis=1))
     t_ns, values = series(chunks, "error/norm")
-    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [0, 1, 2])
+    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [0, 1, 2, 3])
+    t_ns, values = series(chunks, "error/log10")
+    certified = 10 ** values[:, 4]
+    np.testing.assert_allclose(certified, t_ns * 1e-9 + 4, rtol=1e-12)
+    t_ns, values = series(chunks, "size/log10")
+    np.testing.assert_allclose(10 ** values[:, 1], t_ns * 1e-9 + 5, rtol=1e-12)
     t_ns, values = series(chunks, "input")
     np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
 
@@ -194,7 +200,9 @@ def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> Non
     assert len(set(colours)) == 3
     for name in STATES[1:]:
         assert static(chunks, f"state/{name}", "SeriesLines:colors") == colours
-    sensor, threshold, controller = static(chunks, "error/norm", "SeriesLines:colors")
+    sensor, threshold, controller, *bounds = static(chunks, "error/log10", "SeriesLines:colors")
+    assert len({sensor, threshold, controller, *bounds}) == 5
+    assert static(chunks, "error/norm", "SeriesLines:colors")[2] == controller
     assert (sensor, controller) == (colours[1], colours[2])
     assert threshold not in colours
     assert static(chunks, "event/interval", "SeriesPoints:colors") == [sensor]
@@ -255,7 +263,10 @@ def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
     with new_view(path) as view:
         x = np.zeros((3, 4))
         error, threshold = np.array([0.1, 0.0, np.nan]), np.array([0.1, 0.1, 0.1])
-        view.samples(times(0, 3), x, x, x, error, threshold, error)
+        none = np.full(3, np.nan)
+        view.samples(
+            times(0, 3), x, x, x, error, threshold, error, np.stack([none, none], axis=1), none
+        )
     _, values = series(read(path), "error/log10")
     np.testing.assert_allclose(values[:, 0], [-1.0, -4.0, np.nan], rtol=1e-12)
     np.testing.assert_allclose(values[:, 1], -1.0, rtol=1e-12)
@@ -266,7 +277,8 @@ def test_a_rule_without_a_threshold_still_gives_a_plot(tmp_path: Path, threshold
     path = tmp_path / "recording.rrd"
     with new_view(path) as view:
         x, e = np.zeros((2, 4)), np.array([1e-3, 0.0])
-        view.samples(times(0, 2), x, x, x, e, np.full(2, threshold), e)
+        none = np.full((2, 2), np.nan)
+        view.samples(times(0, 2), x, x, x, e, np.full(2, threshold), e, none, none[:, 0])
     for entity in ("error/norm", "error/log10"):
         assert not np.isinf(series(read(path), entity)[1]).any()
     assert series(read(path), "error/log10")[1][0, 0] == pytest.approx(-3.0)
@@ -317,7 +329,7 @@ def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
     with new_view(tmp_path / "recording.rrd") as view:
         x, e = np.zeros((2, 4)), np.zeros(2)
         with pytest.raises(ValueError, match=r"x_s: expected shape \(2, 4\), found \(2, 3\)"):
-            view.samples(times(0, 2), x, x[:, :3], x, e, e, e)
+            view.samples(times(0, 2), x, x[:, :3], x, e, e, e, np.ones((2, 2)), e)
         with pytest.raises(ValueError, match=r"u: expected shape \(2, 2\), found \(2, 4\)"):
             view.inputs(times(0, 2), x)
 

@@ -1,0 +1,147 @@
+"""``noack certify``: what it says, to a person and to a program; what the documentation quotes."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cosim.certify import IDEAL, SCHEDULE, Study, study, with_weight
+from cosim.cli import app
+from noack.errors import CallerError
+from noack.resolve import loop_of, resolve
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.theory.assumptions import Verdict
+
+ROOT = Path(__file__).parents[2]
+
+
+def scenario(name: str, *settings: str) -> Scenario:
+    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+
+
+def found(study: Study, under: str, scope: str) -> dict[str, float]:
+    (certificate,) = [
+        c for u, c in study.certificates if u == under and scope in (c.source, c.scope)
+    ]
+    assert certificate.constants is not None
+    return certificate.constants._asdict()
+
+
+@pytest.fixture(scope="module")
+def lane() -> Study:
+    return study(scenario("lane_following"), 2)
+
+
+@pytest.fixture(scope="module")
+def weighted() -> Study:
+    return study(scenario("lane_weighted"), 2)
+
+
+def test_the_lane_example_reaches_its_figures(lane: Study, weighted: Study) -> None:
+    """A hundred times the printed inter-event time; Δ = M = 5 in a chosen weight."""
+    assert lane.theorem_2 is not None
+    printed_s = lane.theorem_2.inter_event_s
+    assert found(lane, IDEAL, "certificate")["inter_event_s"] >= 100 * printed_s
+    assert found(weighted, IDEAL, "certificate")["inter_event_s"] >= 500 * printed_s
+    assert found(weighted, IDEAL, "certificate")["delta"] == pytest.approx(5.0, abs=1e-9)
+    assert found(weighted, IDEAL, "box certificate")["delta"] == pytest.approx(5.0, abs=1e-9)
+
+
+def test_the_documentation_quotes_what_is_computed(lane: Study, weighted: Study) -> None:
+    assert lane.theorem_2 is not None
+    text = (ROOT / "docs/theory.md").read_text()
+    rows = {
+        key: [cell.strip() for cell in cells.strip(" |").split("|")]
+        for key, cells in re.findall(r"^\| (Δ|X|δ) \|(.*)$", text, re.MULTILINE)
+    }
+    own, chosen = (found(s, IDEAL, "certificate") for s in (lane, weighted))
+    theorem = lane.theorem_2
+    assert rows["Δ"] == ["(same)", f"{own['delta']:.3g}", f"{chosen['delta']:.3g}"]
+    printed = theorem.state_start + theorem.state_forced
+    assert rows["X"] == [f"{printed:.3g}", f"{own['state']:.3g}", f"{chosen['state']:.3g}"]
+    assert rows["δ"] == [
+        f"{1e6 * theorem.inter_event_s:.3g} µs",
+        f"{1e3 * own['inter_event_s']:.3g} ms",
+        f"{1e3 * chosen['inter_event_s']:.3g} ms",
+    ]
+    live = found(lane, SCHEDULE, "certificate")
+    least_ms = 1e3 * live["inter_event_s"]
+    said = f"Δ = {live['delta']:.3g}, X = {live['state']:.3g} and δ = {least_ms:.0f} ms"
+    assert said in " ".join(text.split())
+    limits = weighted.limits["the scenario's plant"]
+    assert f"sampling periods up to {1e3 * limits.sampling_s:.0f} ms" in text
+
+
+def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Study) -> None:
+    """The limits are limits: a little less stands, a little more does not."""
+    from noack.theory.certify import nominal_conditions, own_plant
+
+    resolved = scenario("lane_following")
+    scheduled, scope = nominal_conditions(resolved, 2), own_plant(resolved)
+    limits = lane.limits["the scenario's plant"]
+    for share, stands in ((0.99, True), (1.01, False)):
+        for changed in (
+            scheduled._replace(
+                sampling_s=share * limits.sampling_s, spacing_s=share * limits.sampling_s
+            ),
+            scheduled._replace(hold_s=share * limits.hold_s),
+        ):
+            assert (scope.certificate(changed).constants is not None) == stands
+
+
+def test_a_weight_is_chosen_that_contracts_and_keeps_the_volume() -> None:
+    resolved = scenario(
+        "lane_following", 'model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}"
+    )
+    shares: list[float] = []
+    weighted, W = with_weight(resolved, "chosen", shares.append)
+    assert W is not None
+    assert abs(np.linalg.det(W)) == pytest.approx(1.0)
+    assert shares[-1] == 1.0
+    np.testing.assert_array_equal(np.array(weighted.trigger.weight), W)
+    loop = loop_of(weighted)
+    turned = W @ (loop.H + 0.25 * np.eye(2)) @ np.linalg.inv(W)
+    assert np.linalg.eigvalsh(turned + turned.T).max() <= 1e-9
+    better = found(study(weighted, 0, W), IDEAL, "certificate")
+    plain = found(study(resolved, 0), IDEAL, "certificate")
+    assert better["delta"] <= 5.0
+    assert better["inter_event_s"] >= plain["inter_event_s"]
+
+
+def test_no_weight_helps_a_hold() -> None:
+    with pytest.raises(CallerError, match=r"--weight chosen: α = 0\.25 /s is not below"):
+        with_weight(scenario("lane_following", 'mode="zoh"'), "chosen")
+    with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
+        with_weight(scenario("lane_following"), "best")
+
+
+def test_identity_takes_the_weight_away() -> None:
+    plain, W = with_weight(scenario("lane_weighted"), "identity")
+    assert W is None
+    assert plain.trigger.weight is None
+
+
+def test_the_command_prints_one_document() -> None:
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--late", "1", "--json"])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert [c["under"] for c in document["certificates"]] == [IDEAL, IDEAL, SCHEDULE, SCHEDULE]
+    first = document["certificates"][0]
+    assert first["constants"]["delta"] > 1
+    assert first["floor_from_s"] == pytest.approx(np.log(0.02 / 0.001) / 0.3)
+    assert first["floor_constants"]["rate_per_s"] == 0
+    assert {a["verdict"] for a in first["assumptions"]} <= {str(v) for v in Verdict}
+    assert document["limits"]["the scenario's plant"]["sampling_s"] > 0.002
+
+
+def test_nothing_certified_is_a_failure_that_says_why() -> None:
+    """The gain does not stabilise this plant at all."""
+    settings = ["--set", "model.gain=[[1.0, 1.0]]"]
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", *settings])
+    assert result.exit_code == 1
+    assert "void" in result.stdout
+    assert "grows at" in result.stdout
