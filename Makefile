@@ -23,7 +23,7 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare report
+.PHONY: demo demo-zoh run simulate view summary replay compare report certify
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -50,6 +50,9 @@ compare: setup ## Compare the last run with the paper's loop, effect by effect
 
 report: setup ## Write the last run's report anew, a page with all figures; print its path
 	@$(BIN)/noack report $(ARGS)
+
+certify: setup ## Say what is guaranteed of SCENARIO, under which conditions
+	@$(BIN)/noack certify "$(SCENARIO)" $(ARGS)
 
 ##@ Five terminals, one process each (start `make record` in one, the others in any order)
 .PHONY: record plant sensor controller netem

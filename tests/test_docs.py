@@ -135,6 +135,6 @@ def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> N
 
 
 def test_links_lead_somewhere() -> None:
-    for page in (*PAGES, "ARCHITECTURE.md", "docs/wire.md"):
+    for page in (*PAGES, "ARCHITECTURE.md", "docs/theory.md", "docs/wire.md"):
         for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text()):
             assert (ROOT / page).parent.joinpath(target).exists(), f"{page}: {target}"
