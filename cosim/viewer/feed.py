@@ -105,7 +105,8 @@ class ViewFeed:
         bounds = np.column_stack(
             [self._bounds(rows, joined), self._certificate.controller_error(t_s)]
         )
-        bounds[~self._known & (joined.received == NO_SEQUENCE)] = np.nan
+        if not self._known:  # as yet, sensor and controller have nothing in common
+            bounds[joined.received == NO_SEQUENCE] = np.nan
         self._view.samples(
             joined.t_ns,
             joined.x,

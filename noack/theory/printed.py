@@ -17,7 +17,7 @@ from noack.linear import Matrix, Vector, spectral_abscissa
 from noack.resolve import Loop
 from noack.theory.enclosure import response, response_until
 
-_CANDIDATES = 24
+_CANDIDATES = 12
 _CELLS = 256
 
 

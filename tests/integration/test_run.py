@@ -10,6 +10,7 @@ import pytest
 import rerun.chunk
 from scipy.linalg import expm
 
+from cosim.claims.evaluate import claims_of
 from cosim.join import identity_residual, join_all
 from cosim.record import RunRecord, load_record
 from cosim.replay import replay
@@ -20,14 +21,17 @@ from noack.records import Fate, tables
 from noack.resolve import resolve
 from noack.scenario_file import load
 from noack.wire import read_header
+from tests.cosim.viewer.test_viewer import read, series
 from tests.integration.conftest import Finished, run_scenario, settings
 
 SUMMARY_KEYS = {
     "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",
     "longest_drop_run", "assumption_violations", "missing_samples", "lost_outside_netem",
     "inter_event_min_s", "final_state_norm", "lateness_us", "latency_us", "realtime", "exit",
-    "kind", "replay",
+    "kind", "replay", "fidelity", "claims", "conditions",
 }  # fmt: skip
+
+OWN_CLAIMS = {"(I1)", "certificate", "box certificate"}
 
 CASES = {
     "model": {"mode": "model"},
@@ -272,3 +276,33 @@ def test_the_recording_shows_what_the_record_says(finished: Finished, record: Ru
     assert rows[blueprint.INPUT] == len(record["controller_step"])
     for name in record.loop.state_names:
         assert rows[blueprint.state_path(name)] == len(record["sensor_measurement"])
+
+
+def test_no_claim_that_needs_no_ideal_world_is_violated(finished: Finished) -> None:
+    """However late the machine was: then certificates are void, and say since when and why."""
+    claims = [c for c in finished.summary["claims"] if c["source"] in OWN_CLAIMS]
+    assert {c["source"] for c in claims} >= {"(I1)", "certificate", "box certificate"}
+    for claim in claims:
+        assert claim["verdict"] in ("held", "void"), claim
+        assert (claim["since_s"] is None) == (claim["verdict"] == "held")
+        assert claim["verdict"] == "held" or claim["why"]
+    conditions = finished.summary["conditions"]
+    mansd = finished.summary["mansd"]
+    assert 0 < conditions["dropouts"] <= mansd
+    assert conditions["delay_s"] >= conditions["sampling_s"] / 2 > 0
+
+
+def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
+    """The recorder's curves, drawn while the run went on, are those judged at its end."""
+    envelopes = claims_of(record).envelopes()
+    (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
+    certified = [e.values for e in envelopes if e.label == "certified for the scenario's plant"]
+    chunks = read(finished.run_dir / "recording.rrd")
+    t_ns, drawn = series(chunks, blueprint.ERROR)
+    order = np.argsort(t_ns)
+    np.testing.assert_allclose(drawn[order, 3], identity, rtol=1e-9, atol=1e-12)
+    _, drawn = series(chunks, blueprint.SIZE_LOG10)
+    if certified:  # there is none for a hold
+        np.testing.assert_allclose(10 ** drawn[order, 1], certified[1], rtol=1e-9)
+    else:
+        assert np.isnan(drawn[:, 1]).all()
