@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.claims.evaluate import as_json, claims_of
+from cosim.claims.evaluate import Claims, as_json
 from cosim.fidelity import fidelity_for_summary
 from cosim.launch import Ending
 from cosim.record import RunRecord, finish_record, load_record
@@ -42,10 +42,11 @@ def conclude(ending: Ending) -> Outcome:
         summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
         (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
         # Written once more, so that nothing that is found out afterwards can cost a summary.
-        summary |= _found_out(record)
+        claims = Claims(record)
+        summary |= _found_out(record, claims)
         (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
         try:
-            _report(record, summary, run_dir)
+            _report(record, summary, run_dir, claims)
         except Exception as error:  # whatever it is: a run is none the worse for it
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
@@ -53,7 +54,7 @@ def conclude(ending: Ending) -> Outcome:
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
 
-def _found_out(record: RunRecord) -> Summary:
+def _found_out(record: RunRecord, claims: Claims) -> Summary:
     """What needs more than the record's own numbers; a failure of it is a line in the summary."""
     found: Summary = {}
     if record.kind == "live":
@@ -64,7 +65,6 @@ def _found_out(record: RunRecord) -> Summary:
         found["fidelity"] = fidelity_for_summary(record)
     try:
         with np.errstate(all="ignore"):
-            claims = claims_of(record)
             found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
@@ -97,15 +97,16 @@ def report_anew(run_dir: Path) -> Path:
         MachineError: the report cannot be written.
     """
     outcome = reopen(run_dir)
-    return _report(load_record(run_dir), outcome.summary, run_dir)
+    record = load_record(run_dir)
+    return _report(record, outcome.summary, run_dir, Claims(record))
 
 
-def _report(record: RunRecord, summary: Summary, run_dir: Path) -> Path:
+def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: Claims) -> Path:
     from cosim.report.write import write_report  # imports matplotlib, which no process needs sooner
 
     try:
         with np.errstate(all="ignore"):
-            envelopes = claims_of(record).envelopes()
+            envelopes = claims.envelopes()
     except Exception:  # the page is worth having without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)

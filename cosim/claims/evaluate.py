@@ -68,22 +68,25 @@ class Envelope(NamedTuple):
 
     label: str
     quantity: Literal["e_c", "x", "inter_event"]
-    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖."""
+    """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds."""
     t_s: Reals
     values: Reals
 
 
 @dataclass(frozen=True)
 class Claims:
-    """The claims about one run.
+    """The claims about one run; everything is computed when it is asked for, and once.
 
     Args:
         record: the run's record.
-        joined: its samples.
     """
 
     record: RunRecord
-    joined: Joined
+
+    @cached_property
+    def joined(self) -> Joined:
+        """The run's samples."""
+        return join_all(self.record)
 
     @cached_property
     def certificates(self) -> list[Certificate]:
@@ -110,10 +113,17 @@ class Claims:
                 label = f"certified for {certificate.scope}"
                 found.append(Envelope(label, "e_c", t_s, certificate.controller_error(t_s)))
                 found.append(Envelope(label, "x", t_s, certificate.state(t_s)))
+            if certificate.inter_event_s is not None:
+                found.append(self._least_interval(label, certificate.inter_event_s))
         if (theorem := self._theorem_2) is not None:
             alpha = self.record.scenario.trigger.alpha_per_s
             found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, theorem.state(t_s, alpha)))
+            found.append(self._least_interval("Theorem 2 (eq:tau)", theorem.inter_event_s))
         return found
+
+    def _least_interval(self, label: str, interval_s: float) -> Envelope:
+        ends_s = np.array([0.0, self.record.scenario.horizon_s])
+        return Envelope(label, "inter_event", ends_s, np.full(2, interval_s))
 
     @cached_property
     def _t_s(self) -> Reals:
@@ -282,11 +292,6 @@ def scheduled_certificates(scenario: Scenario) -> list[Certificate]:
     conditions = nominal_conditions(scenario, scenario.certificate.late_periods)
     found = [certify(scenario, conditions), certify_box(scenario, conditions)]
     return [certificate for certificate in found if certificate is not None]
-
-
-def claims_of(record: RunRecord, joined: Joined | None = None) -> Claims:
-    """The claims about a run."""
-    return Claims(record, join_all(record) if joined is None else joined)
 
 
 def as_json(claims: Sequence[Claim]) -> list[dict[str, Any]]:

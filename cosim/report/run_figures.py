@@ -109,9 +109,8 @@ def _norms(
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
     )
     steps = record[PLANT_STEP]
-    x, weight = steps["x"], record.loop.weight
     with np.errstate(all="ignore"):
-        x_norm = np.linalg.norm(x if weight is None else x @ weight.T, axis=1)
+        x_norm = np.linalg.norm(steps["x"], axis=1)
     yield Picture(
         "state-norm",
         figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, x_bounds),

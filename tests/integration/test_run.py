@@ -10,7 +10,7 @@ import pytest
 import rerun.chunk
 from scipy.linalg import expm
 
-from cosim.claims.evaluate import claims_of
+from cosim.claims.evaluate import Claims
 from cosim.join import identity_residual, join_all
 from cosim.record import RunRecord, load_record
 from cosim.replay import replay
@@ -294,7 +294,7 @@ def test_no_claim_that_needs_no_ideal_world_is_violated(finished: Finished) -> N
 
 def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
     """The recorder's curves, drawn while the run went on, are those judged at its end."""
-    envelopes = claims_of(record).envelopes()
+    envelopes = Claims(record).envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [e.values for e in envelopes if e.label == "certified for the scenario's plant"]
     chunks = read(finished.run_dir / "recording.rrd")
