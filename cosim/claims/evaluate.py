@@ -107,7 +107,7 @@ class Claims:
     def envelopes(self) -> list[Envelope]:
         """The certified curves, at the measurements."""
         t_s = self._t_s
-        found = [Envelope("bound from (I1)", "e_c", t_s, self._bounds[0])]
+        found: list[Envelope] = []  # in this order, a certificate looks alike in every figure
         for certificate in self.certificates:
             if certificate.constants is not None:
                 label = f"certified for {certificate.scope}"
@@ -115,6 +115,7 @@ class Claims:
                 found.append(Envelope(label, "x", t_s, certificate.state(t_s)))
             if certificate.inter_event_s is not None:
                 found.append(self._least_interval(label, certificate.inter_event_s))
+        found.append(Envelope("bound from (I1)", "e_c", t_s, self._bounds[0]))
         if (theorem := self._theorem_2) is not None:
             alpha = self.record.scenario.trigger.alpha_per_s
             found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, theorem.state(t_s, alpha)))
