@@ -2,9 +2,9 @@
 
 import sys
 
-from benchmarks import demo_run, latency, lateness, machines, startup
+from benchmarks import demo_run, latency, lateness, machines, simulation, startup
 from benchmarks._report import run
 
 if __name__ == "__main__":
-    modules = (demo_run, latency, lateness, startup, machines)
+    modules = (demo_run, latency, lateness, startup, machines, simulation)
     sys.exit(run([module.BENCHMARK for module in modules]))

@@ -179,7 +179,7 @@ class Claims:
         scale = max(float(np.abs(self.joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
         yield _upper(
             "the models differ by what was missed", "(I1)",
-            "‖x_c − x_s − Σ e^(H(t−t_k)) e_s(t_k)‖ ≤ {:.3g} max‖x_s‖", _IDENTITY,
+            "their difference is it, to {:.0e} of ‖x_s‖", _IDENTITY,
             self._t_s[self._in_common], residual / (_IDENTITY * scale), None, "",
         )  # fmt: skip
         yield self._controller_error(
