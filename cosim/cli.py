@@ -1,6 +1,7 @@
 """The command line ``noack``."""
 
 import io
+import os
 import sys
 from collections.abc import Callable, Sequence
 from enum import StrEnum
@@ -311,6 +312,31 @@ def certify(
     return ExitStatus.OK if certified else ExitStatus.FAILED
 
 
+@command(_RUNS)
+def paper(
+    draws: Annotated[int, typer.Option(help="Draws of plant, losses and initial state.")] = 1000,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for paper.md, and for figures/ in it.")
+    ] = DEFAULT_RUNS / "paper",
+    json: JsonOption = False,
+) -> int:
+    """Reproduce the paper's Section V over many draws: a page with figures, tables and verdicts."""
+    from cosim.paper.table import print_claims
+    from cosim.paper.write import document, make_folder, reproduce, write_page
+    from cosim.progress import PatientConsole, draws_bar
+
+    path = find_scenario("lane_following")
+    make_folder(out)
+    with draws_bar(PatientConsole(stderr=True)) as progress:
+        results = reproduce(path, draws, _cores(), progress)
+    found = document(results, write_page(path, results, out))
+    if json:
+        _print_json(found)
+    else:
+        print_claims(Console(), found)
+    return ExitStatus.OK
+
+
 @command(_PROCESSES)
 def record(
     scenario: ScenarioArgument,
@@ -450,6 +476,10 @@ def _conclude(ending: "Ending", *, json: bool) -> int:
 
 def _process_arguments(session: str, *, json: bool) -> list[str]:
     return ["--session", session, *(["--json"] if json else [])]
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def _print_json(document: object) -> None:

@@ -79,6 +79,16 @@ def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int
         yield lambda now_ns: progress.update(task, completed=now_ns / NS_PER_S)
 
 
+@contextmanager
+def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show how many draws of how many are done while the context lasts, on a terminal only."""
+    columns = (BarColumn(), TextColumn("{task.completed:g}/{task.total:g} draws"))
+    disabled = not console.is_terminal
+    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
+        task = progress.add_task("", total=1)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
 def _account(account: dict[str, Any], horizon_s: float) -> str:
     norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.3g}"
     return (
