@@ -19,7 +19,7 @@ from noack.scenario import Bernoulli, GilbertElliott, Scenario
 from noack.scenario_file import json_schema, load
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/record.md", "docs/scenarios.md")
+PAGES = ("README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md")
 
 
 def blocks(page: str, language: str) -> list[str]:
