@@ -27,7 +27,6 @@ from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
 OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
-_SCHEDULE_STEPS = 100_000
 
 _RESOLUTION = 1e-3
 
@@ -117,29 +116,26 @@ class Certificate:
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
 
-    In the plant's time: an update is felt from the first step on whose newest tick comes after it,
-    and the model state behind an input ages until the step after the one that latched it.
+    In the plant's time, whatever the rates: an update is felt from the first step on whose newest
+    tick is not before it, and the model state behind an input ages until the step after the one
+    that latched it. The plant steps before it takes what arrives at the same time.
     """
     step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
     phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
-    steps = min(math.lcm(step_ns, tick_ns) // step_ns + 2 * tick_ns // step_ns + 4, _SCHEDULE_STEPS)
-    grid_ns = step_ns * np.arange(1, steps + 1, dtype=np.int64)
-    # The plant steps before it takes what arrives at the same time.
-    newest_ns = phase_ns + (grid_ns - 1 - phase_ns) // tick_ns * tick_ns
-    felt = newest_ns >= phase_ns
-    hold_ns = int((grid_ns - newest_ns)[felt].max()) + step_ns
-    samples_ns = sample_ns * np.arange(max(len(grid_ns) * step_ns // (2 * sample_ns), 1))
-    first = np.searchsorted(newest_ns, samples_ns, side="left")
-    known = first < len(grid_ns)
-    delay_ns = int((grid_ns[first[known]] - samples_ns[known]).max())
+    # From a step back to the tick before: 0 < age ≤ tick, and age ≡ −phase modulo the gcd, all of
+    # which occur sooner or later. From a measurement on to the next tick: 0 ≤ wait < tick.
+    newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
+    common_ns = math.gcd(sample_ns, tick_ns)
+    wait_ns = tick_ns - common_ns + phase_ns % common_ns
+    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     late_ns = late_periods * step_ns
     return Conditions(
         dropouts=resolved.network.mansd,
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
         delay_s=(delay_ns + late_ns) / NS_PER_S,
-        hold_s=(hold_ns + late_ns) / NS_PER_S,
-        start_s=(max(delay_ns, int(grid_ns[felt][0])) + late_ns) / NS_PER_S,
+        hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
+        start_s=(first_ns + late_ns) / NS_PER_S,
     )
 
 
