@@ -59,6 +59,8 @@ class Constants(NamedTuple):
     """β̃/β: ‖e_s‖_W ≤ β̃e^{−αt}."""
     input_error: float
     """π: ‖u − Kx‖ ≤ πe^{−αt}, once the plant feels the controller."""
+    start_error: float
+    """The same before that, when u = 0."""
     state: float
     """X: ‖x‖ ≤ Xe^{−αt}."""
     state_weighted: float
@@ -102,12 +104,20 @@ class Level(NamedTuple):
 
 
 class Background(NamedTuple):
-    """What an earlier phase of the run leaves: lower limits of the bounds between two events."""
+    """What an earlier phase of the run leaves: its bounds, which reach into this one.
 
+    An event of the earlier phase may still be missing in this one, and so may two tests or two
+    events lie on either side of where they meet.
+    """
+
+    sensor_error: float = 0.0
+    """Of β̃."""
     mismatch: float = 0.0
     """Of sup‖R_E x‖."""
     input_error: float = 0.0
-    """Of π."""
+    """Of sup‖p‖."""
+    inter_event_s: float = _LONGEST_S
+    """Of the time between two events."""
 
 
 _CLEAN = Background()
@@ -129,15 +139,15 @@ def solve(
     step = _Step(error, plant, conditions, level, background)
     if level.reached is None:
         return step.constants(conditions.spacing_s, None)
-    spacing_s = _LONGEST_S
+    spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
+        if spacing_s <= conditions.spacing_s:
+            return step.constants(conditions.spacing_s, conditions.spacing_s or None)
         found_s = step.inter_event_s(spacing_s)
         if found_s >= spacing_s:
             return step.constants(spacing_s, spacing_s)
         # Down to the largest spacing that reproduces itself, from above.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-        if spacing_s <= conditions.spacing_s:
-            return step.constants(conditions.spacing_s, conditions.spacing_s or None)
     raise VoidError("no minimum inter-event time was found")
 
 
@@ -186,10 +196,11 @@ class _Step:
         )
         input_fixed = hold_s * rate.free + self._remainder * weighted.free
         from_p = self._mismatch_growth * mismatch.gain + self._input_growth
-        error_fixed = (
+        error_fixed = max(
             self._stretch * self._level.beta
             + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
-            + self._input_growth * max(self._start_error, self._background.input_error)
+            + self._input_growth * max(self._start_error, self._background.input_error),
+            self._background.sensor_error,
         )
         loop_gain = own + from_e_s * from_p
         if not loop_gain < 1:
@@ -203,6 +214,7 @@ class _Step:
             shares[Output.WEIGHTED] * sensor_error / self._level.beta,
             sensor_error / self._level.beta,
             input_error,
+            self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
             state[Output.MISMATCH],

@@ -65,9 +65,7 @@ class Certificate:
     @property
     def floor_from_s(self) -> float:
         """When βe^{−αt} falls below the floor ε; infinite without a floor."""
-        if self.floor == 0:
-            return math.inf
-        return max(math.log(self.beta / self.floor) / self.alpha_per_s, 0.0)
+        return _floor_from_s(self.beta, self.alpha_per_s, self.floor)
 
     @property
     def inter_event_s(self) -> float | None:
@@ -111,6 +109,10 @@ class Certificate:
             late = scale(self.floor_constants, self.floor)
             bound = np.where(t_s < self.floor_from_s, bound, late)
         return np.asarray(bound)
+
+
+def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
+    return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
 
 
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
@@ -254,21 +256,28 @@ class Scope:
     def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
         """Once the threshold is the floor: from any state the first phase leaves, without decay.
 
-        An event before then left at most βe^{−αt_k} = εe^{α(t_ε−t_k)}, so that Δ keeps α's kernels.
-        What the first phase leaves, left its mark up to one test or one inter-event time before.
+        What the first phase leaves falls like e^{−αt}: what was there τ before t_ε is greater than
+        at t_ε by e^{ατ}. The models' side keeps α, so that its kernels, e^{(H+αI)τ}, bring that
+        factor along wherever something of the first phase reaches into this one.
         """
         trigger = self._resolved.trigger
-        share = trigger.floor / trigger.beta
-        start = share * first.state * np.eye(self._loop.n)
-        back_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
-        earlier = share * math.exp(trigger.alpha_per_s * back_s)
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
+        before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
+        started = conditions.start_s + before_s <= from_s
+        background = Background(
+            sensor_error=floor * first.overshoot,
+            mismatch=share * first.mismatch,
+            input_error=share * max(first.input_error, 0.0 if started else first.start_error),
+            inter_event_s=first.inter_event_s or 0.0,
+        )
         found = self._solve(
-            conditions._replace(start_s=0.0),
-            trigger.alpha_per_s,
+            conditions._replace(start_s=max(conditions.start_s - from_s, 0.0)),
+            alpha,
             0.0,
-            start,
-            Level(trigger.floor, trigger.floor),
-            Background(earlier * first.mismatch, earlier * first.input_error),
+            share * first.state * np.eye(self._loop.n),
+            Level(floor, floor),
+            background,
         )
         return found._replace(rate_per_s=0.0)
 
