@@ -41,7 +41,7 @@ class Conditions(NamedTuple):
     delay_s: float = 0.0
     """d, the longest time from an event until the plant feels its update, if it is delivered."""
     hold_s: float = 0.0
-    """σ, the greatest age of the model state behind the input that the plant feels."""
+    """σ, how far the model's time behind the input that the plant feels is from now, at most."""
     start_s: float = 0.0
     """From here on the plant feels the controller's input; before, it feels none."""
 

@@ -131,12 +131,17 @@ class ErrorGains:
         )
 
     def hold_remainder(self, hold_s: float) -> float:
-        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, σ ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
+        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
         if hold_s == 0:
             return 0.0
-        followed = response_until(-self.H, self.inverse_weight, hold_s, 16)
-        second = followed.through(self.split_K[1] @ self.H @ self.H).sup_on_grid()
-        return 0.5 * hold_s**2 * second
+        curvature = self.split_K[1] @ self.H @ self.H
+        return max(
+            0.5 * hold_s**2 * followed.through(curvature).sup_on_grid()
+            for followed in (
+                response_until(generator, self.inverse_weight, hold_s, 16)
+                for generator in (-self.H, self.H)
+            )
+        )
 
 
 @dataclass(frozen=True)
