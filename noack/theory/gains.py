@@ -24,6 +24,7 @@ from noack.theory.enclosure import (
     Response,
     constant_kernel,
     factors,
+    norm_bounds,
     response,
     response_until,
 )
@@ -75,8 +76,10 @@ class ErrorGains:
 
     @cached_property
     def inverse_weight(self) -> Matrix:
-        """W^{−1}."""
-        return np.asarray(np.linalg.inv(self.weight))
+        """W^{−1}, to rounding of each entry even if W is ill-conditioned."""
+        wide, found = np.longdouble, np.linalg.inv(self.weight)
+        rest = np.eye(len(found), dtype=wide) - self.weight.astype(wide) @ found.astype(wide)
+        return np.asarray(found + found.astype(wide) @ rest, dtype=np.float64)
 
     @cached_property
     def scaled_H(self) -> Matrix:
@@ -102,10 +105,7 @@ class ErrorGains:
             NotDecayingError: α is not below the decay rate of e^{Hτ}.
         """
         if not self.scaled_H.any():  # a hold: what was missed stays missed
-            return {
-                output: constant_kernel(float(np.linalg.norm(C @ self.inverse_weight, 2)))
-                for output, C in self.outputs.items()
-            }
+            return {output: constant_kernel(self.now(output)) for output in self.outputs}
         followed = response(self.scaled_H, self.inverse_weight)
         found = {output: followed.through(C) for output, C in self.outputs.items()}
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
@@ -122,7 +122,9 @@ class ErrorGains:
 
     def now(self, output: Output) -> float:
         """‖C W^{−1}‖: the share of the present e_s."""
-        return float(np.linalg.norm(self.outputs[output] @ self.inverse_weight, 2))
+        if output is Output.WEIGHTED:
+            return 1.0
+        return float(norm_bounds(self.outputs[output], self.inverse_weight[None])[0])
 
     def missing(self, output: Output, events: int, spacing_s: float) -> float:
         """Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖: the share of N missing events, δ apart."""
