@@ -142,13 +142,13 @@ def solve(
     spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
         if spacing_s <= conditions.spacing_s:
-            return step.constants(conditions.spacing_s, conditions.spacing_s or None)
+            break
         found_s = step.inter_event_s(spacing_s)
         if found_s >= spacing_s:
             return step.constants(spacing_s, spacing_s)
         # Down to the largest spacing that reproduces itself, from above.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-    raise VoidError("no minimum inter-event time was found")
+    return step.constants(conditions.spacing_s, conditions.spacing_s or None)
 
 
 class _Step:
@@ -267,6 +267,7 @@ def first_passage_s(
         own: ‖K W^{−1}‖.
     """
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
+    known_s = 0.0
     while True:
         growth = plant.growth(window_s, cells)
         fixed = np.cumsum(growth.mismatch.area * mismatch + growth.input_error.area * input_error)
@@ -275,14 +276,15 @@ def first_passage_s(
             echo = np.convolve(growth.input_error.area, rho)[:cells]
             rho = np.minimum(level, fixed + own * echo)
         crossed = np.flatnonzero(rho >= level)
-        if len(crossed) and cells == _COARSE:
+        if len(crossed):
+            known_s = max(known_s, float(growth.mismatch.edges_s[crossed[0]]))
+            if cells == _FINE:
+                return known_s
             window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE
-        elif len(crossed):
-            return float(growth.mismatch.edges_s[crossed[0]])
-        elif window_s >= _LONGEST_S or cells == _FINE:
+        elif window_s >= _LONGEST_S:
             return window_s
-        else:
-            window_s *= 2
+        else:  # a coarse grid may have seen a level reached that is not
+            known_s, window_s = window_s, 2 * window_s
 
 
 def _first_window_s(plant: Plant, level: float, mismatch: float, input_error: float) -> float:

@@ -246,7 +246,7 @@ class Scope:
         trigger, decay = self._resolved.trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
-        if not self._held and alpha < decay and floor < beta:
+        if not self._held and _below(alpha, decay) and floor < beta:
             return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
         # A slower decay, or none, is certified instead; then no threshold is there to be reached.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
@@ -356,8 +356,13 @@ def _assumptions(
     ]
 
 
+def _below(alpha_per_s: float, decay_per_s: float) -> bool:
+    """Clearly: what is decided by rounding cannot be certified."""
+    return alpha_per_s < (1 - 1e-9) * decay_per_s
+
+
 def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
-    holds = alpha < decay
+    holds = _below(alpha, decay)
     why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
     if not holds:
         why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""

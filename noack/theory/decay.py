@@ -45,7 +45,8 @@ def decay_of(generator: Matrix) -> Decay | None:
     Args:
         generator: G, (n, n), per second.
     """
-    if not spectral_abscissa(generator) < 0:
+    rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
+    if not spectral_abscissa(generator) < -rounding:
         return None
     candidates = (_lyapunov_factor(generator), _modal_factor(generator))
     found = [_checked(generator, factor) for factor in candidates if factor is not None]
@@ -60,9 +61,10 @@ def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
     except np.linalg.LinAlgError:
         return None
     turned = factor @ generator @ inverse
-    # Of the two products, and of the inverse; it is the same in any units of the states.
-    size = np.abs(factor) @ np.abs(generator) @ np.abs(inverse) @ np.abs(factor) @ np.abs(inverse)
-    rounding = EPSILON * len(generator) * float(np.linalg.norm(size))
+    # Of the products; and L times its inverse is the identity to the rounding of that product.
+    product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
+    identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse)) * np.linalg.norm(turned)
+    rounding = EPSILON * len(generator) * float(np.linalg.norm(product) + identity)
     if not math.isfinite(rounding):
         return None
     rate = -logarithmic_norm(turned) - rounding

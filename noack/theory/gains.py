@@ -76,10 +76,8 @@ class ErrorGains:
 
     @cached_property
     def inverse_weight(self) -> Matrix:
-        """W^{−1}, to rounding of each entry even if W is ill-conditioned."""
-        wide, found = np.longdouble, np.linalg.inv(self.weight)
-        rest = np.eye(len(found), dtype=wide) - self.weight.astype(wide) @ found.astype(wide)
-        return np.asarray(found + found.astype(wide) @ rest, dtype=np.float64)
+        """W^{−1}."""
+        return np.asarray(np.linalg.inv(self.weight))
 
     @cached_property
     def scaled_H(self) -> Matrix:
