@@ -171,8 +171,8 @@ class Claims:
     def _inter_event_s(self) -> tuple[Reals, Reals]:
         """Times of the events from the second on, and since the one before."""
         rows = self.record[SENSOR_MEASUREMENT]
-        event_s = rows["t_ns"][rows["event"] != NO_SEQUENCE] * 1e-9
-        return event_s[1:], np.diff(event_s)
+        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
+        return event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
 
     def _identity(self) -> Iterator[Claim]:
         residual = identity_residual(self.record, self.joined)[self._in_common]

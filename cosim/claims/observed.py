@@ -11,6 +11,7 @@ from noack.records import (
     CONTROLLER_STEP,
     NETEM_PACKET,
     NO_SEQUENCE,
+    PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     Fate,
@@ -42,9 +43,9 @@ class Observed(NamedTuple):
     sampling: Series
     """Time since the measurement before, in seconds, at every measurement."""
     delay: Series
-    """From an event until the plant felt its update, at the event."""
+    """From an event until the controller had its update and the plant felt it, at the event."""
     hold: Series
-    """Greatest age of the model state behind the input in force, at every step."""
+    """How far the model's time behind the input was from now at most, at every step."""
     start_s: float
     """When the plant began to feel the controller; infinite if never."""
 
@@ -82,63 +83,88 @@ class Observed(NamedTuple):
 
 
 def observe(record: RunRecord) -> Observed:
-    """Read the conditions off the record of a run, complete or not."""
-    steps, ticks = record[PLANT_STEP], record[CONTROLLER_STEP]
-    deliveries, sensor = record[CONTROLLER_DELIVERY], record[SENSOR_MEASUREMENT]
+    """Read the conditions off the record of a run, complete or not: what is not known is late."""
+    steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
     events = sensor[sensor["event"] != NO_SEQUENCE]
+    model_ns, felt = _latched(record)
     known = record.scenario.network.initial_sync == "known_state"
-    newest = np.append(NO_SEQUENCE, deliveries["sequence"])[
-        np.searchsorted(deliveries["input"], ticks["input"])
-    ]
-    # Of each step: its actuation's tick, the model's time there, the newest update in it.
-    tick = np.searchsorted(ticks["sequence"], steps["actuation"])
-    tick = np.where(tick < len(ticks), tick, -1)
-    has = (steps["actuation"] != NO_SEQUENCE) & (tick >= 0) & (len(ticks) > 0)
-    felt = np.full(len(steps), NO_SEQUENCE, dtype=np.int64)
-    model_ns = np.zeros(len(steps), dtype=np.int64)
-    if has.any():
-        felt[has], model_ns[has] = newest[tick[has]], ticks["model_t_ns"][tick[has]]
-    felt = np.maximum.accumulate(felt) if len(felt) else felt
-    feels = has & (known | (felt != NO_SEQUENCE))
+    feels = (steps["actuation"] != NO_SEQUENCE) & (known | (felt != NO_SEQUENCE))
     step_s = steps["t_ns"] * 1e-9
     start_s = float(step_s[np.flatnonzero(feels)[0]]) if feels.any() else np.inf
     until_ns = steps["t_ns"] + record.scenario.plant_period_ns
+    # A plant that is late latches what is of its future.
+    age_ns = np.maximum(until_ns - model_ns, model_ns - steps["t_ns"])
+    end_ns = max(int(rows["t_ns"][-1]) if len(rows) else 0 for rows in (steps, sensor))
     return Observed(
         dropouts=_dropouts(record, events),
-        sampling=_sampling(sensor["t_ns"], int(steps["t_ns"][-1]) if len(steps) else 0),
-        delay=_delays(steps["t_ns"], felt, events, set(deliveries["sequence"].tolist()), start_s),
-        hold=Series(step_s[feels], (until_ns - model_ns)[feels] * 1e-9),
+        sampling=_sampling(sensor["t_ns"], end_ns),
+        delay=_delays(record, events, felt, end_ns, start_s),
+        hold=Series(step_s[feels], age_ns[feels] * 1e-9),
         start_s=start_s,
     )
 
 
+def _latched(record: RunRecord) -> tuple[Times, Times]:
+    """Of each step's input: the model's time behind it, and the newest update in it."""
+    steps, ticks = record[PLANT_STEP], record[CONTROLLER_STEP]
+    inputs, deliveries = record[PLANT_ACTUATION], record[CONTROLLER_DELIVERY]
+    newest = np.append(NO_SEQUENCE, deliveries["sequence"])[
+        np.searchsorted(deliveries["input"], ticks["input"])
+    ]
+    tick = _index(ticks["sequence"], steps["actuation"])
+    # The plant knows a tick's time even if the controller did not live to tell the rest.
+    taken = _index(inputs["sequence"], steps["actuation"])
+    tick_ns = np.append(inputs["t_ns"], 0)[taken]
+    model_ns = np.where(tick >= 0, np.append(ticks["model_t_ns"], 0)[tick], tick_ns)
+    felt = np.append(newest, NO_SEQUENCE)[tick]
+    return model_ns, np.maximum.accumulate(felt) if len(felt) else felt
+
+
+def _index(ascending: Times, wanted: Times) -> NDArray[np.intp]:
+    """Where the wanted numbers are; −1 where they are not."""
+    found = np.searchsorted(ascending, wanted)
+    there = np.append(ascending, NO_SEQUENCE)[found] == wanted
+    return np.where(there & (wanted != NO_SEQUENCE), found, -1)
+
+
 def _sampling(measured_ns: Times, end_ns: int) -> Series:
-    times_ns = np.append(measured_ns, max(end_ns, int(measured_ns.max(initial=0))))
+    """From the start and to the end, too."""
+    times_ns = np.concatenate([[0], measured_ns, [end_ns]])
     gaps_ns = np.diff(times_ns)
     kept = gaps_ns > 0
     return Series(times_ns[:-1][kept] * 1e-9, gaps_ns[kept] * 1e-9)
 
 
 def _delays(
-    step_ns: Times, felt: Times, events: NDArray[np.void], taken: set[int], start_s: float
+    record: RunRecord, events: NDArray[np.void], felt: Times, end_ns: int, start_s: float
 ) -> Series:
-    """Of every update that the controller took and the plant felt, or had not yet at the end."""
-    events = events[[int(sequence) in taken for sequence in events["event"]]]
-    if not len(events) or not len(step_ns):
-        return Series(np.zeros(0), np.zeros(0))
-    step = np.searchsorted(felt, events["event"])
-    felt_ns = np.append(step_ns, step_ns[-1])[step]
-    later = felt_ns * 1e-9 > start_s  # what the start brings with it is the start's
-    return Series(
-        events["t_ns"][later] * 1e-9, ((felt_ns - events["t_ns"])[later] * 1e-9).clip(min=0)
-    )
+    """Of every update that was not lost: until the model had it and the plant felt it.
+
+    Of one that was not heard of until the end, as long as it could have been.
+    """
+    step_ns, deliveries = record[PLANT_STEP]["t_ns"], record[CONTROLLER_DELIVERY]
+    sequences = events["event"]
+    taken = _index(deliveries["sequence"], sequences)
+    newest = int(deliveries["sequence"].max(initial=NO_SEQUENCE))
+    pending = (sequences > newest) & ~np.isin(sequences, list(_dropped(record)))
+    felt_ns = np.append(step_ns, end_ns)[np.searchsorted(felt, sequences)]
+    model_ns = np.append(deliveries["model_t_ns"], 0)[taken]
+    acts_ns = np.where(pending, end_ns, np.maximum(felt_ns, model_ns))
+    # What the start brings with it is the start's.
+    counts = (pending | (taken >= 0)) & (acts_ns * 1e-9 > start_s)
+    delay_ns = (acts_ns - events["t_ns"]).clip(min=0)
+    return Series(events["t_ns"][counts] * 1e-9, delay_ns[counts] * 1e-9)
+
+
+def _dropped(record: RunRecord) -> set[int]:
+    packets, sequences, _ = updates_in(record[NETEM_PACKET])
+    return set(sequences[packets["fate"] == Fate.DROPPED].tolist())
 
 
 def _dropouts(record: RunRecord, events: NDArray[np.void]) -> Series:
     """Runs of lost updates; one that is still under way at the end is not lost."""
     taken = record[CONTROLLER_DELIVERY]["sequence"]
-    packets, sequences, _ = updates_in(record[NETEM_PACKET])
-    dropped = set(sequences[packets["fate"] == Fate.DROPPED].tolist())
+    dropped = _dropped(record)
     newest, kept = int(taken.max(initial=NO_SEQUENCE)), set(taken.tolist())
     runs, run = [], 0
     for sequence in events["event"].tolist():

@@ -31,13 +31,13 @@ def theorem_one(record: RunRecord, joined: Joined) -> float | None:
         for interval in _intervals(record, joined, starts)
     ]
     delta = 1.0
-    stretch: list[float] = []
+    first = 0  # of the missed ones
     for index, start in enumerate(starts):
-        if joined.received[start] >= event[start]:
-            stretch = []  # this event was delivered: a new stretch begins
-        elif joined.received[start] != NO_SEQUENCE:
-            stretch.append(longest_s[index])
-            delta = max(delta, theorem_1(loop.H, trigger.alpha_per_s, stretch))
+        while first <= index and event[starts[first]] <= joined.received[start]:
+            first += 1
+        if first <= index and joined.received[start] != NO_SEQUENCE:
+            missed_s = longest_s[first : index + 1]
+            delta = max(delta, theorem_1(loop.H, trigger.alpha_per_s, missed_s))
     return delta if math.isfinite(delta) else None
 
 

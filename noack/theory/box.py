@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.linear import Matrix, Vector
+from noack.theory.decay import logarithmic_norm
 from noack.theory.enclosure import NotDecayingError, Response, factors, response, response_until
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 
@@ -85,7 +86,7 @@ class BoxGains:
             return 0.0, dict.fromkeys(self.outputs, 0.0)
         R, box = self.error.split_K[1], float(np.linalg.norm(self.halfwidth_A, 2))
         # ‖e^{As}‖ ≤ e^{μs}, and the logarithmic norm μ of a sum is at most the sum's.
-        mu = max(_logarithmic_norm(self.A_model) + box, 0.0) + self.alpha_per_s
+        mu = max(logarithmic_norm(self.A_model) + box, 0.0) + self.alpha_per_s
         size = float(np.linalg.norm(self.start, 2)) * math.exp(mu * start_s)
         turn = float(np.linalg.norm(R @ self.A_model, 2)) + float(np.linalg.norm(R, 2)) * box
         first = float(np.linalg.norm(R @ self.start, 2)) * math.exp(self.alpha_per_s * start_s)
@@ -102,7 +103,10 @@ class BoxGains:
     def growth(self, until_s: float, cells: int) -> Growth:
         """How ‖e_s‖_W grows over ``until_s``, on a grid."""
         H, W = self.error.scaled_H, self.error.weight
-        forced = np.concatenate([self._split_nominal[0], self._mistaken_rows], axis=1)
+        known, mistaken = self._split_nominal[0], self._mistaken_rows
+        # Models that run the box's centre make no mistake that is known.
+        apart = self._split_nominal[1].any() or not self._rows
+        forced = np.concatenate([known, mistaken], axis=1) if apart else mistaken
         return Growth(
             *(
                 response_until(H, D, until_s, cells).through(W)
@@ -195,7 +199,3 @@ class _PeakGains(NamedTuple):
     pushed: float
     kicked: float
     from_mistakes: Vector
-
-
-def _logarithmic_norm(matrix: Matrix) -> float:
-    return float(np.linalg.eigvalsh(0.5 * (matrix + matrix.T)).max())

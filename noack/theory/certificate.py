@@ -41,7 +41,7 @@ class Conditions(NamedTuple):
     delay_s: float = 0.0
     """d, the longest time from an event until the plant feels its update, if it is delivered."""
     hold_s: float = 0.0
-    """σ, the greatest age of the model state behind the input that the plant feels."""
+    """σ, how far the model's time behind the input that the plant feels is from now, at most."""
     start_s: float = 0.0
     """From here on the plant feels the controller's input; before, it feels none."""
 
@@ -59,6 +59,8 @@ class Constants(NamedTuple):
     """β̃/β: ‖e_s‖_W ≤ β̃e^{−αt}."""
     input_error: float
     """π: ‖u − Kx‖ ≤ πe^{−αt}, once the plant feels the controller."""
+    start_error: float
+    """The same before that, when u = 0."""
     state: float
     """X: ‖x‖ ≤ Xe^{−αt}."""
     state_weighted: float
@@ -102,12 +104,20 @@ class Level(NamedTuple):
 
 
 class Background(NamedTuple):
-    """What an earlier phase of the run leaves: lower limits of the bounds between two events."""
+    """What an earlier phase of the run leaves: its bounds, which reach into this one.
 
+    An event of the earlier phase may still be missing in this one, and so may two tests or two
+    events lie on either side of where they meet.
+    """
+
+    sensor_error: float = 0.0
+    """Of β̃."""
     mismatch: float = 0.0
     """Of sup‖R_E x‖."""
     input_error: float = 0.0
-    """Of π."""
+    """Of sup‖p‖."""
+    inter_event_s: float = _LONGEST_S
+    """Of the time between two events."""
 
 
 _CLEAN = Background()
@@ -129,16 +139,16 @@ def solve(
     step = _Step(error, plant, conditions, level, background)
     if level.reached is None:
         return step.constants(conditions.spacing_s, None)
-    spacing_s = _LONGEST_S
+    spacing_s = background.inter_event_s
     for _ in range(_ATTEMPTS):
+        if spacing_s <= conditions.spacing_s:
+            break
         found_s = step.inter_event_s(spacing_s)
         if found_s >= spacing_s:
             return step.constants(spacing_s, spacing_s)
         # Down to the largest spacing that reproduces itself, from above.
         spacing_s = found_s if found_s < (1 - _SETTLED) * spacing_s else (1 - _SETTLED) * found_s
-        if spacing_s <= conditions.spacing_s:
-            return step.constants(conditions.spacing_s, conditions.spacing_s or None)
-    raise VoidError("no minimum inter-event time was found")
+    return step.constants(conditions.spacing_s, conditions.spacing_s or None)
 
 
 class _Step:
@@ -186,10 +196,11 @@ class _Step:
         )
         input_fixed = hold_s * rate.free + self._remainder * weighted.free
         from_p = self._mismatch_growth * mismatch.gain + self._input_growth
-        error_fixed = (
+        error_fixed = max(
             self._stretch * self._level.beta
             + self._mismatch_growth * max(mismatch.free, self._background.mismatch)
-            + self._input_growth * max(self._start_error, self._background.input_error)
+            + self._input_growth * max(self._start_error, self._background.input_error),
+            self._background.sensor_error,
         )
         loop_gain = own + from_e_s * from_p
         if not loop_gain < 1:
@@ -203,6 +214,7 @@ class _Step:
             shares[Output.WEIGHTED] * sensor_error / self._level.beta,
             sensor_error / self._level.beta,
             input_error,
+            self._start_error,
             state[Output.STATE],
             state[Output.WEIGHTED],
             state[Output.MISMATCH],
@@ -255,6 +267,7 @@ def first_passage_s(
         own: ‖K W^{−1}‖.
     """
     window_s, cells = _first_window_s(plant, level, mismatch, input_error + own * level), _COARSE
+    known_s = 0.0
     while True:
         growth = plant.growth(window_s, cells)
         fixed = np.cumsum(growth.mismatch.area * mismatch + growth.input_error.area * input_error)
@@ -263,14 +276,15 @@ def first_passage_s(
             echo = np.convolve(growth.input_error.area, rho)[:cells]
             rho = np.minimum(level, fixed + own * echo)
         crossed = np.flatnonzero(rho >= level)
-        if len(crossed) and cells == _COARSE:
+        if len(crossed):
+            known_s = max(known_s, float(growth.mismatch.edges_s[crossed[0]]))
+            if cells == _FINE:
+                return known_s
             window_s, cells = float(growth.mismatch.edges_s[crossed[0] + 1]), _FINE
-        elif len(crossed):
-            return float(growth.mismatch.edges_s[crossed[0]])
-        elif window_s >= _LONGEST_S or cells == _FINE:
+        elif window_s >= _LONGEST_S:
             return window_s
-        else:
-            window_s *= 2
+        else:  # a coarse grid may have seen a level reached that is not
+            known_s, window_s = window_s, 2 * window_s
 
 
 def _first_window_s(plant: Plant, level: float, mismatch: float, input_error: float) -> float:

@@ -27,7 +27,6 @@ from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
 OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
-_SCHEDULE_STEPS = 100_000
 
 _RESOLUTION = 1e-3
 
@@ -66,9 +65,7 @@ class Certificate:
     @property
     def floor_from_s(self) -> float:
         """When βe^{−αt} falls below the floor ε; infinite without a floor."""
-        if self.floor == 0:
-            return math.inf
-        return max(math.log(self.beta / self.floor) / self.alpha_per_s, 0.0)
+        return _floor_from_s(self.beta, self.alpha_per_s, self.floor)
 
     @property
     def inter_event_s(self) -> float | None:
@@ -114,32 +111,33 @@ class Certificate:
         return np.asarray(bound)
 
 
+def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
+    return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
+
+
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
 
-    In the plant's time: an update is felt from the first step on whose newest tick comes after it,
-    and the model state behind an input ages until the step after the one that latched it.
+    In the plant's time, whatever the rates: an update is felt from the first step on whose newest
+    tick is not before it, and the model state behind an input ages until the step after the one
+    that latched it. The plant steps before it takes what arrives at the same time.
     """
     step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
     phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
-    steps = min(math.lcm(step_ns, tick_ns) // step_ns + 2 * tick_ns // step_ns + 4, _SCHEDULE_STEPS)
-    grid_ns = step_ns * np.arange(1, steps + 1, dtype=np.int64)
-    # The plant steps before it takes what arrives at the same time.
-    newest_ns = phase_ns + (grid_ns - 1 - phase_ns) // tick_ns * tick_ns
-    felt = newest_ns >= phase_ns
-    hold_ns = int((grid_ns - newest_ns)[felt].max()) + step_ns
-    samples_ns = sample_ns * np.arange(max(len(grid_ns) * step_ns // (2 * sample_ns), 1))
-    first = np.searchsorted(newest_ns, samples_ns, side="left")
-    known = first < len(grid_ns)
-    delay_ns = int((grid_ns[first[known]] - samples_ns[known]).max())
+    # From a step back to the tick before: 0 < age ≤ tick, and age ≡ −phase modulo the gcd, all of
+    # which occur sooner or later. From a measurement on to the next tick: 0 ≤ wait < tick.
+    newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
+    common_ns = math.gcd(sample_ns, tick_ns)
+    wait_ns = tick_ns - common_ns + phase_ns % common_ns
+    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     late_ns = late_periods * step_ns
     return Conditions(
         dropouts=resolved.network.mansd,
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
         delay_s=(delay_ns + late_ns) / NS_PER_S,
-        hold_s=(hold_ns + late_ns) / NS_PER_S,
-        start_s=(max(delay_ns, int(grid_ns[felt][0])) + late_ns) / NS_PER_S,
+        hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
+        start_s=(first_ns + late_ns) / NS_PER_S,
     )
 
 
@@ -248,7 +246,7 @@ class Scope:
         trigger, decay = self._resolved.trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
-        if not self._held and alpha < decay and floor < beta:
+        if not self._held and _below(alpha, decay) and floor < beta:
             return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
         # A slower decay, or none, is certified instead; then no threshold is there to be reached.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
@@ -258,21 +256,28 @@ class Scope:
     def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
         """Once the threshold is the floor: from any state the first phase leaves, without decay.
 
-        An event before then left at most βe^{−αt_k} = εe^{α(t_ε−t_k)}, so that Δ keeps α's kernels.
-        What the first phase leaves, left its mark up to one test or one inter-event time before.
+        What the first phase leaves falls like e^{−αt}: what was there τ before t_ε is greater than
+        at t_ε by e^{ατ}. The models' side keeps α, so that its kernels, e^{(H+αI)τ}, bring that
+        factor along wherever something of the first phase reaches into this one.
         """
         trigger = self._resolved.trigger
-        share = trigger.floor / trigger.beta
-        start = share * first.state * np.eye(self._loop.n)
-        back_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
-        earlier = share * math.exp(trigger.alpha_per_s * back_s)
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
+        before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
+        started = conditions.start_s + before_s <= from_s
+        background = Background(
+            sensor_error=floor * first.overshoot,
+            mismatch=share * first.mismatch,
+            input_error=share * max(first.input_error, 0.0 if started else first.start_error),
+            inter_event_s=first.inter_event_s or 0.0,
+        )
         found = self._solve(
-            conditions._replace(start_s=0.0),
-            trigger.alpha_per_s,
+            conditions._replace(start_s=max(conditions.start_s - from_s, 0.0)),
+            alpha,
             0.0,
-            start,
-            Level(trigger.floor, trigger.floor),
-            Background(earlier * first.mismatch, earlier * first.input_error),
+            share * first.state * np.eye(self._loop.n),
+            Level(floor, floor),
+            background,
         )
         return found._replace(rate_per_s=0.0)
 
@@ -351,8 +356,13 @@ def _assumptions(
     ]
 
 
+def _below(alpha_per_s: float, decay_per_s: float) -> bool:
+    """Clearly: what is decided by rounding cannot be certified."""
+    return alpha_per_s < (1 - 1e-9) * decay_per_s
+
+
 def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
-    holds = alpha < decay
+    holds = _below(alpha, decay)
     why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
     if not holds:
         why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""

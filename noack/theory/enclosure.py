@@ -4,9 +4,12 @@ A response e^{Gτ}D is computed at the nodes of a grid. Between two nodes, a ste
 F(τ) = C e^{Gτ} D differs from the chord by at most s²/8 · sup‖F''‖ (its integral by s³/12 ·
 sup‖F''‖), and a norm is convex along a chord. sup‖F''‖ over the cell is bounded by Taylor's formula
 from the node, F'' = C G² e^{Gτ} D and its derivatives, the remainder by e^{μ s} with μ the
-logarithmic norm of G. Beyond the grid a Lyapunov function bounds the rest: GᵀP + PG ⪯ −2νP gives
-‖C e^{G(T+s)} D‖ ≤ ‖C P^{−1/2}‖ ‖P^{1/2} e^{GT} D‖ e^{−νs}. Rounding, some 1e-12 of a value, is
-covered by a relative inflation of 1e-9.
+logarithmic norm of G, or in coordinates L in which it is −ν < 0 (:mod:`noack.theory.decay`), as it
+suits: ‖C e^{Gs} Y‖ ≤ ‖C L^{−1}‖ ‖L Y‖ e^{−νs}. The same bounds what is beyond the grid. Steps grow
+as fast modes die out, so that a stiff system takes hardly more of them than another.
+
+Rounding: of the products C Y by n ε |C| |Y|, which counts where C and D are ill-conditioned; all
+the rest, some 1e-12 of a value, by a relative inflation of 1e-9.
 """
 
 import math
@@ -17,14 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from noack.linear import Matrix, spectral_abscissa
-
-Stack = NDArray[np.float64]
+from noack.theory.decay import EPSILON, Decay, Stack, decay_of, frobenius_norms, logarithmic_norm
 
 _ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
+_LARGEST_EXPONENT = 100.0
 _BLOCK = 64
-_STEPS_PER_RATE = (0.05, 0.1, 0.2)
-_CELLS_PER_STEP = 256
+_FIRST_STEP, _STEP = 0.05, 0.2
+"""Of the fastest mode's time constant."""
+_SAG = 0.005
+"""By how much of ‖e^{Gτ}D‖ a chord may lie below it for a step to be longer than that."""
+_CELLS_PER_BLOCK = 256
 _MOST_CELLS = 60_000
 _TAIL_SHARE = 1e-5
 
@@ -83,48 +89,63 @@ class Response:
     """(cells + 1,)"""
     states: Stack
     """(cells + 1, n, r), e^{Gτ} D."""
-    tail: "_Tail | None"
+    decay: Decay | None
+    """None if it is not needed, or if G does not decay."""
+    endless: bool
+    """Whether bounds beyond the grid are asked for."""
 
     def through(self, C: Matrix) -> Kernel:
         """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
-        norms = _spectral_norms(C @ self.states)
-        bend = self._second_derivative(C, steps_s)
+        norms = norm_bounds(C, self.states)
+        bend = _second_derivative(self.generator, C, self.states[:-1], steps_s, self.decay)
         ends = np.maximum(norms[:-1], norms[1:])
         middle = 0.5 * (norms[:-1] + norms[1:])
-        beyond = math.inf if self.tail is None else self.tail.through(C) * _ROUNDING
+        rate, beyond = 0.0, math.inf
+        if self.endless and self.decay is not None:
+            rate = self.decay.rate_per_s
+            beyond = float(self.decay.bounds(C, self.states[-1:])[0]) * _ROUNDING
         return Kernel(
             self.edges_s,
             (ends + steps_s**2 / 8 * bend) * _ROUNDING,
             (steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING,
             beyond,
-            beyond if self.tail is None else beyond / self.tail.rate_per_s,
-            0.0 if self.tail is None else self.tail.rate_per_s,
+            beyond / rate if rate > 0 else math.inf,
+            rate,
         )
 
-    def _second_derivative(self, C: Matrix, steps_s: Stack) -> Stack:
-        """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node."""
-        bound = np.zeros(len(steps_s))
-        row = C @ self.generator @ self.generator
-        nodes = self.states[:-1]
-        for order in range(_TAYLOR_TERMS):
-            bound += steps_s**order / math.factorial(order) * _frobenius_norms(row @ nodes)
-            row = row @ self.generator
-        growth = np.exp(max(_logarithmic_norm(self.generator), 0.0) * steps_s)
-        rest = np.linalg.norm(row, 2) * growth * _frobenius_norms(nodes)
-        return np.asarray(bound + steps_s**_TAYLOR_TERMS / math.factorial(_TAYLOR_TERMS) * rest)
+
+def norm_bounds(C: Matrix, states: Stack) -> Stack:
+    """Upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), the product's rounding included."""
+    exact = C @ states
+    # Of a vector, the Euclidean norm is the spectral one.
+    norms = (
+        frobenius_norms(exact)
+        if min(exact.shape[1:]) == 1
+        else np.linalg.norm(exact, 2, axis=(1, 2))
+    )
+    return np.asarray(norms + EPSILON * len(C.T) * frobenius_norms(np.abs(C) @ np.abs(states)))
 
 
-class _Tail(NamedTuple):
-    factor_inverse: Matrix
-    """P^{−1/2}."""
-    height: float
-    """‖P^{1/2} e^{GT} D‖."""
-    rate_per_s: float
-    """ν."""
-
-    def through(self, C: Matrix) -> float:
-        return float(np.linalg.norm(C @ self.factor_inverse, 2)) * self.height
+def _second_derivative(
+    generator: Matrix, C: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None
+) -> Stack:
+    """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node (k, n, r)."""
+    exponents = max(logarithmic_norm(generator), 0.0) * steps_s
+    growth = np.where(
+        exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
+    )
+    moved = generator @ (generator @ nodes)
+    bound = np.zeros(len(steps_s))
+    least = bound + np.inf if decay is None else decay.bounds(C, moved)
+    for order in range(_TAYLOR_TERMS):
+        bound += steps_s**order / math.factorial(order) * frobenius_norms(C @ moved)
+        moved = generator @ moved
+    rest = float(np.linalg.norm(C, 2)) * growth * frobenius_norms(moved)
+    if decay is not None:
+        rest = np.minimum(rest, decay.bounds(C, moved))
+    bound += steps_s**_TAYLOR_TERMS / math.factorial(_TAYLOR_TERMS) * rest
+    return np.asarray(np.minimum(least, bound))
 
 
 def response(generator: Matrix, D: Matrix) -> Response:
@@ -136,36 +157,50 @@ def response(generator: Matrix, D: Matrix) -> Response:
     margin = -spectral_abscissa(generator)
     if margin <= 0:
         raise NotDecayingError(f"the slowest mode grows at {-margin:.3g} /s")
-    rate = 0.5 * margin
-    factor = _lyapunov_factor(generator, rate)
-    inverse = np.asarray(np.linalg.inv(factor))
-    condition = float(np.linalg.norm(factor, 2) * np.linalg.norm(inverse, 2))
+    decay = decay_of(generator)
+    if decay is None:
+        raise NotDecayingError("no Lyapunov function of it was found to working precision")
+    everything = np.eye(len(generator))
     parts: list[Stack] = []
     edges: list[Stack] = [np.zeros(1)]
-    area, t_s = 0.0, 0.0
-    state, cells, level = D, 0, 0
+    area, t_s, state, cells = 0.0, 0.0, D, 0
+    usual_s = _STEP / _fastest(generator)
+    step_s = usual_s * _FIRST_STEP / _STEP
     while True:
-        step_s = _STEPS_PER_RATE[min(level, 2)] / _fastest(generator)
-        states = _propagate(generator, state, step_s, _CELLS_PER_STEP)
+        states = _propagate(generator, state, step_s, _CELLS_PER_BLOCK)
         parts.append(states[:-1])
-        edges.append(np.asarray(t_s + step_s * np.arange(1.0, _CELLS_PER_STEP + 1)))
+        edges.append(np.asarray(t_s + step_s * np.arange(1.0, _CELLS_PER_BLOCK + 1)))
         t_s, state = float(edges[-1][-1]), states[-1]
-        area += step_s * float(_frobenius_norms(states[:-1]).sum())
-        cells, level = cells + _CELLS_PER_STEP, level + 1
-        rest = float(np.linalg.norm(state)) * condition / rate
+        area += step_s * float(frobenius_norms(states[:-1]).sum())
+        cells += _CELLS_PER_BLOCK
+        rest = float(decay.bounds(everything, state[None])[0]) / decay.rate_per_s
         if rest <= _TAIL_SHARE * area or cells >= _MOST_CELLS:
             break
-    tail = _Tail(inverse, float(np.linalg.norm(factor @ state, 2)), rate)
-    return Response(generator, np.concatenate(edges), np.concatenate([*parts, state[None]]), tail)
+        while step_s > usual_s and not _straight(generator, state, step_s, decay):
+            step_s /= 2
+        if 2 * step_s <= usual_s or _straight(generator, state, 2 * step_s, decay):
+            step_s *= 2
+    states = np.concatenate([*parts, state[None]])
+    return Response(generator, np.concatenate(edges), states, decay, endless=True)
+
+
+def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> bool:
+    """Whether e^{Gτ} Y hardly differs from its chord over a step from here."""
+    size = float(np.linalg.norm(state))
+    everything, steps_s = np.eye(len(generator)), np.array([step_s])
+    bend = _second_derivative(generator, everything, state[None], steps_s, decay)
+    return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
 
 
 def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64) -> Response:
     """Follow e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
+    step_s = until_s / cells
     return Response(
         generator,
         np.linspace(0.0, until_s, cells + 1),
-        _propagate(generator, D, until_s / cells, cells),
-        None,
+        _propagate(generator, D, step_s, cells),
+        decay_of(generator) if step_s * np.linalg.norm(generator) > 1 else None,
+        endless=False,
     )
 
 
@@ -204,43 +239,7 @@ def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> S
     return np.concatenate(blocks)[: cells + 1]
 
 
-def _lyapunov_factor(generator: Matrix, rate_per_s: float) -> Matrix:
-    """A factor L of P = LᵀL with GᵀP + PG ⪯ −2νP, checked after the fact.
-
-    Raises:
-        NotDecayingError: no such P was found to working precision.
-    """
-    from scipy.linalg import cholesky, solve_continuous_lyapunov
-
-    n = len(generator)
-    shifted = generator + rate_per_s * np.eye(n)
-    P = solve_continuous_lyapunov(shifted.T, -np.eye(n))
-    P = 0.5 * (P + P.T)
-    residual = shifted.T @ P + P @ shifted
-    try:
-        factor = cholesky(P)
-    except np.linalg.LinAlgError:
-        raise NotDecayingError("no Lyapunov function was found") from None
-    if np.linalg.eigvalsh(residual).max() > 0:
-        raise NotDecayingError("the Lyapunov function does not stand its check")
-    return np.asarray(factor)
-
-
 def _fastest(generator: Matrix) -> float:
     """The rate in 1/s that sets the step."""
     magnitude = float(np.abs(np.linalg.eigvals(generator)).max())
-    return max(magnitude, 0.2 * _logarithmic_norm(generator), np.finfo(float).tiny)
-
-
-def _logarithmic_norm(generator: Matrix) -> float:
-    return float(np.linalg.eigvalsh(0.5 * (generator + generator.T)).max())
-
-
-def _spectral_norms(stack: Stack) -> Stack:
-    if min(stack.shape[1:]) == 1:
-        return _frobenius_norms(stack)
-    return np.asarray(np.linalg.norm(stack, 2, axis=(1, 2)))
-
-
-def _frobenius_norms(stack: Stack) -> Stack:
-    return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))
+    return max(magnitude, 0.2 * logarithmic_norm(generator), np.finfo(float).tiny)

@@ -24,6 +24,7 @@ from noack.theory.enclosure import (
     Response,
     constant_kernel,
     factors,
+    norm_bounds,
     response,
     response_until,
 )
@@ -102,10 +103,7 @@ class ErrorGains:
             NotDecayingError: α is not below the decay rate of e^{Hτ}.
         """
         if not self.scaled_H.any():  # a hold: what was missed stays missed
-            return {
-                output: constant_kernel(float(np.linalg.norm(C @ self.inverse_weight, 2)))
-                for output, C in self.outputs.items()
-            }
+            return {output: constant_kernel(self.now(output)) for output in self.outputs}
         followed = response(self.scaled_H, self.inverse_weight)
         found = {output: followed.through(C) for output, C in self.outputs.items()}
         if self.contracts:  # ‖·‖_W is a Lyapunov function: no sum of missing events exceeds M
@@ -122,7 +120,9 @@ class ErrorGains:
 
     def now(self, output: Output) -> float:
         """‖C W^{−1}‖: the share of the present e_s."""
-        return float(np.linalg.norm(self.outputs[output] @ self.inverse_weight, 2))
+        if output is Output.WEIGHTED:
+            return 1.0
+        return float(norm_bounds(self.outputs[output], self.inverse_weight[None])[0])
 
     def missing(self, output: Output, events: int, spacing_s: float) -> float:
         """Σ_{j<N} sup_{τ ≥ jδ} ‖C e^{(H+αI)τ} W^{−1}‖: the share of N missing events, δ apart."""
@@ -131,12 +131,17 @@ class ErrorGains:
         )
 
     def hold_remainder(self, hold_s: float) -> float:
-        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, σ ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
+        """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
         if hold_s == 0:
             return 0.0
-        followed = response_until(-self.H, self.inverse_weight, hold_s, 16)
-        second = followed.through(self.split_K[1] @ self.H @ self.H).sup_on_grid()
-        return 0.5 * hold_s**2 * second
+        curvature = self.split_K[1] @ self.H @ self.H
+        return max(
+            0.5 * hold_s**2 * followed.through(curvature).sup_on_grid()
+            for followed in (
+                response_until(generator, self.inverse_weight, hold_s, 16)
+                for generator in (-self.H, self.H)
+            )
+        )
 
 
 @dataclass(frozen=True)

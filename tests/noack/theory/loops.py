@@ -91,16 +91,57 @@ class Worst(NamedTuple):
         }
 
 
-def simulate(system: System, delivered: Flags, delays: NDArray[np.int64]) -> Worst:
+class Trace(NamedTuple):
+    """The largest of all runs, (STEPS,) each, and the shortest time between two events."""
+
+    sensor_error: Reals
+    """‖e_s‖_W before a reset."""
+    controller_error: Reals
+    state: Reals
+    state_weighted: Reals
+    input_error: Reals
+    inter_event_s: float
+
+    def worst(self, system: System) -> Worst:
+        growth = np.exp(system.alpha * times_s(system))
+        return Worst(*(float((growth * series).max()) for series in self[:-1]), self.inter_event_s)
+
+
+def times_s(system: System) -> Reals:
+    """Of the steps, (STEPS,)."""
+    return np.arange(STEPS) * system.step_s
+
+
+class Plants(NamedTuple):
+    """Plants between which each run switches as it likes."""
+
+    pool: list[tuple[Matrix, Matrix]]
+    """(A, B) of each."""
+    which: NDArray[np.int64]
+    """(runs, STEPS) the plant of each run in each step."""
+
+
+def simulate(
+    system: System,
+    delivered: Flags,
+    delays: NDArray[np.int64],
+    *,
+    floor: float = 0.0,
+    plants: Plants | None = None,
+) -> Trace:
     """All runs at once.
 
     Args:
         system: the loop.
         delivered: (runs, events) what the network lets through.
         delays: (runs, events) steps that each update is under way.
+        floor: of the trigger's threshold.
+        plants: instead of the system's own.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
-    model, steps = _Propagators(system), Steps(system)
+    steps = Steps(system)
+    pool = [(system.A, system.B)] if plants is None else plants.pool
+    model = [_Propagators(system, A, B) for A, B in pool]
     x = np.tile(system.x0, (runs, 1))
     x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
     # An update under way is kept as what it will be when it arrives; 0 in ``arrives`` is none.
@@ -108,12 +149,12 @@ def simulate(system: System, delivered: Flags, delays: NDArray[np.int64]) -> Wor
     newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
     synchronised = np.full(runs, system.known_start)
     commands: list[tuple[Reals, Flags]] = []
-    worst, shortest, every = np.zeros(5), 10**9, np.arange(runs)
+    trace, shortest, every = np.zeros((5, STEPS)), 10**9, np.arange(runs)
     for step in range(STEPS):
-        growth = np.exp(system.alpha * step * system.step_s)
-        worst[0] = max(worst[0], growth * np.linalg.norm((x_s - x) @ W, axis=1).max())
+        threshold = max(system.beta * np.exp(-system.alpha * step * system.step_s), floor)
+        trace[0, step] = np.linalg.norm((x_s - x) @ W, axis=1).max()
         if step % steps.sample == 0:
-            event = growth * np.linalg.norm((x_s - x) @ W, axis=1) > system.beta
+            event = np.linalg.norm((x_s - x) @ W, axis=1) > threshold
             event |= step == 0 and not system.known_start
             shortest = min(
                 shortest, int((step - last_event)[event & (events > 0)].min(initial=10**9))
@@ -122,7 +163,7 @@ def simulate(system: System, delivered: Flags, delays: NDArray[np.int64]) -> Wor
             put = np.flatnonzero(event & delivered[every, events])
             under_way = delays[put, events[put]]
             slot = (step + under_way) % (steps.delay + 1)
-            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model.late[under_way])
+            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model[0].late[under_way])
             arrives[put, slot] = events[put] + 1
             events = events + event
         slot_now = step % (steps.delay + 1)
@@ -146,14 +187,11 @@ def simulate(system: System, delivered: Flags, delays: NDArray[np.int64]) -> Wor
                 np.linalg.norm(u - x @ K, axis=1)[feels],
             )
         ):
-            worst[i + 1] = max(worst[i + 1], growth * value.max(initial=0.0))
-        if steps.hold == 0:
-            together = np.concatenate([x, x_c], axis=1) @ model.both
-            x = np.where(feels[:, None], together[:, :n], x @ model.free)
-        else:
-            x = np.concatenate([x, u], axis=1) @ model.held
-        x_s, x_c = x_s @ model.model, x_c @ model.model
-    return Worst(*(float(value) for value in worst), shortest * system.step_s)
+            trace[i + 1, step] = value.max(initial=0.0)
+        following = [own.advance(x, x_c, u, feels, held=steps.hold > 0) for own in model]
+        x = following[0] if plants is None else np.array(following)[plants.which[:, step], every]
+        x_s, x_c = x_s @ model[0].model, x_c @ model[0].model
+    return Trace(*trace, shortest * system.step_s)
 
 
 class Steps:
@@ -168,15 +206,22 @@ class Steps:
 class _Propagators:
     """Over one step, transposed, for rows of states."""
 
-    def __init__(self, system: System) -> None:
-        (n, m), step_s = system.B.shape, system.step_s
+    def __init__(self, system: System, A: Matrix, B: Matrix) -> None:
+        (n, m), step_s = B.shape, system.step_s
         flow, held = np.zeros((2 * n, 2 * n)), np.zeros((n + m, n + m))
-        flow[:n, :n], flow[:n, n:], flow[n:, n:] = system.A, system.B @ system.K, system.H
-        held[:n, :n], held[:n, n:] = system.A, system.B
-        self.both = expm(flow * step_s).T
+        flow[:n, :n], flow[:n, n:], flow[n:, n:] = A, B @ system.K, system.H
+        held[:n, :n], held[:n, n:] = A, B
+        self.both = expm(flow * step_s).T[:, :n]
         self.held = expm(held * step_s).T[:, :n]
-        self.free, self.model = expm(system.A * step_s).T, expm(system.H * step_s).T
+        self.free, self.model = expm(A * step_s).T, expm(system.H * step_s).T
         self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
+
+    def advance(self, x: Reals, x_c: Reals, u: Reals, feels: Flags, *, held: bool) -> Reals:
+        """x of all runs, a step later; u = K x_c moves on unless it is held."""
+        if held:
+            return np.concatenate([x, u], axis=1) @ self.held
+        together = np.concatenate([x, x_c], axis=1) @ self.both
+        return np.where(feels[:, None], together, x @ self.free)
 
 
 def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[np.int64]]:

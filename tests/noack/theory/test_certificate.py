@@ -28,7 +28,7 @@ seeds = st.integers(0, 2**32)
 
 def exceeded(system: System, certified: Constants, seed: int) -> list[str]:
     """The bounds that some run exceeds."""
-    worst = simulate(system, *networks(np.random.default_rng(seed), system))
+    worst = simulate(system, *networks(np.random.default_rng(seed), system)).worst(system)
     shares = worst.shares(certified, system.beta)
     return [name for name, share in shares.items() if share > ROUNDING]
 

@@ -1,0 +1,76 @@
+"""Random loops in exact continuous time, as the paper has them: not sampled, delayed or held."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.exact.loop import ContinuousLoop, Samples
+from cosim.exact.run import ContinuousRun, TooManyEventsError, simulate_continuous
+from noack.linear import Vector
+from noack.resolve import Loop
+from noack.trigger.decaying import DecayingTrigger
+from tests.noack.theory.loops import System
+
+_MOST_EVENTS = 3000
+
+
+class Observed(NamedTuple):
+    """A run, looked at: at all events just before the reset, and densely in between."""
+
+    run: ContinuousRun
+    samples: Samples
+
+    def norms(self, errors: np.ndarray) -> Vector:
+        return self.run.system.norms(errors)
+
+
+def loop_of(system: System) -> Loop:
+    plain = np.array_equal(system.weight, np.eye(len(system.A)))
+    names = tuple(f"x_{i}" for i in range(len(system.A)))
+    return Loop(
+        A_model=system.H - system.B @ system.K, B_model=system.B, K=system.K, H=system.H,
+        A=system.A, B=system.B, x0=system.x0, weight=None if plain else system.weight,
+        state_names=names, input_names=names[: len(system.K)],
+    )  # fmt: skip
+
+
+def observe(system: System, horizon_s: float, seed: int, samples: int = 400) -> Iterator[Observed]:
+    """Runs with several patterns of losses: all that may be lost, none, every other, at random."""
+    loop = loop_of(system)
+    trigger = DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
+    continuous = ContinuousLoop(loop, trigger)
+    rng = np.random.default_rng(seed)
+    for share in (1.0, 0.0, 0.5, 0.8):
+        arrives = _pattern(rng.uniform(size=_MOST_EVENTS) < share, system)
+        try:
+            run = simulate_continuous(
+                continuous, horizon_s=horizon_s, delivered=arrives,
+                known_start=system.known_start, max_events=_MOST_EVENTS,
+            )  # fmt: skip
+        except TooManyEventsError:
+            continue
+        yield Observed(run, _looked_at(run, np.linspace(0.0, run.reached_s, samples)))
+
+
+def _looked_at(run: ContinuousRun, t_s: Vector) -> Samples:
+    """At the given times and, before the resets, at the events."""
+    dense, before = run.at(t_s), run.before
+    if not before:
+        return dense
+    return Samples(
+        np.concatenate([dense.t_s, [state.t_s for state in before]]),
+        *(
+            np.concatenate([getattr(dense, name), [getattr(state, name) for state in before]])
+            for name in ("x", "e_s", "e_c")
+        ),
+    )
+
+
+def _pattern(lost: np.ndarray, system: System) -> list[bool]:
+    run, delivered = 0, []
+    for event, drop in enumerate(lost):
+        drop = drop and run < system.mansd and (system.known_start or event > 0)
+        run = run + 1 if drop else 0
+        delivered.append(not drop)
+    return delivered

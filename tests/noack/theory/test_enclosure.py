@@ -1,0 +1,312 @@
+"""Enclosures against dense sampling, quadrature and decimal arithmetic, on every kind of system."""
+
+import math
+from collections.abc import Callable
+from decimal import Decimal, localcontext
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from noack.linear import Matrix, spectral_abscissa
+from noack.theory.decay import decay_of
+from noack.theory.enclosure import (
+    Kernel,
+    NotDecayingError,
+    constant_kernel,
+    factors,
+    response,
+    response_until,
+)
+
+Rng = np.random.Generator
+
+
+def turned(rng: Rng, blocks: Matrix) -> Matrix:
+    """The same system in skew coordinates."""
+    S = rng.normal(size=blocks.shape) + 2 * np.eye(len(blocks))
+    return np.asarray(S @ blocks @ np.linalg.inv(S))
+
+
+def dense(rng: Rng, n: int) -> Matrix:
+    G = rng.normal(size=(n, n)) * 3
+    return np.asarray(G - (spectral_abscissa(G) + rng.uniform(0.3, 2)) * np.eye(n))
+
+
+def stiff(rng: Rng, n: int) -> Matrix:
+    rates = np.geomspace(1.0, 10.0 ** rng.uniform(2, 4), n)
+    return turned(rng, np.diag(-rates)) if n > 1 else np.array([[-1e4]])
+
+
+def defective(rng: Rng, n: int) -> Matrix:
+    """One Jordan block."""
+    return turned(rng, np.diag(np.ones(n - 1), 1) - rng.uniform(0.3, 1.0) * np.eye(n))
+
+
+def non_normal(rng: Rng, n: int) -> Matrix:
+    """Grows by orders of magnitude before it decays."""
+    upper = np.triu(rng.normal(size=(n, n)), 1) * 10.0 ** rng.uniform(1, 2)
+    return np.asarray(upper - np.diag(rng.uniform(1, 3, n)))
+
+
+def ringing(rng: Rng, n: int) -> Matrix:
+    """Hardly damped oscillations."""
+    skew = rng.normal(size=(n, n)) * 5
+    return np.asarray(skew - skew.T - rng.uniform(0.05, 0.3) * np.eye(n))
+
+
+KINDS: dict[str, Callable[[Rng, int], Matrix]] = {
+    kind.__name__: kind for kind in (dense, stiff, defective, non_normal, ringing)
+}
+
+
+@st.composite
+def cases(draw: st.DrawFn, kind: str) -> tuple[Matrix, Matrix, Matrix]:
+    """C, G, D of ‖C e^{Gτ} D‖."""
+    n, rng = draw(st.integers(1, 6)), np.random.default_rng(draw(st.integers(0, 2**32)))
+    rows, columns = (draw(st.integers(1, n)) for _ in range(2))
+    G = KINDS[kind](rng, n)
+    assume(decay_of(G) is not None)
+    whole = draw(st.booleans())
+    C = np.eye(n) if whole else rng.normal(size=(rows, n))
+    D = np.eye(n) if whole else rng.normal(size=(n, columns))
+    return C, G, D
+
+
+def values(C: Matrix, G: Matrix, D: Matrix, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """‖C e^{Gt} D‖, each time anew."""
+    return np.asarray(np.linalg.norm(C @ expm(G * t_s[:, None, None]) @ D, 2, axis=(1, 2)))
+
+
+def times(G: Matrix, end_s: float) -> NDArray[np.float64]:
+    """Dense for the fast modes and for the slow ones."""
+    fast = float(np.abs(np.linalg.eigvals(G)).max())
+    return np.unique(
+        np.concatenate([np.geomspace(1e-3 / fast, end_s, 250), np.linspace(0.0, end_s, 400)])
+    )
+
+
+def cell_of(kernel: Kernel, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.searchsorted(kernel.edges_s, t_s, side="right") - 1
+
+
+# The enclosure's own inflation covers rounding; what is left is that of the reference.
+ROUNDING = 1 - 1e-10
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
+    """Cell by cell, beyond the grid, and from any time on; the supremum within 1 %."""
+
+    @settings(max_examples=25)
+    @given(cases(kind))
+    def check(case: tuple[Matrix, Matrix, Matrix]) -> None:
+        C, G, D = case
+        kernel = response(G, D).through(C)
+        grid_s = float(kernel.edges_s[-1])
+        t_s = times(G, 1.2 * grid_s)
+        found = values(C, G, D, t_s)
+        on_grid = t_s < grid_s
+        highest = kernel.highest[cell_of(kernel, t_s[on_grid])]
+        assert (highest >= found[on_grid] * ROUNDING).all()
+        # What is as small as the rounding of the reference says nothing.
+        assert (kernel.sups(t_s) + 1e-13 * found.max() >= found * ROUNDING).all()
+        assert (np.diff(kernel.sups(t_s)) <= 0).all()
+        assert kernel.sup() == kernel.sups(np.zeros(1))[0] == kernel.highest.max()
+        # Sampling misses less than this of the peak: 650 points, the peak smooth or at 0.
+        assert kernel.sup() <= 1.01 * found.max()
+
+    check()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
+    """Cell by cell, by Gauss's formula, which knows ‖C e^{Gτ} d‖ of a vector d to 1e-8 there."""
+    points, weights = np.polynomial.legendre.leggauss(4)
+
+    @settings(max_examples=5)
+    @given(st.integers(2, 5), st.integers(0, 2**32))
+    def check(n: int, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        G, C, d = KINDS[kind](rng, n), rng.normal(size=(n, n)), rng.normal(size=(n, 1))
+        kernel = response(G, d).through(C)
+        begins_s, steps_s = kernel.edges_s[:-1, None], np.diff(kernel.edges_s)[:, None]
+        t_s = begins_s + steps_s * (1 + points) / 2
+        areas = values(C, G, d, t_s.ravel()).reshape(t_s.shape) @ weights * steps_s[:, 0] / 2
+        assert (kernel.area + 1e-13 * areas.sum() >= areas * (1 - 1e-7)).all()
+        assert kernel.integral_on_grid() == pytest.approx(float(kernel.area.sum()))
+        assert kernel.integral() <= 1.01 * float(areas.sum())
+
+    check()
+
+
+def test_the_integral_of_one_mode_is_its_closed_form() -> None:
+    for rate in (1e-3, 1.0, 1e5):
+        kernel = response(np.array([[-rate]]), np.array([[2.0]])).through(np.array([[3.0]]))
+        assert 1.0 <= kernel.integral() / (6 / rate) <= 1.002
+        assert 1.0 <= kernel.sup() / 6 <= 1.001
+        for after in (0.0, 0.5, 3.0, 100.0):  # the last one is far beyond the grid
+            assert kernel.sups(np.array([after / rate]))[0] >= 6 * math.exp(-after)
+
+
+def test_the_tail_alone_bounds_what_is_beyond_any_grid() -> None:
+    """A grid that ends while everything still moves."""
+    for kind, make in KINDS.items():
+        G, D = make(np.random.default_rng(4), 4), np.eye(4)
+        whole = response(G, D)
+        for end in (1, 40, 200):
+            cut = whole.__class__(G, whole.edges_s[: end + 1], whole.states[: end + 1],
+                                  whole.decay, endless=True)  # fmt: skip
+            kernel, end_s = cut.through(np.eye(4)), float(whole.edges_s[end])
+            later_s = np.concatenate([[end_s], end_s + times(G, float(whole.edges_s[-1]))])
+            found = values(np.eye(4), G, D, later_s)
+            bounds = kernel.tail_highest * np.exp(-kernel.tail_rate_per_s * (later_s - end_s))
+            assert (bounds + 1e-13 * found.max() >= found * ROUNDING).all(), kind
+            np.testing.assert_allclose(kernel.sups(later_s), bounds, rtol=1e-12)
+            rest = whole.through(np.eye(4)).area[end:].sum()
+            assert kernel.tail_area >= rest / 1.01
+
+
+@settings(max_examples=60)
+@given(
+    st.integers(1, 5), st.integers(0, 2**32), st.sampled_from([0.1, 1.0, 10.0, 100.0]),
+    st.sampled_from([1, 16, 64]), st.booleans(),
+)  # fmt: skip
+def test_over_a_finite_time_growing_systems_are_enclosed_too(
+    n: int, seed: int, reach: float, cells: int, grows: bool
+) -> None:
+    """However coarse the grid: with 100 time constants in a single cell, the bound is far off."""
+    rng = np.random.default_rng(seed)
+    G, D, C = (rng.normal(size=(n, n)) for _ in range(3))
+    if not grows:
+        G -= (spectral_abscissa(G) + 0.5) * np.eye(n)
+    until_s = reach / float(np.linalg.norm(G, 2))
+    kernel = response_until(G, D, until_s, cells).through(C)
+    assert len(kernel.area) == cells
+    t_s = np.linspace(0, until_s, 200)
+    found = values(C, G, D, t_s)
+    assert (kernel.highest[np.minimum(cell_of(kernel, t_s), cells - 1)] >= found * ROUNDING).all()
+    expected = float(np.trapezoid(found, t_s))
+    error = 1e-4 if reach <= 10 else 0.05  # of 200 trapezoids over the fastest turns of F
+    assert kernel.integral_on_grid() >= expected * (1 - error)
+    if reach <= cells / 16:
+        assert kernel.sup_on_grid() <= 1.01 * found.max()
+    assert kernel.tail_highest == kernel.tail_area == math.inf  # nobody asked
+
+
+def test_a_fast_mode_costs_a_coarse_grid_little_if_all_decays() -> None:
+    """10 cells for 1000 time constants of the fast mode, which Taylor's formula cannot reach."""
+    G = np.array([[-1.0, 1.0], [0.0, -1e4]])
+    kernel = response_until(G, np.eye(2), 0.1, 10).through(np.eye(2))
+    assert kernel.sup_on_grid() < 20_000
+    slow = response_until(G, np.array([[1.0], [0.0]]), 0.1, 10).through(np.eye(2))
+    assert slow.sup_on_grid() <= 1.0001
+
+
+def test_a_system_that_does_not_decay_is_refused() -> None:
+    with pytest.raises(NotDecayingError, match=r"the slowest mode grows at 2 /s"):
+        response(np.diag([-1.0, 2.0]), np.eye(2))
+    for G in (np.zeros((1, 1)), np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([1e-9, -1e9])):
+        with pytest.raises(NotDecayingError):
+            response(G, np.eye(len(G)))
+
+
+def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
+    """A Jordan block of ten whose eigenvalues rounding moves by more than they are from 0."""
+    triangular = np.diag(np.ones(9), 1) - 1e-3 * np.eye(10)
+    Q = np.linalg.qr(np.random.default_rng(1).normal(size=(10, 10)))[0]
+    with pytest.raises(NotDecayingError):
+        response(Q @ triangular @ Q.T, np.eye(10))
+    # As it is written, its eigenvalues are exact, and so is what it grows to: t⁹e^{−t/1000}/9!.
+    peak = 9e3**9 / math.factorial(9) * math.exp(-9)
+    assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001
+
+
+@settings(max_examples=40)
+@given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
+def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
+    G = KINDS[kind](np.random.default_rng(seed), n)
+    decay = decay_of(G)
+    assume(decay is not None)
+    assert decay is not None
+    assert 0 < decay.rate_per_s <= -spectral_abscissa(G) * (1 + 1e-9)
+    L = decay.factor
+    for t_s in (1e-3, 0.1, 1.0, 3.0):
+        moved = L @ expm(G * t_s / decay.rate_per_s) @ np.linalg.inv(L)
+        assert np.linalg.norm(moved, 2) <= math.exp(-t_s) + 1e-10 * decay.stretch
+        assert np.linalg.norm(expm(G * t_s), 2) <= decay.stretch * (1 + 1e-9)
+
+
+def decimals(matrix: Matrix) -> list[list[Decimal]]:
+    return [[Decimal(float(entry)) for entry in row] for row in matrix]
+
+
+def times_of(a: list[list[Decimal]], b: list[list[Decimal]]) -> list[list[Decimal]]:
+    columns = list(zip(*b, strict=True))
+    return [
+        [sum((x * y for x, y in zip(row, column, strict=True)), Decimal(0)) for column in columns]
+        for row in a
+    ]
+
+
+def exactly(C: Matrix, G: Matrix, D: list[list[Decimal]], t_s: float) -> float:
+    """‖C e^{Gt} D‖ in 60 digits: Taylor's series at t/2^k, squared k times."""
+    with localcontext() as context:
+        context.prec = 60
+        halvings = max(0, math.ceil(math.log2(max(np.linalg.norm(G) * t_s, 1e-9))) + 2)
+        step = Decimal(t_s) / 2**halvings
+        scaled = [[entry * step for entry in row] for row in decimals(G)]
+        n = len(G)
+        total = term = decimals(np.eye(n))
+        for k in range(1, 35):
+            term = [[entry / k for entry in row] for row in times_of(term, scaled)]
+            pairs = zip(total, term, strict=True)
+            total = [[x + y for x, y in zip(*rows, strict=True)] for rows in pairs]
+        for _ in range(halvings):
+            total = times_of(total, total)
+        found = times_of(decimals(C), times_of(total, D))
+        return float(np.linalg.norm(np.array(found, dtype=np.float64), 2))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("condition", [1.0, 1e4, 1e8, 1e11])
+def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condition: float) -> None:
+    """‖W e^{Gτ} W⁻¹‖ for a W in which errors of 1e-16 grow by the condition of W."""
+    rng = np.random.default_rng(11)
+    n = 3
+    U, V = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+    W = U @ np.diag(np.geomspace(1, condition**-1, n)) @ V
+    G = KINDS[kind](rng, n)
+    D = np.linalg.inv(W)
+    response_ = response(G, D)
+    kernel = response_.through(W)
+    for node in (0, 1, 40, 64, 300):
+        t_s = float(kernel.edges_s[node])
+        exact = exactly(W, G, decimals(D), t_s)
+        assert kernel.highest[node] >= exact
+        assert kernel.sups(np.array([t_s]))[0] >= exact
+
+
+def test_a_rank_is_found_and_kept() -> None:
+    rng = np.random.default_rng(3)
+    for rank in range(1, 5):
+        matrix = rng.normal(size=(5, rank)) @ rng.normal(size=(rank, 4))
+        L, R = factors(matrix)
+        assert L.shape == (5, rank)
+        assert R.shape == (rank, 4)
+        np.testing.assert_allclose(L.T @ L, np.eye(rank), atol=1e-14)
+        np.testing.assert_allclose(L @ R, matrix, atol=1e-13)
+        v = rng.normal(size=4)
+        assert np.linalg.norm(R @ v) == pytest.approx(np.linalg.norm(matrix @ v), rel=1e-12)
+    L, R = factors(np.zeros((3, 2)))
+    assert L.shape[1] == R.shape[0] == 1
+    assert not R.any()
+
+
+def test_what_neither_grows_nor_decays() -> None:
+    kernel = constant_kernel(2.5)
+    np.testing.assert_array_equal(kernel.sups(np.array([0.0, 0.3, 1.0, 1e9])), [2.5] * 4)
+    assert kernel.integral() == math.inf
