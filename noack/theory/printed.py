@@ -17,7 +17,7 @@ from noack.linear import Matrix, Vector, spectral_abscissa
 from noack.resolve import Loop
 from noack.theory.enclosure import response, response_until
 
-_CANDIDATES = 12
+_SHARE, _NEAREST = 1e-2, 0.98
 _CELLS = 256
 
 
@@ -56,12 +56,20 @@ def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theo
     fastest = -spectral_abscissa(closed)
     if not 0 < alpha_per_s < fastest:
         return None
-    shares = np.linspace(0.0, 1.0, _CANDIDATES + 2)[1:-1]
-    found = [
-        _theorem_2(loop, beta, alpha_per_s, delta, alpha_per_s + share * (fastest - alpha_per_s))
-        for share in shares
-    ]
-    return max(found, key=lambda theorem: theorem.inter_event_s)
+    from scipy.optimize import minimize_scalar
+
+    def at(share: float) -> Theorem2:
+        rate = alpha_per_s + share * (fastest - alpha_per_s)
+        return _theorem_2(loop, beta, alpha_per_s, delta, rate)
+
+    # c grows without bound towards the one end, 1/(ᾱ − α) towards the other.
+    best = minimize_scalar(
+        lambda share: -at(share).inter_event_s,
+        bounds=(0.0, _NEAREST),
+        method="bounded",
+        options={"xatol": _SHARE},
+    )
+    return at(float(best.x))
 
 
 def _theorem_2(

@@ -70,7 +70,7 @@ def test_the_scenarios_that_are_spoilt_below_are_right(text: str, tmp_path: Path
 LANE_MISTAKES = [
     # A key that nobody knows, at every level.
     ("sped=2", "sped = 2: unknown key; ", "did you mean speed?"),
-    ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are controller, .*, trigger"),
+    ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are certificate, .*, trigger"),
     ("pland.rate_hz=9", 'pland = {"rate_hz": 9}: unknown key; ', "did you mean plant?"),
     ("model.param.a11=2", 'model.param = {"a11": 2}: unknown key; ', "did you mean parameters?"),
     ("plant.rate=100", "plant.rate = 100: unknown key; ", "did you mean rate_hz?"),
