@@ -47,7 +47,7 @@ def print_worst(
     for worst in found:
         at = "" if worst.at_s is None else f"at {worst.at_s:.6f} s; "
         how = "no pattern is worse" if worst.exact else "not all patterns were tried"
-        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f} per second"
+        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
     console.print("[dim]D delivered, · lost; --json tells the times of the events[/]")
