@@ -7,7 +7,7 @@ From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞)
 (Young's inequality for the convolution; K = U R), where by identity (I1) no pattern makes ‖R e_c‖
 larger than D level(t): D sums the gains of the present e_s and of M − 1 missed ones, however close.
 It is cheap, and it leaves out what comes late in a run. For suprema there is nothing as good: they
-may come at any time, and bounds by rates of growth save hardly a tenth of the nodes.
+may come at any time, and a bound by rates of growth reaches only the last fraction of a second.
 """
 
 import numpy as np
