@@ -23,7 +23,7 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare report certify paper
+.PHONY: demo demo-zoh run simulate view summary replay compare report certify adversary paper
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -53,6 +53,9 @@ report: setup ## Write the last run's report anew, a page with all figures; prin
 
 certify: setup ## Say what is guaranteed of SCENARIO, under which conditions
 	@$(BIN)/noack certify "$(SCENARIO)" $(ARGS)
+
+adversary: setup ## Search the worst losses that SCENARIO's network may make
+	@$(BIN)/noack adversary "$(SCENARIO)" $(ARGS)
 
 paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/ (3 minutes)
 	@$(BIN)/noack paper --out docs $(ARGS)

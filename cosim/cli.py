@@ -337,6 +337,65 @@ def paper(
     return ExitStatus.OK
 
 
+class AdversaryAim(StrEnum):
+    """What ``noack adversary`` may look for."""
+
+    ERROR = "error"
+    STATE = "state"
+    COST = "cost"
+    INTER_EVENT = "inter-event"
+    ALL = "all"
+
+
+@command(_THEORY)
+def adversary(
+    scenario: ScenarioArgument,
+    objective: Annotated[
+        AdversaryAim,
+        typer.Option(
+            help="What is to be as bad as possible: the controller's error, the state, "
+            "the integral of its square, or the time between two events."
+        ),
+    ] = AdversaryAim.ALL,
+    horizon: Annotated[
+        float | None, typer.Option(help="Seconds to look ahead; the scenario's unless given.")
+    ] = None,
+    nodes: Annotated[
+        int, typer.Option(help="Try all patterns, up to so many segments between events.", min=0)
+    ] = 500_000,
+    beam: Annotated[
+        int, typer.Option(help="Runs that the beam search carries along.", min=0)
+    ] = 512,
+    settings: SetOption = None,
+    json: JsonOption = False,
+) -> int:
+    """Search the losses that the network may make for the worst, and how near bounds come to it."""
+    from cosim.adversary import Objective, find_worst
+    from cosim.adversary.report import document, print_worst
+    from cosim.progress import search_status
+    from noack.resolve import resolve
+    from noack.theory.certify import certify, ideal_conditions
+
+    given = [] if horizon is None else [f"horizon_s={horizon}"]
+    resolved = resolve(load(find_scenario(scenario), [*(settings or ()), *given]))
+    certificate = certify(resolved, ideal_conditions(resolved))
+    aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
+    with search_status() as report:
+        found = [
+            find_worst(
+                resolved, aim, most_nodes=nodes, beam=beam, certificate=certificate,
+                report=report(aim.value),
+            )
+            for aim in aims
+        ]  # fmt: skip
+    if json:
+        _print_json(document(found, resolved, certificate))
+    else:
+        print_worst(Console(), found, resolved, certificate)
+    refuted = any(worst.breaches for worst in found)
+    return ExitStatus.FAILED if refuted else ExitStatus.OK
+
+
 @command(_PROCESSES)
 def record(
     scenario: ScenarioArgument,

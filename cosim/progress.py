@@ -1,6 +1,7 @@
 """The progress line that a person sees during a run."""
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -87,6 +88,24 @@ def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
         task = progress.add_task("", total=1)
         yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+@contextmanager
+def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
+    """Show how a search goes while the context lasts, on a terminal only."""
+    began_s = time.monotonic()
+    with PatientConsole(stderr=True).status("searching") as status:
+
+        def named(aim: str) -> Callable[[str, int, float], None]:
+            def report(what: str, nodes: int, value: float) -> None:
+                elapsed_s = time.monotonic() - began_s
+                status.update(
+                    f"{aim}, {what}: {nodes} segments, worst {abs(value):.6g}, {elapsed_s:.0f} s"
+                )
+
+            return report
+
+        yield named
 
 
 def _account(account: dict[str, Any], horizon_s: float) -> str:
