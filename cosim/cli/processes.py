@@ -1,0 +1,73 @@
+"""Commands for a person with five terminals: one process each."""
+
+import typer
+
+from cosim.cli.app import (
+    DEFAULT_RUNS,
+    PROCESSES,
+    JsonOption,
+    LiveOption,
+    RunsOption,
+    ScenarioArgument,
+    SessionOption,
+    SetOption,
+    command,
+    find_scenario,
+)
+from cosim.cli.runs import run_processes
+from noack.scenario_file import load
+from noack.topology import RECORDER
+
+
+@command(PROCESSES)
+def record(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    session: SessionOption = "default",
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Open a run and record it; the other four processes join from other terminals."""
+    loaded = load(find_scenario(scenario), settings or ())
+    return run_processes(loaded, runs, (RECORDER,), session, live=live, json=json)
+
+
+@command(PROCESSES)
+def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the plant: owns the true state, sends measurements."""
+    from plant_server.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@command(PROCESSES)
+def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
+    from sensor_node.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@command(PROCESSES)
+def controller(session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the controller: runs x_c, sends u = K x_c."""
+    from controller_node.__main__ import main
+
+    return main(_process_arguments(session, json=json))
+
+
+@command(
+    PROCESSES,
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    add_help_option=False,
+)
+def netem(context: typer.Context) -> int:
+    """Join the open run as the lossy network; or serve any UDP program (`noack netem --help`)."""
+    from netem.__main__ import main
+
+    return main(context.args)
+
+
+def _process_arguments(session: str, *, json: bool) -> list[str]:
+    return ["--session", session, *(["--json"] if json else [])]

@@ -1,0 +1,262 @@
+"""Commands on runs: make one, live or simulated; look at it, repeat it, compare it."""
+
+import sys
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.app import (
+    DEFAULT_RUNS,
+    RUNS,
+    JsonOption,
+    LiveOption,
+    RunsOption,
+    ScenarioArgument,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from cosim.run_dir import RECORDING_FILE, latest_run
+from noack.errors import ExitStatus
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.topology import ROLES
+
+if TYPE_CHECKING:
+    from cosim.launch import Ending
+
+
+@command(RUNS)
+def run(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Run a scenario: start all processes, watch them, record everything."""
+    loaded = load(find_scenario(scenario), settings or ())
+    return run_processes(loaded, runs, ROLES, None, live=live, json=json)
+
+
+@command(RUNS)
+def demo(
+    zoh: Annotated[bool, typer.Option("--zoh", help="Hold the last update; no model.")] = False,
+    settings: SetOption = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    live: LiveOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Run the paper's lane-following example in real time."""
+    mode = ['mode="zoh"'] if zoh else []
+    loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
+    return run_processes(loaded, runs, ROLES, None, live=live, json=json)
+
+
+class Trigger(StrEnum):
+    """When a simulated sensor looks at the threshold."""
+
+    SAMPLED = "sampled"
+    CONTINUOUS = "continuous"
+
+
+@command(RUNS)
+def simulate(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    trigger: Annotated[
+        Trigger,
+        typer.Option(help="sampled: at each measurement, as a live run; continuous: at all times."),
+    ] = Trigger.SAMPLED,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
+    loaded = load(find_scenario(scenario), settings or ())
+    if trigger is Trigger.CONTINUOUS:
+        return _simulate_continuously(loaded, json=json)
+    from cosim.progress import PatientConsole, simulation_bar
+    from cosim.simulated_run import simulate_run
+
+    _warn_of_violations(loaded)
+    with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
+        ending = simulate_run(loaded, runs, progress=progress)
+    return _conclude(ending, json=json)
+
+
+@command(RUNS)
+def view(
+    recording: Annotated[
+        Path | None, typer.Argument(help="A run directory or .rrd file; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Open a recording in the rerun viewer."""
+    from cosim.viewer.live import view_recording
+
+    path = recording or latest_run(runs)
+    path = path / RECORDING_FILE if path.is_dir() else path
+    if json:
+        print_json({"recording": str(path), "exists": path.is_file()})
+        return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
+    view_recording(path)
+    return ExitStatus.OK
+
+
+@command(RUNS)
+def summary(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Show what became of a run; finishes the record of one that was cut short."""
+    from cosim.conclude import reopen
+    from cosim.tables import print_outcome
+
+    outcome = reopen(run_dir or latest_run(runs))
+    if json:
+        print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome)
+    return ExitStatus.OK
+
+
+@command(RUNS)
+def replay(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Feed every machine of a run its recorded inputs again; compare the outputs bit for bit."""
+    from cosim.environment import changed_since
+    from cosim.progress import PatientConsole
+    from cosim.record import load_record
+    from cosim.replay import replay as replay_record
+    from cosim.replay.table import print_replay
+
+    path = run_dir or latest_run(runs)
+    with PatientConsole(stderr=True).status("replaying"):
+        found = replay_record(load_record(path))
+    changed = changed_since(path)
+    if json:
+        print_json(found.document() | {"changed_since": changed})
+    else:
+        print_replay(Console(), found, changed)
+    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
+
+
+@command(RUNS)
+def compare(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Compare a run with the paper's loop in continuous time, effect by effect."""
+    from cosim.fidelity import compare as compare_record
+    from cosim.fidelity_table import print_fidelity
+    from cosim.progress import PatientConsole
+    from cosim.record import load_record
+
+    path = run_dir or latest_run(runs)
+    with PatientConsole(stderr=True).status("comparing"):
+        fidelity = compare_record(load_record(path))
+    if json:
+        print_json(fidelity.as_json())
+    else:
+        print_fidelity(Console(), fidelity)
+    return ExitStatus.OK if fidelity.explained else ExitStatus.FAILED
+
+
+@command(RUNS)
+def report(
+    run_dir: Annotated[
+        Path | None, typer.Argument(help="A run directory; by default the last run.")
+    ] = None,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Write a run's report anew, one page with all figures, and print where it is."""
+    from cosim.conclude import report_anew
+
+    path = report_anew(run_dir or latest_run(runs))
+    if json:
+        print_json({"report": str(path)})
+    else:
+        print(path)
+    return ExitStatus.OK
+
+
+def run_processes(
+    scenario: Scenario,
+    runs: Path,
+    spawn: Sequence[str],
+    session: str | None,
+    *,
+    live: bool,
+    json: bool,
+) -> int:
+    """Run a scenario with the processes ``spawn``; the others join by ``session``."""
+    # Each process of a run waits for the slowest: what is not needed yet is imported later.
+    from cosim.launch import launch
+    from cosim.progress import PatientConsole, progress_line
+
+    _warn_of_violations(scenario)
+    ending = None
+    try:
+        with progress_line(PatientConsole(stderr=True), scenario) as watcher:
+            ending = launch(
+                scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
+            )
+    except OSError:  # a closed terminal is no reason to lose a run
+        if ending is None:
+            raise
+    return _conclude(ending, json=json)
+
+
+def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
+    from cosim.exact.report import document, print_run, run_continuous
+    from cosim.progress import PatientConsole
+    from noack.resolve import resolve
+
+    _warn_of_violations(scenario)
+    resolved = resolve(scenario)
+    with PatientConsole(stderr=True).status("simulating"):
+        run = run_continuous(resolved)
+    if json:
+        print_json(document(run, resolved))
+    else:
+        print_run(Console(), run, resolved)
+    return ExitStatus.OK if run.diverged_at_s is None else ExitStatus.FAILED
+
+
+def _warn_of_violations(scenario: Scenario) -> None:
+    from noack.resolve import resolve
+    from noack.theory.assumptions import Verdict, assumptions
+
+    for assumption in assumptions(resolve(scenario)):
+        if assumption.verdict == Verdict.VIOLATED and assumption.source == "Theorem 2":
+            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
+
+
+def _conclude(ending: "Ending", *, json: bool) -> int:
+    from cosim.conclude import conclude
+    from cosim.tables import print_outcome
+
+    outcome = conclude(ending)
+    if json:
+        print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome)
+    return outcome.status

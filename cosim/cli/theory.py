@@ -1,0 +1,145 @@
+"""Commands on what is claimed: certificates, the worst losses, the paper reproduced."""
+
+import os
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.app import (
+    DEFAULT_RUNS,
+    THEORY,
+    JsonOption,
+    ScenarioArgument,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from noack.errors import ExitStatus
+from noack.scenario_file import load
+
+
+@command(THEORY)
+def certify(
+    scenario: ScenarioArgument,
+    settings: SetOption = None,
+    weight: Annotated[
+        str,
+        typer.Option(
+            help="The trigger's norm: `given` by the scenario, `identity`, or `chosen` here."
+        ),
+    ] = "given",
+    late: Annotated[
+        int | None,
+        typer.Option(help="Steps of the plant by which the schedule may be late.", min=0, max=1000),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Say what is guaranteed of a scenario, with which constants, under which conditions."""
+    from cosim.certify import print_study, study, with_weight
+    from cosim.progress import work_bar
+    from noack.resolve import resolve
+
+    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    allowed = resolved.certificate.late_periods if late is None else late
+    with work_bar("choosing the weight") as progress:
+        weighted, chosen = with_weight(resolved, weight, progress)
+    found = study(weighted, allowed, chosen)
+    if json:
+        print_json(found.to_json())
+    else:
+        print_study(Console(), found)
+    certified = any(certificate.constants for _, certificate in found.certificates)
+    return ExitStatus.OK if certified else ExitStatus.FAILED
+
+
+class AdversaryAim(StrEnum):
+    """What ``noack adversary`` may look for."""
+
+    ERROR = "error"
+    STATE = "state"
+    COST = "cost"
+    INTER_EVENT = "inter-event"
+    ALL = "all"
+
+
+@command(THEORY)
+def adversary(
+    scenario: ScenarioArgument,
+    objective: Annotated[
+        AdversaryAim,
+        typer.Option(
+            help="What is to be as bad as possible: the controller's error, the state, "
+            "the integral of its square, or the time between two events."
+        ),
+    ] = AdversaryAim.ALL,
+    horizon: Annotated[
+        float | None, typer.Option(help="Seconds to look ahead; the scenario's unless given.")
+    ] = None,
+    nodes: Annotated[
+        int, typer.Option(help="Try all patterns, up to so many segments between events.", min=0)
+    ] = 500_000,
+    beam: Annotated[
+        int, typer.Option(help="Runs that the beam search carries along.", min=0)
+    ] = 512,
+    settings: SetOption = None,
+    json: JsonOption = False,
+) -> int:
+    """Search the losses that the network may make for the worst, and how near bounds come to it."""
+    from cosim.adversary import Objective, find_worst
+    from cosim.adversary.report import document, print_worst
+    from cosim.progress import search_status
+    from noack.resolve import resolve
+    from noack.theory.certify import certify, ideal_conditions
+
+    given = [] if horizon is None else [f"horizon_s={horizon}"]
+    resolved = resolve(load(find_scenario(scenario), [*(settings or ()), *given]))
+    certificate = certify(resolved, ideal_conditions(resolved))
+    aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
+    with search_status() as report:
+        found = [
+            find_worst(
+                resolved, aim, most_nodes=nodes, beam=beam, certificate=certificate,
+                report=report(aim.value),
+            )
+            for aim in aims
+        ]  # fmt: skip
+    if json:
+        print_json(document(found, resolved, certificate))
+    else:
+        print_worst(Console(), found, resolved, certificate)
+    refuted = any(worst.breaches for worst in found)
+    return ExitStatus.FAILED if refuted else ExitStatus.OK
+
+
+@command(THEORY)
+def paper(
+    draws: Annotated[int, typer.Option(help="Draws of plant, losses and initial state.")] = 1000,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for paper.md, and for figures/ in it.")
+    ] = DEFAULT_RUNS / "paper",
+    json: JsonOption = False,
+) -> int:
+    """Reproduce the paper's Section V over many draws: a page with figures, tables and verdicts."""
+    from cosim.paper.table import print_claims
+    from cosim.paper.write import document, make_folder, reproduce, write_page
+    from cosim.progress import PatientConsole, draws_bar
+
+    path = find_scenario("lane_following")
+    make_folder(out)
+    with draws_bar(PatientConsole(stderr=True)) as progress:
+        results = reproduce(path, draws, _cores(), progress)
+    found = document(results, write_page(path, results, out))
+    if json:
+        print_json(found)
+    else:
+        print_claims(Console(), found)
+    return ExitStatus.OK
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
