@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cosim.claims.evaluate import Claim, Claims, ClaimVerdict, as_json, claims_of
+from cosim.claims.evaluate import Claim, Claims, ClaimVerdict, as_json
 from cosim.record import RunRecord
 from cosim.virtual import simulate
 from noack.linear import spectral_abscissa
@@ -36,7 +36,7 @@ CERTIFIED = (
 
 
 def certified(record: RunRecord) -> dict[str, Claim]:
-    return {c.what: c for c in claims_of(record).judge() if c.source == "certificate"}
+    return {c.what: c for c in Claims(record).judge() if c.source == "certificate"}
 
 
 def verdicts(record: RunRecord) -> dict[str, ClaimVerdict]:
@@ -44,7 +44,7 @@ def verdicts(record: RunRecord) -> dict[str, ClaimVerdict]:
 
 
 def from_I1(record: RunRecord) -> list[Claim]:
-    return [claim for claim in claims_of(record).judge() if claim.source == "(I1)"]
+    return [claim for claim in Claims(record).judge() if claim.source == "(I1)"]
 
 
 # --- held -----------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def from_I1(record: RunRecord) -> list[Claim]:
 
 def test_a_run_that_keeps_to_its_schedule_holds_what_is_certified(run: RunRecord) -> None:
     assert verdicts(run) == dict.fromkeys(CERTIFIED, HELD)
-    for claim in claims_of(run).judge():
+    for claim in Claims(run).judge():
         assert claim.since_s is None
         assert claim.ratio is not None
         assert 0 <= claim.ratio <= 1
@@ -127,7 +127,7 @@ def test_printed_bounds_are_judged_although_they_assume_what_no_run_has(make: Ma
     lossy = {"loss": {"model": "worst_case"}}
     seldom = make(plant={"measure_every": 20}, network=lossy, trigger={"beta": 1e-3})
     record = simulate(seldom)
-    printed = {c.source: c for c in claims_of(record).judge()}
+    printed = {c.source: c for c in Claims(record).judge()}
     assert printed["eq:LossEv3"].verdict is VIOLATED
     assert "watches always" in printed["eq:LossEv3"].why
 
@@ -181,7 +181,7 @@ def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -
         )
     )  # fmt: skip
     with np.errstate(all="ignore"):
-        claims = claims_of(record)
+        claims = Claims(record)
         document = as_json(claims.judge())
         envelopes = claims.envelopes()
     assert {claim["verdict"] for claim in document if claim["source"] == "certificate"} == {"void"}
@@ -198,8 +198,8 @@ def without(run: RunRecord, *processes: str) -> RunRecord:
 
 
 def test_nothing_is_claimed_of_a_run_without_measurements(run: RunRecord) -> None:
-    assert claims_of(without(run, "sensor")).judge() == []
-    assert claims_of(without(run, "sensor", "plant", "controller", "netem")).judge() == []
+    assert Claims(without(run, "sensor")).judge() == []
+    assert Claims(without(run, "sensor", "plant", "controller", "netem")).judge() == []
 
 
 @pytest.mark.parametrize("process", ["plant", "controller"])
@@ -238,11 +238,12 @@ def test_a_controller_that_dies_makes_claims_void_rather_than_violated(make: Mak
 
 
 def test_envelopes_are_at_the_measurements(run: RunRecord) -> None:
-    claims = claims_of(run)
+    claims = Claims(run)
     k = len(run[SENSOR_MEASUREMENT])
     found = {(e.label, e.quantity): e for e in claims.envelopes()}
     for envelope in found.values():
-        assert envelope.t_s.shape == envelope.values.shape == (k,)
+        points = 2 if envelope.quantity == "inter_event" else k
+        assert envelope.t_s.shape == envelope.values.shape == (points,)
     own = "certified for the scenario's plant"
     assert {("bound from (I1)", "e_c"), (own, "e_c"), (own, "x")} <= set(found)
     error = claims.joined.e_c_norm
@@ -257,10 +258,9 @@ def test_a_long_run_s_clock_does_not_violate_the_distance_of_events(run: RunReco
     """At 1e7 s, a float tells apart 2 ns: differences are taken of whole nanoseconds."""
     rows = run[SENSOR_MEASUREMENT].copy()
     rows["t_ns"] += 10**16
-    joined = claims_of(run).joined
-    shifted = Claims(changed(run, **{SENSOR_MEASUREMENT: rows}), joined)
+    shifted = Claims(changed(run, **{SENSOR_MEASUREMENT: rows}))
     _, passed_s = shifted._inter_event_s
-    np.testing.assert_array_equal(passed_s, claims_of(run)._inter_event_s[1])
+    np.testing.assert_array_equal(passed_s, Claims(run)._inter_event_s[1])
 
 
 def test_numbers_that_are_none_are_null() -> None:
@@ -346,7 +346,7 @@ def test_no_simulated_run_violates_its_certificate() -> None:
     )  # fmt: skip
     @given(scenarios(), st.integers(0, 2**32))
     def check(resolved: Scenario, seed: int) -> None:
-        claims = claims_of(simulate(resolved, hostile(resolved, seed)))
+        claims = Claims(simulate(resolved, hostile(resolved, seed)))
         for claim in claims.judge():
             if claim.source in ("certificate", "(I1)"):
                 assert claim.verdict is not VIOLATED, claim
