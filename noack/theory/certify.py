@@ -129,15 +129,18 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
     common_ns = math.gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
-    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     late_ns = late_periods * step_ns
+    if late_periods > 0:  # an update that is late by any time up to that may just miss a tick
+        wait_ns = late_ns + tick_ns - 1
+    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
+    start_ns = first_ns if late_periods == 0 else max(first_ns + late_ns, delay_ns)
     return Conditions(
         dropouts=resolved.network.mansd,
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
-        delay_s=(delay_ns + late_ns) / NS_PER_S,
+        delay_s=delay_ns / NS_PER_S,
         hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
-        start_s=(first_ns + late_ns) / NS_PER_S,
+        start_s=start_ns / NS_PER_S,
     )
 
 
