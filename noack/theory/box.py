@@ -21,7 +21,7 @@ import numpy as np
 
 from noack.linear import Matrix, Vector
 from noack.theory.decay import logarithmic_norm
-from noack.theory.enclosure import NotDecayingError, Response, factors, response, response_until
+from noack.theory.enclosure import NotDecayingError, Response, factors, response
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 
 
@@ -102,17 +102,11 @@ class BoxGains:
 
     def growth(self, until_s: float, cells: int) -> Growth:
         """How ‖e_s‖_W grows over ``until_s``, on a grid."""
-        H, W = self.error.scaled_H, self.error.weight
         known, mistaken = self._split_nominal[0], self._mistaken_rows
         # Models that run the box's centre make no mistake that is known.
         apart = self._split_nominal[1].any() or not self._rows
         forced = np.concatenate([known, mistaken], axis=1) if apart else mistaken
-        return Growth(
-            *(
-                response_until(H, D, until_s, cells).through(W)
-                for D in (self.error.inverse_weight, forced, self._input_matrix)
-            )
-        )
+        return self.error.growth(forced, self._input_matrix, until_s, cells)
 
     @cached_property
     def _closed_loop(self) -> Matrix:

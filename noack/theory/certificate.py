@@ -170,10 +170,10 @@ class _Step:
             output: Coefficients(free + start[output], gain)
             for output, (free, gain) in plant.states.items()
         }
-        self._stretch, self._mismatch_growth, self._input_growth = 1.0, 0.0, 0.0
+        self._stretch = error.stretch(conditions.sampling_s)
+        self._mismatch_growth, self._input_growth = 0.0, 0.0
         if conditions.sampling_s > 0:
             growth = plant.growth(conditions.sampling_s, _COARSE)
-            self._stretch = growth.start.sup_on_grid()
             self._mismatch_growth = growth.mismatch.integral_on_grid()
             self._input_growth = growth.input_error.integral_on_grid()
 

@@ -226,12 +226,11 @@ def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> S
     """e^{G k s} state for k = 0 … cells, (cells + 1, n, r); each block starts anew."""
     from scipy.linalg import expm
 
-    powers = np.eye(len(generator))[None]
-    size = min(_BLOCK, cells)
+    powers, size = np.eye(len(generator))[None], min(_BLOCK, cells)
+    leap = expm(generator * step_s)
     while len(powers) < size:
-        powers = np.concatenate([powers, expm(generator * (step_s * len(powers))) @ powers])
-    powers = powers[:size]
-    leap = expm(generator * (step_s * size))
+        powers, leap = np.concatenate([powers, leap @ powers]), leap @ leap
+    size = len(powers)
     blocks = []
     for _ in range(-(-(cells + 1) // size)):
         blocks.append(powers @ state)

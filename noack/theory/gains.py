@@ -48,10 +48,8 @@ class Coefficients(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """How ‖e_s‖_W grows after a reset or a sample."""
+    """How ‖e_s‖_W grows after a reset."""
 
-    start: Kernel
-    """‖W e^{Hτ} W^{−1}‖"""
     mismatch: Kernel
     """‖W e^{Hτ} L_E‖, E = L_E R_E"""
     input_error: Kernel
@@ -129,6 +127,22 @@ class ErrorGains:
         return float(
             self.kernels[output].sups(spacing_s * np.arange(events, dtype=np.float64)).sum()
         )
+
+    def growth(self, mismatch: Matrix, pushed: Matrix, until_s: float, cells: int) -> Growth:
+        """How ‖e_s‖_W grows if E x and B p act through these columns."""
+        return Growth(
+            *(
+                response_until(self.scaled_H, D, until_s, cells).through(self.weight)
+                for D in (mismatch, pushed)
+            )
+        )
+
+    def stretch(self, until_s: float) -> float:
+        """sup‖e^{(H+αI)τ}‖_W over τ ≤ ``until_s``: how a sampled error grows."""
+        if until_s == 0:
+            return 1.0
+        followed = response_until(self.scaled_H, self.inverse_weight, until_s)
+        return followed.through(self.weight).sup_on_grid()
 
     def hold_remainder(self, hold_s: float) -> float:
         """Bound of ‖K(e^{−Hσ} − I + Hσ) W^{−1}‖, |σ| ≤ ``hold_s``: ½σ² sup‖K H² e^{−Hs} W^{−1}‖."""
@@ -221,13 +235,7 @@ class PlantGains:
 
     def growth(self, until_s: float, cells: int) -> Growth:
         """How ‖e_s‖_W grows over ``until_s``, on a grid."""
-        H, W = self.error.scaled_H, self.error.weight
-        return Growth(
-            *(
-                response_until(H, D, until_s, cells).through(W)
-                for D in (self.error.inverse_weight, self.split_mismatch[0], self.input_matrix)
-            )
-        )
+        return self.error.growth(self.split_mismatch[0], self.input_matrix, until_s, cells)
 
 
 def error_gains(loop: Loop, alpha_per_s: float) -> ErrorGains:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from noack.theory.enclosure import (
     NotDecayingError,
     constant_kernel,
     factors,
+    norm_bounds,
     response,
     response_until,
 )
@@ -206,6 +208,34 @@ def test_a_fast_mode_costs_a_coarse_grid_little_if_all_decays() -> None:
     assert slow.sup_on_grid() <= 1.0001
 
 
+def test_a_hump_within_a_single_cell_is_seen() -> None:
+    """t⁷e^{−t}/7! has no derivative at 0 up to the sixth; at the cell's end it is over."""
+    G = np.diag(np.ones(7), 1) - np.eye(8)
+    C, D = np.eye(8)[:1], np.eye(8)[:, -1:]
+    for until_s in (10.0, 40.0):
+        kernel = response_until(G, D, until_s, 1).through(C)
+        assert kernel.sup_on_grid() >= 7.0**7 * math.exp(-7) / math.factorial(7)
+        assert kernel.integral_on_grid() >= 0.77  # ∫₀¹⁰; over all times it is 1
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
+def test_the_rounding_of_a_product_is_covered(seed: int, n: int, columns: int) -> None:
+    """Of factors whose terms cancel, against rational numbers: nothing is known of such a norm."""
+    rng = np.random.default_rng(seed)
+    C = rng.normal(size=(2, n)) * 10.0 ** rng.uniform(-8, 8, n)
+    Y = rng.normal(size=(n, columns)) / np.abs(C[:1]).T
+    Y[-1] = -(C[0, :-1] @ Y[:-1]) / C[0, -1]
+    C, Y = C[:1], Y[:, :1] if columns == 1 else Y
+    product = [
+        [sum(Fraction(a) * Fraction(b) for a, b in zip(row, column, strict=True)) for column in Y.T]
+        for row in C
+    ]
+    exact = math.hypot(*(float(entry) for row in product for entry in row))
+    bound = float(norm_bounds(C, Y[None])[0])
+    assert exact <= bound <= exact + 1e-12
+
+
 def test_a_system_that_does_not_decay_is_refused() -> None:
     with pytest.raises(NotDecayingError, match=r"the slowest mode grows at 2 /s"):
         response(np.diag([-1.0, 2.0]), np.eye(2))
@@ -216,10 +246,12 @@ def test_a_system_that_does_not_decay_is_refused() -> None:
 
 def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
     """A Jordan block of ten whose eigenvalues rounding moves by more than they are from 0."""
-    triangular = np.diag(np.ones(9), 1) - 1e-3 * np.eye(10)
     Q = np.linalg.qr(np.random.default_rng(1).normal(size=(10, 10)))[0]
-    with pytest.raises(NotDecayingError):
-        response(Q @ triangular @ Q.T, np.eye(10))
+    for margin, why in ((1e-3, "grows at"), (0.1, "no Lyapunov function")):
+        triangular = np.diag(np.ones(9), 1) - margin * np.eye(10)
+        with pytest.raises(NotDecayingError, match=why):
+            response(Q @ triangular @ Q.T, np.eye(10))
+    triangular = np.diag(np.ones(9), 1) - 1e-3 * np.eye(10)
     # As it is written, its eigenvalues are exact, and so is what it grows to: t⁹e^{−t/1000}/9!.
     peak = 9e3**9 / math.factorial(9) * math.exp(-9)
     assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001

@@ -12,7 +12,7 @@ from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import System, systems
 
 ROUNDING = 1 + 1e-9
-SYSTEMS = 70
+SYSTEMS = 45
 EVENTFUL = {"mismatch": 0.5, "beta": 0.01}
 
 SEARCH = settings(deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
