@@ -1,12 +1,16 @@
-"""Gains of a loop against dense sampling: never below, and not far above."""
+"""Gains of a loop against dense sampling: never below, and not far above; and what solves them."""
+
+import math
 
 import numpy as np
-from hypothesis import HealthCheck, Phase, given, settings
+import pytest
+from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.linear import Matrix
+from noack.theory.certificate import Conditions, VoidError, first_passage_s
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import System, systems
 
@@ -154,3 +158,91 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
         )  # fmt: skip
         area = float(np.trapezoid(norms(W, G, D @ v, t_s), t_s))
         assert area <= kernel.integral_on_grid() * size * (1 + 1e-4) + 1e-15
+
+
+@settings(SEARCH)
+@given(systems())
+def test_the_constants_solve_the_inequalities(system: System) -> None:
+    """Each bound is what the others make it, as certificate.py's head has it, with equality."""
+    conditions, (error, plant) = system.conditions, gains(system)
+    try:
+        found = system.certify(conditions)
+    except VoidError:
+        assume(False)
+        raise
+    assert found.inter_event_s is not None
+    spacing_s, hold_s = found.inter_event_s, conditions.hold_s
+    under_way = math.ceil(conditions.delay_s / spacing_s - 1e-9)
+    assert found.missing_events == conditions.dropouts + under_way
+    beta_tilde, push = found.overshoot * system.beta, found.input_error
+    before, start = plant.start_up(conditions.start_s)
+
+    def state(output: Output) -> float:
+        free, gain = plant.states[output]
+        return free + start[output] + gain * push
+
+    def controller_error(output: Output) -> float:
+        missing = error.missing(output, found.missing_events, spacing_s)
+        return (error.now(output) + missing) * beta_tilde
+
+    assert found.start_error == pytest.approx(before)
+    assert found.state == pytest.approx(state(Output.STATE))
+    assert found.mismatch == pytest.approx(state(Output.MISMATCH))
+    assert found.delta * system.beta == pytest.approx(controller_error(Output.WEIGHTED))
+    age = state(Output.GAIN_RATE) + controller_error(Output.GAIN_RATE)
+    bend = state(Output.WEIGHTED) + controller_error(Output.WEIGHTED)
+    rest = error.hold_remainder(hold_s)
+    assert push == pytest.approx(controller_error(Output.GAIN) + hold_s * age + rest * bend)
+    growth = plant.growth(conditions.sampling_s, 64)
+    grown = error.stretch(conditions.sampling_s) * system.beta
+    grown += growth.mismatch.integral_on_grid() * state(Output.MISMATCH)
+    grown += growth.input_error.integral_on_grid() * (push + before)
+    assert beta_tilde == pytest.approx(grown)
+
+
+@settings(SEARCH)
+@given(systems(n=2), st.floats(0.01, 3.0), st.floats(0.0, 3.0), st.floats(0.0, 3.0))
+def test_the_first_passage_is_that_of_the_volterra_equation(
+    system: System, mismatch: float, push: float, own: float
+) -> None:
+    """ρ(r) = ∫₀^r k_E(s) X + k_B(s) (π' + own ρ(r−s)) ds, marched in small steps, reaches β."""
+    _, plant = gains(system)
+    level = system.beta
+    found_s = first_passage_s(plant, level, mismatch, push, own)
+    longest_s = 6 * slow_s(system.H + system.alpha * np.eye(len(system.H)))
+    assume(found_s < longest_s)  # not where hardly anything is left to push
+    G, W = system.H + system.alpha * np.eye(len(system.H)), system.weight
+    E = system.A + system.B @ system.K - system.H
+    U = np.linalg.svd(system.K, full_matrices=False)[0][:, : np.linalg.matrix_rank(system.K)]
+    L = np.linalg.svd(E)[0][:, : max(np.linalg.matrix_rank(E), 1)]
+    steps = 400
+    t_s = np.linspace(0, 1.3 * found_s, steps + 1)
+    step_s = float(t_s[1])
+    from_x, from_p = norms(W, G, L, t_s), norms(W, G, system.B @ U, t_s)
+    rho = np.zeros(steps + 1)
+    for k in range(1, steps + 1):  # the trapezoidal rule, whose ρ(0) is 0
+        fixed = np.trapezoid(from_x[: k + 1] * mismatch + from_p[: k + 1] * push, dx=step_s)
+        echo = float(from_p[1:k] @ rho[k - 1 : 0 : -1]) + 0.5 * from_p[0] * rho[k - 1]
+        rho[k] = max(fixed + own * step_s * echo, rho[k - 1])
+    passed_s = float(np.interp(level, rho, t_s)) if rho[-1] > level else math.inf
+    # Never later than the equation's own solution, and hardly earlier.
+    assert found_s <= passed_s * (1 + 1e-2)
+    assert passed_s < math.inf
+    assert found_s >= 0.95 * passed_s
+
+
+def test_without_mismatch_or_push_nothing_is_ever_passed() -> None:
+    system = System(
+        A=np.array([[-2.0]]), B=np.array([[1.0]]), K=np.array([[0.0]]), H=np.array([[-2.0]]),
+        weight=np.eye(1), x0=np.ones(1), alpha=1.0, beta=0.1, known_start=True, mansd=0,
+        step_s=0.01, sample_steps=1, delay_steps=0, hold_steps=0, lag_steps=0,
+    )  # fmt: skip
+    _, plant = gains(system)
+    assert first_passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
+    found = system.certify(Conditions(0))
+    assert found.inter_event_s is not None
+    assert found.inter_event_s >= 1e6
+    # ρ = π'(1 − e^{−t}): never beyond π', and ln 2 to the half of it.
+    assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
+    assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
+    assert first_passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4
