@@ -35,11 +35,29 @@ class Series(NamedTuple):
         return float(self.value.max()) if len(self.value) else None
 
 
+class Losses(NamedTuple):
+    """The events, and which of their updates never came."""
+
+    t_s: Reals
+    """(k,)"""
+    made_up_s: Reals
+    """(k,) After which time the plant felt a newer update instead: infinite if the update was
+    dropped, 0 if it came or was still to come; in between if it was overtaken."""
+
+    def runs(self, delay_s: float) -> Series:
+        """Successive losses at every event; what was overtaken within ``delay_s`` is not lost."""
+        runs, run = [], 0
+        for made_up_s in self.made_up_s.tolist():
+            run = run + 1 if made_up_s > delay_s + _TOLERANCE_S else 0
+            runs.append(run)
+        return Series(self.t_s, np.array(runs, dtype=np.float64))
+
+
 class Observed(NamedTuple):
     """What :class:`noack.theory.certificate.Conditions` presupposes, as it was."""
 
-    dropouts: Series
-    """Successive updates that the controller never took, at every event."""
+    losses: Losses
+    """Updates that the controller never took."""
     sampling: Series
     """Time since the measurement before, in seconds, at every measurement."""
     delay: Series
@@ -52,7 +70,8 @@ class Observed(NamedTuple):
     def left(self, conditions: Conditions) -> tuple[float, str] | None:
         """When and how the run first left the conditions; None if it never did."""
         limits = (
-            (self.dropouts, conditions.dropouts, "{:.0f} updates lost in a row, {:.0f} allowed"),
+            (self.losses.runs(conditions.delay_s), conditions.dropouts,
+             "{:.0f} updates lost in a row, {:.0f} allowed"),
             (self.sampling, conditions.sampling_s,
              "no measurement for {:.4g} s, {:.4g} s allowed"),
             (self.delay, conditions.delay_s,
@@ -74,7 +93,7 @@ class Observed(NamedTuple):
     def summary(self) -> dict[str, float | None]:
         """The largest value of each."""
         return {
-            "dropouts": self.dropouts.largest(),
+            "dropouts": self.losses.runs(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
@@ -96,7 +115,7 @@ def observe(record: RunRecord) -> Observed:
     age_ns = np.maximum(until_ns - model_ns, model_ns - steps["t_ns"])
     end_ns = max(int(rows["t_ns"][-1]) if len(rows) else 0 for rows in (steps, sensor))
     return Observed(
-        dropouts=_dropouts(record, events),
+        losses=_losses(record, events, felt),
         sampling=_sampling(sensor["t_ns"], end_ns),
         delay=_delays(record, events, felt, end_ns, start_s),
         hold=Series(step_s[feels], age_ns[feels] * 1e-9),
@@ -146,7 +165,7 @@ def _delays(
     sequences = events["event"]
     taken = _index(deliveries["sequence"], sequences)
     newest = int(deliveries["sequence"].max(initial=NO_SEQUENCE))
-    pending = (sequences > newest) & ~np.isin(sequences, list(_dropped(record)))
+    pending = (sequences > newest) & ~np.isin(sequences, list(_fates(record)[0]))
     felt_ns = np.append(step_ns, end_ns)[np.searchsorted(felt, sequences)]
     model_ns = np.append(deliveries["model_t_ns"], 0)[taken]
     acts_ns = np.where(pending, end_ns, np.maximum(felt_ns, model_ns))
@@ -156,19 +175,21 @@ def _delays(
     return Series(events["t_ns"][counts] * 1e-9, delay_ns[counts] * 1e-9)
 
 
-def _dropped(record: RunRecord) -> set[int]:
+def _fates(record: RunRecord) -> tuple[set[int], set[int]]:
+    """The updates that the network dropped, and those that it let pass."""
     packets, sequences, _ = updates_in(record[NETEM_PACKET])
-    return set(sequences[packets["fate"] == Fate.DROPPED].tolist())
+    dropped = packets["fate"] == Fate.DROPPED
+    return set(sequences[dropped].tolist()), set(sequences[~dropped].tolist())
 
 
-def _dropouts(record: RunRecord, events: NDArray[np.void]) -> Series:
-    """Runs of lost updates; one that is still under way at the end is not lost."""
-    taken = record[CONTROLLER_DELIVERY]["sequence"]
-    dropped = _dropped(record)
-    newest, kept = int(taken.max(initial=NO_SEQUENCE)), set(taken.tolist())
-    runs, run = [], 0
-    for sequence in events["event"].tolist():
-        lost = sequence not in kept and (sequence < newest or sequence in dropped)
-        run = run + 1 if lost else 0
-        runs.append(run)
-    return Series(events["t_ns"] * 1e-9, np.array(runs, dtype=np.float64))
+def _losses(record: RunRecord, events: NDArray[np.void], felt: Times) -> Losses:
+    """What never came; an update that is under way at the end is not lost."""
+    taken, sequences = record[CONTROLLER_DELIVERY]["sequence"], events["event"]
+    dropped, passed = (np.isin(sequences, list(fates)) for fates in _fates(record))
+    superseded = sequences < taken.max(initial=NO_SEQUENCE)
+    lost = ~np.isin(sequences, taken) & (superseded | dropped)
+    # Had it only been overtaken, a newer one made up for it.
+    step_s = np.append(record[PLANT_STEP]["t_ns"] * 1e-9, np.inf)
+    felt_s = step_s[np.searchsorted(felt, sequences)] - events["t_ns"] * 1e-9
+    made_up_s = np.where(lost, np.where(passed & superseded, felt_s, np.inf), 0.0)
+    return Losses(events["t_ns"] * 1e-9, made_up_s)

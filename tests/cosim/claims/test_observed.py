@@ -152,6 +152,19 @@ def test_an_update_that_was_overtaken_is_lost(make: Make) -> None:
     assert why == "3 updates lost in a row, 2 allowed"
 
 
+def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
+    """Every other update is just under way long enough for the next one to pass it."""
+    resolved = make()
+    allowance_s = 0.4
+    record = simulate(resolved, network_of(lambda n: 500 if n % 2 else 0))
+    observed = observe(record)
+    taken = set(record[CONTROLLER_DELIVERY]["sequence"].tolist())
+    overtaken = [n for n in range(len(observed.losses.t_s) - 2) if n not in taken]
+    assert overtaken
+    assert observed.losses.runs(0.0).largest() == 1
+    assert observed.losses.runs(allowance_s).largest() == 0
+
+
 def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None:
     """The network passed it, nobody took it: lost in a socket, or by a controller that died."""
     whole = simulate(make(), network_of(lambda n: 0))
@@ -248,7 +261,7 @@ def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
     run: RunRecord,
 ) -> None:
     whole, blind = observe(run), observe(without(run, "netem"))
-    assert blind.dropouts.largest() == whole.dropouts.largest() == 2
+    assert blind.losses.runs(0.0).largest() == whole.losses.runs(0.0).largest() == 2
     assert blind.hold.largest() == whole.hold.largest()
 
 
@@ -314,7 +327,7 @@ def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
     rows = {table: np.zeros(0, dtype) for table, dtype in tables(n, m).items()}
     found = observe(RunRecord(resolved, rows, [], {}))
     assert found.start_s == np.inf
-    assert found.dropouts.largest() is None
+    assert found.losses.runs(0.0).largest() is None
     one = rows | {PLANT_STEP: np.zeros(1, tables(n, m)[PLANT_STEP])}
     one[PLANT_STEP]["actuation"] = NO_SEQUENCE
     assert observe(RunRecord(resolved, one, [], {})).start_s == np.inf
