@@ -1,6 +1,7 @@
 """Theorem 1's own Δ (eq:Normec), which exists after a run only: from its recorded trajectory."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,30 +15,38 @@ from noack.theory.printed import Interval, longest_interval_s, theorem_1
 Indices = NDArray[np.int64]
 
 
-def theorem_one(record: RunRecord, joined: Joined) -> float | None:
+def theorem_one(record: RunRecord, joined: Joined, until_s: float = math.inf) -> float | None:
     """The largest Δ over all stretches between two deliveries; None if there is none to be had.
 
-    Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this.
+    Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this. Nor does it
+    from ``until_s`` on, when the run has left what the theorem presupposes.
     """
     loop, trigger = record.loop, record.scenario.trigger
     if loop.weight is not None:
         return None
     event = record[SENSOR_MEASUREMENT]["event"]
-    starts = np.flatnonzero(event != NO_SEQUENCE)
+    events = np.flatnonzero(event != NO_SEQUENCE)
+    starts = events[joined.t_ns[events] * 1e-9 < until_s]
     if not len(starts):
         return None
+    ends = [*events[1:], len(joined.t_ns) - 1][: len(starts)]
     longest_s = [
         longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, _decay(record))
-        for interval in _intervals(record, joined, starts)
+        for interval in _intervals(record, joined, starts, ends)
     ]
-    delta = 1.0
+    # Δ grows with the stretch: of the stretches that begin with an event, the longest is enough.
+    stretches: dict[int, int] = {}
     first = 0  # of the missed ones
     for index, start in enumerate(starts):
         while first <= index and event[starts[first]] <= joined.received[start]:
             first += 1
         if first <= index and joined.received[start] != NO_SEQUENCE:
-            missed_s = longest_s[first : index + 1]
-            delta = max(delta, theorem_1(loop.H, trigger.alpha_per_s, missed_s))
+            stretches[first] = index + 1
+    found = [
+        theorem_1(loop.H, trigger.alpha_per_s, longest_s[first:end])
+        for first, end in stretches.items()
+    ]
+    delta = max(found, default=1.0)
     return delta if math.isfinite(delta) else None
 
 
@@ -49,11 +58,13 @@ def _decay(record: RunRecord) -> float:
     return min(record.scenario.trigger.alpha_per_s, max(-spectral_abscissa(H), 0.0))
 
 
-def _intervals(record: RunRecord, joined: Joined, starts: Indices) -> list[Interval]:
-    """Between every event and the next."""
+def _intervals(
+    record: RunRecord, joined: Joined, starts: Indices, ends: Sequence[int]
+) -> list[Interval]:
+    """From every event of ``starts`` to the next."""
     propagate = Propagator(record.loop.H)
     found = []
-    for first, end in zip(starts, [*starts[1:], len(joined.t_ns) - 1], strict=True):
+    for first, end in zip(starts, ends, strict=True):
         index = np.arange(first, end + 1)
         ages_ns = joined.t_ns[index] - joined.t_ns[first]
         model = [propagate(joined.x[first], int(age_ns)) for age_ns in ages_ns]

@@ -6,8 +6,6 @@ with r the last event whose packet the controller has, q the last event. It exte
 eq:LossEv2 to every drop pattern: x_s jumped by −e_s(t_k⁻) at each event; x_c missed those jumps.
 """
 
-from collections.abc import Iterable
-
 import numpy as np
 
 from noack.linear import Matrix, Propagator, Vector
@@ -43,10 +41,6 @@ class MissedJumps:
             # Anew rather than by subtraction, so that no rounding outlives a delivery.
             terms = [self.propagate(e_s, self._t_ns - t_ns) for t_ns, e_s in self._jumps.values()]
             self._total = np.sum([np.zeros_like(self._total), *terms], axis=0)
-
-    def jumps(self) -> Iterable[tuple[int, Vector]]:
-        """The missed jumps: when, and e_s(t_k⁻), shape (n,)."""
-        return self._jumps.values()
 
     def total(self) -> Vector:
         """Σ of the missed jumps at the present time, shape (n,)."""

@@ -190,3 +190,17 @@ def test_under_a_hold_every_missing_event_counts_one_threshold() -> None:
     found = monitor.sample(4 * 10**9, np.array([1 / 16, 0.0]), -1, 2)
     assert found.printed == pytest.approx(1 / 16 + 1 / 8)
     assert found.identity == pytest.approx(1 / 16 + 1 / 8)
+
+
+def test_thousands_of_missing_events_are_summed_as_few_are() -> None:
+    """Over them all the closed form: equal jumps, of age 0, 1, … steps, each decayed by its age."""
+    H, step_ns, jump, count = np.array([[-2.0]]), 1_000_000, np.array([0.5]), 3000
+    monitor = ErrorMonitor(H, DecayingTrigger(0.25, 1.0))
+    for k in range(count):
+        found = monitor.sample(k * step_ns, jump, k, -1)
+    shrinks = math.exp(-2.0 * step_ns * NS)
+    identity = 0.5 * (1 - shrinks**count) / (1 - shrinks)
+    now_s = (count - 1) * step_ns * NS
+    ages_s = np.arange(count) * step_ns * NS
+    printed = 0.25 * (math.exp(-now_s) + np.exp(-(now_s - ages_s) - 2 * ages_s).sum())
+    assert found == pytest.approx((identity, printed), rel=1e-9)
