@@ -1,6 +1,7 @@
 """Holds every claim about a run against its record."""
 
 import math
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,12 +11,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.claims.observed import observe
+from cosim.claims.observed import Left, Observed, observe
 from cosim.claims.theorem_one import theorem_one
 from cosim.join import Joined, identity_residual, join_all
 from cosim.record import RunRecord
 from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario import Scenario
+from noack.theory.certificate import Conditions
 from noack.theory.certify import (
     Certificate,
     certify,
@@ -32,6 +34,7 @@ Reals = NDArray[np.float64]
 # What an exact computation may miss by rounding: the record holds 20 s in 10,000 steps.
 _ROUNDING = 1e-9
 _IDENTITY = 1e-9
+_ANY = Conditions(sys.maxsize, *[math.inf] * 5)
 
 
 class ClaimVerdict(StrEnum):
@@ -96,7 +99,36 @@ class Claims:
     @cached_property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition."""
-        return observe(self.record).summary()
+        return self._observed.summary()
+
+    @cached_property
+    def _unknown(self) -> Left:
+        """Since when not everything is on record, so that no claim can be held against it."""
+        found: list[Left] = [
+            self._observed.left(_ANY._replace(sampling_s=self._schedule.sampling_s))
+        ]
+        gaps = np.flatnonzero(~self._in_common[np.argmax(self._in_common) :])
+        if len(gaps):
+            since_s = float(self._t_s[np.argmax(self._in_common) + gaps[0]])
+            found.append((since_s, "the controller's error is not on record, or not finite"))
+        return min(filter(None, found), default=None)
+
+    @cached_property
+    def _beyond_paper(self) -> Left:
+        """When the run left the paper's bound on successive dropouts, on which its theorems rest.
+
+        That its trigger watches always and its network is instant, no run keeps; the claims say so.
+        """
+        lost = self._observed.left(_ANY._replace(dropouts=self._schedule.dropouts))
+        return min(filter(None, (lost, self._unknown)), default=None)
+
+    @cached_property
+    def _schedule(self) -> Conditions:
+        return nominal_conditions(self.record.scenario)
+
+    @cached_property
+    def _observed(self) -> Observed:
+        return observe(self.record)
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict."""
@@ -179,34 +211,39 @@ class Claims:
         scale = max(float(np.abs(self.joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
         yield _upper(
             "the models differ by what was missed", "(I1)",
-            "their difference is it, to {:.0e} of ‖x_s‖", _IDENTITY,
-            self._t_s[self._in_common], residual / (_IDENTITY * scale), None, "",
+            "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), to {:.0e} of ‖x_s‖", _IDENTITY,
+            self._t_s[self._in_common], residual / (_IDENTITY * scale), self._unknown, "",
         )  # fmt: skip
         yield self._controller_error(
             "the controller's error is at most what was missed", "(I1)",
-            "‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖", None, self._bounds[0], None, "",
+            "‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖", None, self._bounds[0], self._unknown, "",
         )  # fmt: skip
 
     def _printed(self) -> Iterator[Claim]:
-        ideal = "assumes a trigger that watches always and a network and an input without delay"
+        ideal = (
+            "presupposes a trigger that watches always and a network and an input without delay, "
+            "which no sampled loop has"
+        )
+        left = self._beyond_paper
         yield self._controller_error(
             "the paper's bound, line by line", "eq:LossEv3",
-            "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1], None, ideal,
+            "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1],
+            self._unknown, ideal,
         )  # fmt: skip
         trigger = self.record.scenario.trigger
-        delta = theorem_one(self.record, self.joined)
+        delta = theorem_one(self.record, self.joined, math.inf if left is None else left[0])
         if delta is not None and trigger.floor == 0:
             name = "Theorem 1" if self.record.loop.H.any() else "Theorem 3"
             level = trigger.beta * np.exp(-trigger.alpha_per_s * self._t_s)
             yield self._controller_error(
                 "the controller's error decays", f"{name}, Δ from this run's trajectory",
-                "‖e_c‖ ≤ {:.4g} βe^(−αt)", delta, delta * level, None, ideal,
+                "‖e_c‖ ≤ {:.4g} βe^(−αt)", delta, delta * level, left, ideal,
             )  # fmt: skip
         if (theorem := self._theorem_2) is not None:
             bound = theorem.state(self._t_s, trigger.alpha_per_s)
             yield self._state("Theorem 2, eq:normXt", "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))",
-                              None, bound, None, ideal)  # fmt: skip
-            yield self._spacing("Theorem 2, eq:tau", theorem.inter_event_s, None, ideal)
+                              None, bound, left, ideal)  # fmt: skip
+            yield self._spacing("Theorem 2, eq:tau", theorem.inter_event_s, left, ideal)
 
     def _certified(self) -> Iterator[Claim]:
         for certificate in self.certificates:
@@ -216,7 +253,7 @@ class Claims:
                     None, None, None, ClaimVerdict.VOID, 0.0, certificate.void or "",
                 )  # fmt: skip
                 continue
-            left = observe(self.record).left(certificate.conditions)
+            left = self._observed.left(certificate.conditions)
             constants, t_s, source = certificate.constants, self._t_s, certificate.source
             rate = f"e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
             suffix = "" if certificate.floor_constants is None else ", and the floor's share"
@@ -239,25 +276,24 @@ class Claims:
 
     def _controller_error(
         self, what: str, source: str, bound: str, certified: float | None, values: Reals,
-        left: tuple[float, str] | None, why: str,
+        left: Left, why: str,
     ) -> Claim:  # fmt: skip
         here = self._in_common
+        left = min(filter(None, (left, self._unknown)), default=None)
         # Rounding of x itself, where a bound is as small as that.
         slack = _ROUNDING * np.linalg.norm(self.joined.x[here], axis=1)
-        shares = self.joined.e_c_norm[here] / (values[here] + slack)
+        shares = _shares(self.joined.e_c_norm[here], values[here] + slack)
         return _upper(what, source, bound, certified, self._t_s[here], shares, left, why)
 
     def _state(
         self, source: str, bound: str, certified: float | None, values: Reals,
-        left: tuple[float, str] | None, why: str,
+        left: Left, why: str,
     ) -> Claim:  # fmt: skip
-        shares = np.linalg.norm(self.joined.x, axis=1) / values
+        shares = _shares(np.linalg.norm(self.joined.x, axis=1), values)
         what = "the state is bounded and decays" if "e^" in bound else "the state is bounded"
         return _upper(what, source, bound, certified, self._t_s, shares, left, why)
 
-    def _spacing(
-        self, source: str, certified_s: float, left: tuple[float, str] | None, why: str
-    ) -> Claim:
+    def _spacing(self, source: str, certified_s: float, left: Left, why: str) -> Claim:
         t_s, passed_s = self._inter_event_s
         claim = _upper(
             "events keep their distance", source, "t_(i+1) − t_i ≥ {:.4g} s", certified_s,
@@ -267,9 +303,15 @@ class Claims:
         return claim._replace(observed=certified_s / ratio if ratio else None)
 
 
+def _shares(observed: Reals, bound: Reals) -> Reals:
+    """How much of a bound was used, (k,); of a bound that is 0 itself, 0 uses nothing."""
+    used = np.zeros(len(observed))
+    return np.divide(observed, bound, out=used, where=(observed != 0) | ~(bound >= 0))
+
+
 def _upper(
     what: str, source: str, bound: str, certified: float | None, t_s: Reals, shares: Reals,
-    left: tuple[float, str] | None, why: str,
+    left: Left, why: str,
 ) -> Claim:  # fmt: skip
     """Judge a bound from the share of it that was used, (k,), at times (k,)."""
     text = bound.format(certified) if certified is not None else bound

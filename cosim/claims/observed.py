@@ -24,6 +24,10 @@ Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
 
 
+Left = tuple[float, str] | None
+"""When a run left the conditions of a claim, and how; None if it never did."""
+
+
 class Series(NamedTuple):
     """A condition's value over time: k values, each known from its time on."""
 
@@ -67,7 +71,7 @@ class Observed(NamedTuple):
     start_s: float
     """When the plant began to feel the controller; infinite if never."""
 
-    def left(self, conditions: Conditions) -> tuple[float, str] | None:
+    def left(self, conditions: Conditions) -> Left:
         """When and how the run first left the conditions; None if it never did."""
         limits = (
             (self.losses.runs(conditions.delay_s), conditions.dropouts,

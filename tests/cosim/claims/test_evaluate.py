@@ -355,3 +355,57 @@ def test_no_simulated_run_violates_its_certificate() -> None:
 
     check()
     assert judged[HELD] > 10 * judged.get(VOID, 0)
+
+
+# --- what cannot be judged ------------------------------------------------------------------------
+
+
+def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
+    """They presuppose M − 1; what follows from (I1) alone does not, and is judged to the end."""
+    record = simulate(
+        make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2})
+    )
+    claims = Claims(record).judge()
+    since = {claim.since_s for claim in claims if claim.verdict is VOID}
+    theorems = [claim for claim in claims if claim.source.startswith("Theorem")]
+    assert theorems
+    assert {claim.verdict for claim in theorems} == {VOID}
+    events = record[SENSOR_MEASUREMENT]
+    event_s = events["t_ns"][events["event"] >= 0] * 1e-9
+    # t_0 arrives; of the next ones, the third is too many.
+    assert list(since) == pytest.approx([event_s[3]])
+    assert {claim.verdict for claim in claims if claim.source == "(I1)"} == {HELD}
+
+
+def test_nothing_at_all_is_within_every_bound(make: Make) -> None:
+    """x(0) = 0: every error, and the bounds that follow from the errors, are 0 all along."""
+    record = simulate(make(plant={"initial_state": [0.0, 0.0]}))
+    for claim in Claims(record).judge():
+        assert claim.verdict is HELD, claim
+        assert claim.ratio is None or claim.ratio <= 1
+
+
+def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
+    """The measurements go on when the controller's record ends: from 2 s on ‖e_c‖ is unknown."""
+    ticks, taken = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
+    cut = changed(
+        run, controller_step=ticks[ticks["t_ns"] < 2_000_000_000],
+        controller_delivery=taken[taken["now_ns"] < 2_000_000_000],
+    )  # fmt: skip
+    unknown = [c for c in Claims(cut).judge() if "e_c" in c.bound or c.source == "(I1)"]
+    assert unknown
+    for claim in unknown:
+        assert claim.verdict is not HELD
+        assert claim.since_s is not None
+        assert claim.since_s <= 2.02
+
+
+def test_a_state_beyond_floating_point_is_not_held(make: Make) -> None:
+    unstable = make(
+        model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]]},
+        plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        claims = Claims(simulate(unstable)).judge()
+    assert claims
+    assert all(claim.verdict is not HELD for claim in claims), claims
