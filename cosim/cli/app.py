@@ -1,8 +1,10 @@
 """The program ``noack``: how a command is declared, what all commands share, the entry point."""
 
 import io
+import math
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import wraps
 from importlib.metadata import version
 from json import dumps
@@ -101,13 +103,22 @@ def find_scenario(name: str) -> Path:
 
 
 def print_json(document: object) -> None:
-    """Print the one document of ``--json``."""
-    print(dumps(document, indent=2, allow_nan=False))
+    """Print the one document of ``--json``; a number that is not finite becomes null."""
+    print(dumps(_finite(document), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _failed(message: str, status: ExitStatus) -> ExitStatus:
     if "--json" in sys.argv:
-        print_json({"error": message, "exit": {"status": int(status), "reason": message}})
+        with suppress(OSError):  # it may be standard output that failed
+            print_json({"error": message, "exit": {"status": int(status), "reason": message}})
     for line in message.splitlines():
         print(f"noack: {line}", file=sys.stderr)
     return status

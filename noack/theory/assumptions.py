@@ -65,11 +65,12 @@ def _closed_loop(loop: Loop) -> Assumption:
 
 def _decay_rate(loop: Loop, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
+    how = f"decays at any rate below {rate:.3g} /s" if rate > 0 else "does not decay"
     return Assumption(
         "0 < α < ᾱ: the threshold decays more slowly than the closed loop",
         "Theorem 2",
         _verdict(alpha_per_s < rate),
-        f"α = {alpha_per_s:g} /s; ‖e^((A+BK)t)‖ decays at any rate below {rate:.3g} /s",
+        f"α = {alpha_per_s:g} /s; ‖e^((A+BK)t)‖ {how}",
     )
 
 

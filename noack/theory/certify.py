@@ -29,6 +29,7 @@ OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
 
 _RESOLUTION = 1e-3
+_TOO_LARGE = "the numbers on the way to it are too large or too small for floating point"
 
 Change = Callable[[Conditions, float], Conditions]
 """Sets a time of the conditions."""
@@ -217,11 +218,16 @@ class Scope:
         late: Constants | None = None
         void = None
         try:
-            first = self._first_phase(conditions)
-            if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
-                late = self._after_floor(conditions, first)
+            with np.errstate(all="ignore"):
+                first = self._first_phase(conditions)
+                if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
+                    late = self._after_floor(conditions, first)
         except (NotDecayingError, VoidError) as error:
             first, void = None, str(error)
+        except (OverflowError, np.linalg.LinAlgError):
+            first, void = None, _TOO_LARGE
+        if not all(_finite(constants) for constants in (first, late)):
+            first, late, void = None, None, _TOO_LARGE
         assumptions = _assumptions(self._resolved, conditions, self._decay, self._held, first, void)
         return Certificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
@@ -371,3 +377,14 @@ def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assu
         why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
     verdict = Verdict.HOLDS if holds else Verdict.VIOLATED
     return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
+
+
+def _finite(constants: Constants | None) -> bool:
+    """Whether every constant is a number; only the inter-event time may be without end."""
+    if constants is None:
+        return True
+    numbers = constants._replace(inter_event_s=None)
+    endless = constants.inter_event_s
+    return all(math.isfinite(v) for v in numbers if v is not None) and not (
+        endless is not None and math.isnan(endless)
+    )

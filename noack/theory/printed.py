@@ -50,7 +50,7 @@ class Theorem2(NamedTuple):
 def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theorem2 | None:
     """Theorem 2 for a given Δ, with the c and ᾱ that give the longest inter-event time.
 
-    None if 0 < α < ᾱ cannot be met.
+    None if 0 < α < ᾱ cannot be met, or if the numbers leave floating point.
     """
     closed = loop.A + loop.B @ loop.K
     fastest = -spectral_abscissa(closed)
@@ -69,7 +69,9 @@ def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theo
         method="bounded",
         options={"xatol": _SHARE},
     )
-    return at(float(best.x))
+    found = at(float(best.x))
+    sizes = (found.c, found.state_start, found.state_forced)
+    return None if math.isnan(found.inter_event_s) or not all(map(math.isfinite, sizes)) else found
 
 
 def _theorem_2(

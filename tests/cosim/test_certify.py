@@ -145,3 +145,28 @@ def test_nothing_certified_is_a_failure_that_says_why() -> None:
     assert result.exit_code == 1
     assert "void" in result.stdout
     assert "grows at" in result.stdout
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["plant.uncertainty_A=[[0.0, 0.0], [1e3, 1e3]]"],
+        ["plant.uncertainty_A=[[0.0, 0.0], [1e300, 0.0]]", 'plant.draw="nominal"'],
+        ["plant.initial_state=[1e300, 1e300]"],
+        ["trigger.beta=1e308", "trigger.floor=0.0"],
+        ["model.gain=[[0.0, -1e7]]"],
+    ],
+)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_numbers_beyond_floating_point_are_no_certificate(settings: list[str]) -> None:
+    """Neither a traceback nor a certificate with a constant that is no number."""
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json", *arguments])
+    assert result.exit_code in (0, 1), result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    for certificate in json.loads(result.stdout)["certificates"]:
+        if certificate["constants"] is None:
+            assert certificate["void"]
+        else:
+            assert all(v is not None for k, v in certificate["constants"].items()
+                       if k != "inter_event_s")  # fmt: skip
