@@ -16,6 +16,16 @@ from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FIL
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus
 
+_SHOWN = {
+    "scenario", "mode", "mansd", "horizon_s", "reached_s", "events", "deliveries", "drops",
+    "forced_deliveries", "longest_drop_run", "assumption_violations", "assumptions",
+    "missing_samples", "missing_by_table", "lost_outside_netem", "lost_by_leg",
+    "rejected_datagrams", "inter_event_min_s", "inter_event_median_s", "inter_delivery_median_s",
+    "initial_state_norm", "final_state_norm", "sup_e_s_norm", "sup_e_c_norm",
+    "identity_residual_relative", "lateness_us", "latency_us", "realtime",
+}  # fmt: skip
+"""What a summary needs to be shown; one of an earlier version may lack it."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -27,6 +37,7 @@ class Outcome:
     summary: Summary
 
 
+@np.errstate(all="ignore")
 def conclude(ending: Ending) -> Outcome:
     """Finish what a dead recorder left undone; write summary and report."""
     run_dir = ending.run_dir
@@ -64,8 +75,7 @@ def _found_out(record: RunRecord, claims: Claims) -> Summary:
             found["replay"] = {"bit_exact": None, "error": repr(error)}
         found["fidelity"] = fidelity_for_summary(record)
     try:
-        with np.errstate(all="ignore"):
-            found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+        found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     return found
@@ -80,15 +90,25 @@ def reopen(run_dir: Path) -> Outcome:
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     summary = _read_summary(run_dir)
-    if summary is None:
+    ending = _ending(run_dir, summary)
+    # It is of an earlier version or damaged; or a process woke up after the end.
+    if not summary.keys() >= _SHOWN or (run_dir / SPOOL).is_dir():
+        return conclude(ending)
+    return Outcome(run_dir, ending.status, ending.reason, summary)
+
+
+def _ending(run_dir: Path, summary: Summary) -> Ending:
+    """How a run ended, as its summary has it."""
+    try:
+        status, reason = ExitStatus(summary["exit"]["status"]), str(summary["exit"]["reason"])
+        return Ending(run_dir, 0, status, reason, summary["startup_s"])
+    except (LookupError, TypeError, ValueError):
+        summary.clear()  # without an end, nothing of it can be trusted
         reason = "the launcher did not live to see the end"
-        return conclude(Ending(run_dir, 0, ExitStatus.FAILED, reason))
-    status, reason = ExitStatus(summary["exit"]["status"]), summary["exit"]["reason"]
-    if (run_dir / SPOOL).is_dir():  # from a process that woke up after the end
-        return conclude(Ending(run_dir, 0, status, reason, summary["startup_s"]))
-    return Outcome(run_dir, status, reason, summary)
+        return Ending(run_dir, 0, ExitStatus.FAILED, reason)
 
 
+@np.errstate(all="ignore")
 def report_anew(run_dir: Path) -> Path:
     """Write the report of an earlier run anew, and return its path.
 
@@ -105,17 +125,16 @@ def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: Claims) 
     from cosim.report.write import write_report  # imports matplotlib, which no process needs sooner
 
     try:
-        with np.errstate(all="ignore"):
-            envelopes = claims.envelopes()
+        envelopes = claims.envelopes()
     except Exception:  # the page is worth having without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)
 
 
-def _read_summary(run_dir: Path) -> Summary | None:
-    """The run's summary; None if there is none, or a damaged one, which is then written anew."""
+def _read_summary(run_dir: Path) -> Summary:
+    """The run's summary; empty if there is none, or a damaged one, which is then written anew."""
     try:
-        summary: Summary = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
-        return summary if {"exit", "startup_s"} <= summary.keys() else None
-    except (OSError, ValueError, AttributeError):
-        return None
+        found = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

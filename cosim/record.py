@@ -182,8 +182,11 @@ def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
 
 def _read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return [json.loads(line) for line in lines]
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        return [json.loads(line) for line in lines]
+    except (OSError, ValueError) as error:
+        raise CallerError(f"{path}: cannot be read: {error}") from None
 
 
 def _reports(run_dir: Path) -> dict[str, dict[str, Any]]:

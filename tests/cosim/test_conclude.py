@@ -6,13 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import cosim.conclude
 from cosim.conclude import reopen
 from cosim.environment import write_environment
 from cosim.record import write_record
 from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
+from cosim.tables import print_outcome
 from cosim.virtual import simulate
+from noack.errors import CallerError
 from noack.records import PLANT_STEP
 from noack.resolve import resolve
 from noack.scenario_file import dumps, validate
@@ -82,3 +85,38 @@ def test_an_interrupted_replay_leaves_a_summary(
         reopen(run_dir)
     assert summary_of(run_dir)["replay"] is None
     assert reopen(run_dir).summary["replay"] is None
+
+
+@pytest.mark.parametrize("lacking", ["assumptions", "lateness_us", "identity_residual_relative"])
+def test_a_summary_of_an_earlier_version_is_made_whole(run_dir: Path, lacking: str) -> None:
+    """How the run ended is kept: that is all that the record does not know."""
+    whole = reopen(run_dir)
+    ended = {"exit": {"status": 143, "reason": "stopped by SIGTERM"}}
+    earlier = {k: v for k, v in whole.summary.items() if k != lacking} | ended
+    (run_dir / SUMMARY_FILE).write_text(json.dumps(earlier))
+    outcome = reopen(run_dir)
+    assert outcome.summary == whole.summary | ended
+    assert (outcome.status, outcome.reason) == (143, "stopped by SIGTERM")
+
+
+@pytest.mark.parametrize("end", [None, {}, {"status": 99, "reason": ""}])
+def test_a_summary_that_does_not_know_the_end_is_written_anew(run_dir: Path, end: Any) -> None:
+    whole = reopen(run_dir)
+    (run_dir / SUMMARY_FILE).write_text(json.dumps(whole.summary | {"exit": end}))
+    assert reopen(run_dir).summary == whole.summary
+
+
+@pytest.mark.parametrize("new", ["claims", "conditions", "fidelity", "replay", "kind"])
+def test_what_is_new_in_a_summary_may_be_lacking(run_dir: Path, new: str) -> None:
+    whole = reopen(run_dir)
+    earlier = {k: v for k, v in whole.summary.items() if k != new}
+    (run_dir / SUMMARY_FILE).write_text(json.dumps(earlier))
+    outcome = reopen(run_dir)
+    assert outcome.summary == earlier
+    print_outcome(Console(quiet=True), outcome)
+
+
+def test_a_damaged_log_is_one_clear_line(run_dir: Path) -> None:
+    (run_dir / "record/notices.jsonl").write_bytes(b"\xae\xff")
+    with pytest.raises(CallerError, match=r"notices\.jsonl: cannot be read"):
+        reopen(run_dir)
