@@ -84,6 +84,7 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a run may diverge
 def join(loop: Loop, measurements: Rows, track: ControllerTrack, until_ns: int) -> Joined:
     """Join measurements with the controller's track.
 

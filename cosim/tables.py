@@ -104,8 +104,15 @@ def print_claims(console: Console, summary: Summary) -> None:
             f"[{colour}]{claim['verdict']}{since}[/]",
         )
     console.print(table)
-    for why in dict.fromkeys(c["why"] for c in claims if c["verdict"] != "held" and c["why"]):
-        console.print(f"not held: {why}", highlight=False, markup=False)
+    for verdict, why in dict.fromkeys((c["verdict"], c["why"]) for c in claims):
+        if verdict != "held" and why:
+            console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",
+                          highlight=False, markup=False)  # fmt: skip
+
+
+def _sources(claims: list[dict[str, Any]], verdict: str, why: str) -> str:
+    same = (c["source"] for c in claims if (c["verdict"], c["why"]) == (verdict, why))
+    return "; ".join(dict.fromkeys(same))
 
 
 _CLAIM_COLOURS = {"held": "green", "violated": "bold red", "void": "yellow"}

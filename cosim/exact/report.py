@@ -33,6 +33,7 @@ def run_continuous(resolved: Scenario) -> ContinuousRun:
     )
 
 
+@np.errstate(all="ignore")  # a run may diverge
 def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
     """The run as JSON: its summary, every event, and the states at 501 times."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
@@ -92,6 +93,7 @@ def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
     }
 
 
+@np.errstate(all="ignore")
 def print_run(console: Console, run: ContinuousRun, resolved: Scenario) -> None:
     """Print the run's figures, and its events."""
     figures = summary(run, resolved)

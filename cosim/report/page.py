@@ -158,7 +158,9 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
 
 def _claim(claim: Mapping[str, Any]) -> dict[str, str]:
     texts = {key: _text(claim, key) for key in ("what", "source", "bound", "verdict", "why")}
-    numbers = {key: _shown(claim.get(key)) for key in ("certified", "observed", "ratio")}
+    numbers = {key: _shown(claim.get(key)) for key in ("certified", "observed")}
+    ratio = claim.get("ratio")
+    numbers["ratio"] = f"{100 * ratio:.3g} %" if isinstance(ratio, float) else _shown(ratio)
     since_s = claim.get("since_s")
     return texts | numbers | {"since": "" if since_s is None else f"t = {_shown(since_s)} s"}
 

@@ -68,6 +68,7 @@ class ViewFeed:
         level = "WARN" if notice["level"] == "violation" else "INFO"
         self._view.log(int(notice["t_ns"]), level, str(text))
 
+    @np.errstate(all="ignore")  # a run may diverge
     def advance(self, *, final: bool = False) -> None:
         """Pass on what is complete; at the end, everything."""
         steps = self._take(CONTROLLER_STEP, None)

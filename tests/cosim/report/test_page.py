@@ -130,7 +130,7 @@ def test_the_report_of_a_live_run_is_whole(record: RunRecord, tmp_path: Path) ->
     for claim in CLAIMS:
         for key in ("what", "source", "bound", "verdict", "why"):
             assert str(claim.get(key, "")) in page.text
-    for number in ("2.5", "0.4371", "0.1748", "t = 3.25 s", "0.011"):
+    for number in ("2.5", "0.4371", "17.5 %", "t = 3.25 s", "0.011"):
         assert number in page.text
     for assumption in summary["assumptions"]:
         assert assumption["what"] in page.text
