@@ -52,7 +52,8 @@ class Losses(NamedTuple):
         """Successive losses at every event; what was overtaken within ``delay_s`` is not lost."""
         runs, run = [], 0
         for made_up_s in self.made_up_s.tolist():
-            run = run + 1 if made_up_s > delay_s + _TOLERANCE_S else 0
+            lost = made_up_s == np.inf or made_up_s > delay_s + _TOLERANCE_S
+            run = run + 1 if lost else 0
             runs.append(run)
         return Series(self.t_s, np.array(runs, dtype=np.float64))
 
