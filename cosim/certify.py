@@ -21,6 +21,7 @@ from noack.theory.certify import (
     box,
     ideal_conditions,
     nominal_conditions,
+    outside_box,
     own_plant,
 )
 from noack.theory.enclosure import NotDecayingError
@@ -146,6 +147,8 @@ def print_study(console: Console, found: Study) -> None:
     """Print the tables."""
     _print_constants(console, found)
     _print_limits(console, found)
+    if (outside := outside_box(found.resolved)) is not None:
+        console.print(f"[yellow]the box certificates say nothing of this plant:[/] {outside}")
     console.print("assumptions of the certificates under the schedule:")
     certificate = next(c for under, c in found.certificates if under == SCHEDULE)
     _print_assumptions(console, [a._asdict() for a in certificate.assumptions])
@@ -197,20 +200,20 @@ def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
         return row(lambda c: getattr(c.constants, name))
 
     yield (
-        "falls at, 1/s",
+        "decay rate, 1/s",
         constant("rate_per_s"),
         _number(found.resolved.trigger.alpha_per_s),
     )
     yield "updates missing", constant("missing_events"), "-"
     yield (
-        "Δ, of ‖e_c‖/β",
+        "Δ, bound of ‖e_c‖/β",
         constant("delta"),
         ("(same)" if theorem is not None else "-"),
     )
-    yield "of ‖e_s‖/β", constant("overshoot"), "1"
-    yield "of ‖u − Kx‖", constant("input_error"), "-"
+    yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
+    yield "bound of ‖u − Kx‖", constant("input_error"), "-"
     yield (
-        "X, of ‖x‖",
+        "X, bound of ‖x‖",
         constant("state"),
         (_number(theorem.state_start + theorem.state_forced) if theorem is not None else "-"),
     )
@@ -233,7 +236,7 @@ def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
 
 
 def _print_limits(console: Console, found: Study) -> None:
-    table = Table(title="largest certified values, the schedule otherwise as it is")
+    table = Table(title="largest certified values of the schedule, one at a time")
     for heading in ("", "sampling period", "delay of an update", "age of the input"):
         table.add_column(heading, justify="right" if heading else "left")
     for scope, limits in found.limits.items():

@@ -108,6 +108,13 @@ def print_claims(console: Console, summary: Summary) -> None:
         if verdict != "held" and why:
             console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",
                           highlight=False, markup=False)  # fmt: skip
+    if summary["kind"] == "live" and any(
+        "felt after" in c["why"] or " old" in c["why"] for c in claims
+    ):
+        console.print(
+            "[dim]this machine was late: a greater certificate.late_periods allows for it, "
+            "where it can be certified; noack simulate is never late[/]"
+        )
 
 
 def _sources(claims: list[dict[str, Any]], verdict: str, why: str) -> str:

@@ -19,11 +19,13 @@ from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario import Scenario
 from noack.theory.certificate import Conditions
 from noack.theory.certify import (
+    OWN_PLANT,
     Certificate,
     certify,
     certify_box,
     ideal_conditions,
     nominal_conditions,
+    outside_box,
 )
 from noack.theory.monitor import ErrorMonitor
 from noack.theory.printed import Theorem2, theorem_2
@@ -254,6 +256,8 @@ class Claims:
                 )  # fmt: skip
                 continue
             left = self._observed.left(certificate.conditions)
+            if certificate.scope != OWN_PLANT and (outside := outside_box(self.record.scenario)):
+                left = (0.0, outside)
             constants, t_s, source = certificate.constants, self._t_s, certificate.source
             rate = f"e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
             suffix = "" if certificate.floor_constants is None else ", and the floor's share"

@@ -1,5 +1,6 @@
 """Certificates of a scenario: which claims stand, on which assumptions, under which conditions."""
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -27,6 +28,7 @@ from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
 OWN_PLANT = "the scenario's plant"
 _SLOWER = 0.9
+_SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 
 _RESOLUTION = 1e-3
 _TOO_LARGE = "the numbers on the way to it are too large or too small for floating point"
@@ -186,6 +188,26 @@ def box(resolved: Scenario) -> "Scope | None":
     return Scope("every plant of the uncertainty box", resolved, closed_loop, plant_at)
 
 
+def outside_box(resolved: Scenario) -> str | None:
+    """Where the scenario's plant lies outside its own uncertainty box; None if it does not."""
+    loop, plant = loop_of(resolved), resolved.plant
+    for name, true, model, halfwidth in (
+        ("A", loop.A, loop.A_model, plant.uncertainty_A),
+        ("B", loop.B, loop.B_model, plant.uncertainty_B),
+    ):
+        if plant.uncertainty_A is None and plant.uncertainty_B is None:
+            return None
+        half = np.zeros_like(true) if halfwidth is None else np.array(halfwidth)
+        slack = 1e-12 * (1.0 + np.abs(model))
+        for i, j in np.argwhere(np.abs(true - model) > half + slack):
+            apart = abs(true[i, j] - model[i, j])
+            return (
+                f"the plant lies outside: {name}[{i + 1},{j + 1}] is {apart:.3g} from the "
+                f"model's, the half-width is {half[i, j]:.3g}"
+            )
+    return None
+
+
 class Scope:
     """Plants for which certificates are made; what depends on no condition is computed once.
 
@@ -256,11 +278,29 @@ class Scope:
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
         if not self._held and _below(alpha, decay) and floor < beta:
-            return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+            try:
+                return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+            except NotDecayingError:
+                if floor > 0:
+                    raise
+                return self._slower(conditions, alpha, start)
         # A slower decay, or none, is certified instead; then no threshold is there to be reached.
         slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
         level = Level(max(beta, floor), floor or None)
         return self._solve(conditions, slower, slower, start, level)
+
+    def _slower(self, conditions: Conditions, alpha_per_s: float, start: Matrix) -> Constants:
+        """Bounds that fall more slowly than the threshold: of a box too large for α.
+
+        Raises:
+            NotDecayingError: there are none, either.
+        """
+        for share in _SHARES_OF_ALPHA:
+            rate = share * alpha_per_s
+            with contextlib.suppress(NotDecayingError):
+                level = Level(self._resolved.trigger.beta, None)
+                return self._solve(conditions, rate, rate, start, level)
+        raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
     def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
         """Once the threshold is the floor: from any state the first phase leaves, without decay.

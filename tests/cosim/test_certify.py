@@ -9,12 +9,15 @@ import pytest
 from typer.testing import CliRunner
 
 from cosim.certify import IDEAL, SCHEDULE, Study, study, with_weight
+from cosim.claims.evaluate import Claims
 from cosim.cli import app
+from cosim.virtual import simulate
 from noack.errors import CallerError
 from noack.resolve import loop_of, resolve
 from noack.scenario import Scenario
 from noack.scenario_file import load
 from noack.theory.assumptions import Verdict
+from noack.theory.certify import certify_box, ideal_conditions, outside_box
 
 ROOT = Path(__file__).parents[2]
 
@@ -170,3 +173,44 @@ def test_numbers_beyond_floating_point_are_no_certificate(settings: list[str]) -
         else:
             assert all(v is not None for k, v in certificate["constants"].items()
                        if k != "inter_event_s")  # fmt: skip
+
+
+BOXED = (
+    'model={name="double_integrator"}',
+    "plant={initial_state=[1.0,0.0],uncertainty_A=[[0.0,0.0],[0.3,0.1]]}",
+)
+
+
+def test_a_plant_outside_its_box_is_named() -> None:
+    inside = scenario("lane_following", *BOXED)
+    assert outside_box(inside) is None
+    assert outside_box(scenario("lane_following")) is None
+    outside = scenario(
+        "lane_following", *BOXED, 'plant.draw="given"', "plant.A=[[0.0,1.0],[2.0,0.0]]",
+        "plant.B=[[0.0],[1.0]]",
+    )  # fmt: skip
+    said = outside_box(outside)
+    assert said == ("the plant lies outside: A[2,1] is 2 from the model's, the half-width is 0.3")
+    claims = [c for c in Claims(simulate(outside)).judge() if c.source == "box certificate"]
+    assert claims
+    assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
+
+
+def test_a_box_too_large_for_alpha_is_certified_at_a_slower_rate() -> None:
+    """Bounds that fall like e^(−rate·t), and no inter-event time; a larger box has none at all."""
+    certified = {}
+    for wide in (0.2, 0.5, 5.0):
+        settings = [
+            *BOXED[:1],
+            f"plant={{initial_state=[1.0,0.0],uncertainty_A=[[0,0],[{wide},0]]}}",
+        ]
+        resolved = scenario("lane_following", *settings, "trigger.alpha_per_s=0.6")
+        found = certify_box(resolved, ideal_conditions(resolved))
+        assert found is not None
+        certified[wide] = found
+    assert certified[0.2].constants is not None
+    assert certified[5.0].constants is None
+    slower = certified[0.5].constants
+    assert slower is not None
+    assert 0 < slower.rate_per_s < 0.6
+    assert slower.inter_event_s is None
