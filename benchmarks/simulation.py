@@ -26,7 +26,8 @@ from noack.linear import Vector
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.scenario_file import load
-from noack.theory.certify import certify, ideal_conditions
+from noack.theory.certify import certify
+from noack.theory.schedule import ideal_conditions
 
 ROUNDS = 5
 _RTOL = 1e-10

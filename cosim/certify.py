@@ -15,17 +15,10 @@ from noack.resolve import loop_of
 from noack.scenario import Scenario
 from noack.theory.assumptions import Verdict, assumptions
 from noack.theory.certificate import Conditions
-from noack.theory.certify import (
-    Certificate,
-    Scope,
-    box,
-    ideal_conditions,
-    nominal_conditions,
-    outside_box,
-    own_plant,
-)
+from noack.theory.certify import Certificate, Scope, box, outside_box, own_plant
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.printed import Theorem2, theorem_2
+from noack.theory.schedule import ideal_conditions, nominal_conditions
 from noack.theory.weight import choose_weight
 
 IDEAL = "paper"

@@ -27,7 +27,8 @@ from cosim.exact.loop import ContinuousLoop, continuous_loop_of
 from cosim.exact.run import ContinuousRun, simulate_continuous
 from noack.rng import stream
 from noack.scenario import Scenario
-from noack.theory.certify import Certificate, certify, ideal_conditions
+from noack.theory.certify import Certificate, certify
+from noack.theory.schedule import ideal_conditions
 
 NODES = 500_000
 BEAM = 512

@@ -18,17 +18,10 @@ from cosim.record import RunRecord
 from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario import Scenario
 from noack.theory.certificate import Conditions
-from noack.theory.certify import (
-    OWN_PLANT,
-    Certificate,
-    certify,
-    certify_box,
-    ideal_conditions,
-    nominal_conditions,
-    outside_box,
-)
+from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box, outside_box
 from noack.theory.monitor import ErrorMonitor
 from noack.theory.printed import Theorem2, theorem_2
+from noack.theory.schedule import ideal_conditions, nominal_conditions
 from noack.trigger.decaying import trigger_of
 
 Reals = NDArray[np.float64]

@@ -94,7 +94,8 @@ def adversary(
     from cosim.adversary.report import document, print_worst
     from cosim.progress import search_status
     from noack.resolve import resolve
-    from noack.theory.certify import certify, ideal_conditions
+    from noack.theory.certify import certify
+    from noack.theory.schedule import ideal_conditions
 
     given = [] if horizon is None else [f"horizon_s={horizon}"]
     resolved = resolve(load(find_scenario(scenario), [*(settings or ()), *given]))

@@ -7,8 +7,9 @@ from cosim.paper.conditions import resolved_draw
 from noack.resolve import loop_of
 from noack.scenario import Scenario
 from noack.theory.certificate import Constants
-from noack.theory.certify import certify, ideal_conditions
+from noack.theory.certify import certify
 from noack.theory.printed import theorem_2
+from noack.theory.schedule import ideal_conditions
 
 
 class Certified(NamedTuple):

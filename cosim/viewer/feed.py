@@ -23,8 +23,9 @@ from noack.records import (
 )
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.theory.certify import Certificate, certify, nominal_conditions
+from noack.theory.certify import Certificate, certify
 from noack.theory.monitor import ErrorMonitor
+from noack.theory.schedule import nominal_conditions
 from noack.trigger.decaying import trigger_of
 
 _LAG_S = 0.2

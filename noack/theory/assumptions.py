@@ -1,4 +1,4 @@
-"""The paper's assumptions, checked for one scenario before it runs.
+"""Assumptions, the paper's and a certificate's, checked for one scenario before it runs.
 
 A claim is worth its assumptions. Each gets a verdict with its reason; what only the run can show
 (delays, the longest drop run) is checked against the run's record.
@@ -14,6 +14,7 @@ from noack.clock import NS_PER_S
 from noack.linear import Matrix, spectral_abscissa
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
+from noack.theory.certificate import Conditions, Constants
 
 
 class Verdict(StrEnum):
@@ -117,3 +118,84 @@ def _continuous_time(resolved: Scenario) -> Assumption:
         f"sampled every {period_ms:g} ms, input held for {control_ms:g} ms: "
         "‖e_s‖ may pass the threshold by what it grows in between",
     )
+
+
+def certificate_assumptions(
+    resolved: Scenario,
+    conditions: Conditions,
+    decay: dict[str, float],
+    held: bool,
+    constants: Constants | None,
+    void: str | None,
+) -> list[Assumption]:
+    """What a certificate rests on, with verdicts.
+
+    Args:
+        resolved: the scenario.
+        conditions: what is presupposed of network and schedule.
+        decay: decay rates per second, of "the models" and of "A + BK".
+        held: whether the models hold instead of decaying.
+        constants: of the certificate; None if there is none.
+        void: why there is none.
+    """
+    alpha, network = resolved.trigger.alpha_per_s, resolved.network
+    rate = 0.0 if constants is None else constants.rate_per_s
+    if held:
+        why = "a hold does not decay at all: what is certified is bounded, not decaying"
+        models = Assumption(
+            "α is below the decay rate of the models", "(I1)", Verdict.VIOLATED, why
+        )
+    else:
+        models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
+    presupposed = [
+        f"at most {conditions.dropouts} successive dropouts after a delivered t_0",
+        f"the trigger is tested every {1e3 * conditions.sampling_s:g} ms"
+        if conditions.sampling_s
+        else "the trigger watches continuously",
+        f"the plant feels an update within {1e3 * conditions.delay_s:g} ms of its event",
+        f"the input in force is at most {1e3 * conditions.hold_s:g} ms old",
+        f"the plant feels the controller from {1e3 * conditions.start_s:g} ms on",
+    ]
+    enforced = "the network enforces it" if network.enforce_mansd else "enforcement is switched off"
+    checks = [enforced, *["every run is checked for it"] * 4]
+    verdicts = [Verdict.HOLDS if network.enforce_mansd else Verdict.PRESUPPOSED]
+    verdicts += [Verdict.PRESUPPOSED] * 4
+    gain = (
+        Assumption(
+            "the errors reproduce themselves with a gain below 1",
+            "certificate",
+            Verdict.HOLDS,
+            f"the gain is {constants.loop_gain:.3g}",
+        )
+        if constants is not None
+        else Assumption("there is a certificate", "certificate", Verdict.VIOLATED, void or "")
+    )
+    return [
+        models,
+        _rate("A + BK", "Theorem 2", alpha, decay["A + BK"], rate),
+        *(
+            Assumption(what, "conditions", verdict, why)
+            for what, verdict, why in zip(presupposed, verdicts, checks, strict=True)
+        ),
+        gain,
+        Assumption(
+            "A is unstable with distinct eigenvalues",
+            "Proposition 1",
+            Verdict.NOT_NEEDED,
+            "the bounds rest on (I1), which holds for every plant",
+        ),
+    ]
+
+
+def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
+    holds = below(alpha, decay)
+    why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
+    if not holds:
+        why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
+    verdict = Verdict.HOLDS if holds else Verdict.VIOLATED
+    return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
+
+
+def below(alpha_per_s: float, decay_per_s: float) -> bool:
+    """Clearly: what is decided by rounding cannot be certified."""
+    return alpha_per_s < (1 - 1e-9) * decay_per_s

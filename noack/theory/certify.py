@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from noack.clock import NS_PER_S
 from noack.linear import Matrix, spectral_abscissa
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.theory.assumptions import Assumption, Verdict
+from noack.theory.assumptions import Assumption, below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
     Background,
@@ -118,40 +117,6 @@ def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
     return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
 
 
-def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
-    """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
-
-    In the plant's time, whatever the rates: an update is felt from the first step on whose newest
-    tick is not before it, and the model state behind an input ages until the step after the one
-    that latched it. The plant steps before it takes what arrives at the same time.
-    """
-    step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
-    phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
-    # From a step back to the tick before: 0 < age ≤ tick, and age ≡ −phase modulo the gcd, all of
-    # which occur sooner or later. From a measurement on to the next tick: 0 ≤ wait < tick.
-    newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)
-    common_ns = math.gcd(sample_ns, tick_ns)
-    wait_ns = tick_ns - common_ns + phase_ns % common_ns
-    late_ns = late_periods * step_ns
-    if late_periods > 0:  # an update that is late by any time up to that may just miss a tick
-        wait_ns = late_ns + tick_ns - 1
-    delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
-    start_ns = first_ns if late_periods == 0 else max(first_ns + late_ns, delay_ns)
-    return Conditions(
-        dropouts=resolved.network.mansd,
-        sampling_s=sample_ns / NS_PER_S,
-        spacing_s=sample_ns / NS_PER_S,
-        delay_s=delay_ns / NS_PER_S,
-        hold_s=(newest_ns + step_ns + late_ns) / NS_PER_S,
-        start_s=start_ns / NS_PER_S,
-    )
-
-
-def ideal_conditions(resolved: Scenario) -> Conditions:
-    """The paper's: a trigger that watches always, an instant network, an input that is not held."""
-    return Conditions(dropouts=resolved.network.mansd)
-
-
 def certify(resolved: Scenario, conditions: Conditions) -> Certificate:
     """The certificate of a scenario's own plant."""
     return own_plant(resolved).certificate(conditions)
@@ -250,7 +215,9 @@ class Scope:
             first, void = None, _TOO_LARGE
         if not all(_finite(constants) for constants in (first, late)):
             first, late, void = None, None, _TOO_LARGE
-        assumptions = _assumptions(self._resolved, conditions, self._decay, self._held, first, void)
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, self._held, first, void
+        )
         return Certificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
             self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
@@ -277,7 +244,7 @@ class Scope:
         trigger, decay = self._resolved.trigger, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
-        if not self._held and _below(alpha, decay) and floor < beta:
+        if not self._held and below(alpha, decay) and floor < beta:
             try:
                 return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
             except NotDecayingError:
@@ -346,77 +313,6 @@ class Scope:
         if key not in self._plants:
             self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
         return solve(error, self._plants[key], conditions, level, background or Background())
-
-
-def _assumptions(
-    resolved: Scenario,
-    conditions: Conditions,
-    decay: dict[str, float],
-    held: bool,
-    constants: Constants | None,
-    void: str | None,
-) -> list[Assumption]:
-    alpha, network = resolved.trigger.alpha_per_s, resolved.network
-    rate = 0.0 if constants is None else constants.rate_per_s
-    if held:
-        why = "a hold does not decay at all: what is certified is bounded, not decaying"
-        models = Assumption(
-            "α is below the decay rate of the models", "(I1)", Verdict.VIOLATED, why
-        )
-    else:
-        models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
-    presupposed = [
-        f"at most {conditions.dropouts} successive dropouts after a delivered t_0",
-        f"the trigger is tested every {1e3 * conditions.sampling_s:g} ms"
-        if conditions.sampling_s
-        else "the trigger watches continuously",
-        f"the plant feels an update within {1e3 * conditions.delay_s:g} ms of its event",
-        f"the input in force is at most {1e3 * conditions.hold_s:g} ms old",
-        f"the plant feels the controller from {1e3 * conditions.start_s:g} ms on",
-    ]
-    enforced = "the network enforces it" if network.enforce_mansd else "enforcement is switched off"
-    checks = [enforced, *["every run is checked for it"] * 4]
-    verdicts = [Verdict.HOLDS if network.enforce_mansd else Verdict.PRESUPPOSED]
-    verdicts += [Verdict.PRESUPPOSED] * 4
-    gain = (
-        Assumption(
-            "the errors reproduce themselves with a gain below 1",
-            "certificate",
-            Verdict.HOLDS,
-            f"the gain is {constants.loop_gain:.3g}",
-        )
-        if constants is not None
-        else Assumption("there is a certificate", "certificate", Verdict.VIOLATED, void or "")
-    )
-    return [
-        models,
-        _rate("A + BK", "Theorem 2", alpha, decay["A + BK"], rate),
-        *(
-            Assumption(what, "conditions", verdict, why)
-            for what, verdict, why in zip(presupposed, verdicts, checks, strict=True)
-        ),
-        gain,
-        Assumption(
-            "A is unstable with distinct eigenvalues",
-            "Proposition 1",
-            Verdict.NOT_NEEDED,
-            "the bounds rest on (I1), which holds for every plant",
-        ),
-    ]
-
-
-def _below(alpha_per_s: float, decay_per_s: float) -> bool:
-    """Clearly: what is decided by rounding cannot be certified."""
-    return alpha_per_s < (1 - 1e-9) * decay_per_s
-
-
-def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
-    holds = _below(alpha, decay)
-    why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
-    if not holds:
-        why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
-    verdict = Verdict.HOLDS if holds else Verdict.VIOLATED
-    return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
 
 
 def _finite(constants: Constants | None) -> bool:

@@ -17,7 +17,8 @@ from noack.resolve import loop_of, resolve
 from noack.scenario import Scenario
 from noack.scenario_file import load
 from noack.theory.assumptions import Verdict
-from noack.theory.certify import certify_box, ideal_conditions, outside_box
+from noack.theory.certify import certify_box, outside_box
+from noack.theory.schedule import ideal_conditions
 
 ROOT = Path(__file__).parents[2]
 
@@ -81,7 +82,8 @@ def test_the_documentation_quotes_what_is_computed(lane: Study, weighted: Study)
 
 def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Study) -> None:
     """The limits are limits: a little less stands, a little more does not."""
-    from noack.theory.certify import nominal_conditions, own_plant
+    from noack.theory.certify import own_plant
+    from noack.theory.schedule import nominal_conditions
 
     resolved = scenario("lane_following")
     scheduled, scope = nominal_conditions(resolved, 2), own_plant(resolved)

@@ -15,7 +15,8 @@ from cosim.adversary.tree import search_tree
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.scenario_file import validate
-from noack.theory.certify import certify, ideal_conditions
+from noack.theory.certify import certify
+from noack.theory.schedule import ideal_conditions
 from tests.cosim.adversary.scenarios import (
     every_run,
     flow_of,

@@ -21,7 +21,7 @@ from noack.records import (
 )
 from noack.scenario import Scenario
 from noack.theory.certificate import Conditions
-from noack.theory.certify import nominal_conditions
+from noack.theory.schedule import nominal_conditions
 from tests.cosim.claims.conftest import Make, changed, network_of
 
 PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]

@@ -20,14 +20,9 @@ from noack.scenario import Scenario
 from noack.scenario_file import load, validate
 from noack.theory.assumptions import Verdict
 from noack.theory.certificate import Conditions, Constants, VoidError
-from noack.theory.certify import (
-    OWN_PLANT,
-    Certificate,
-    certify,
-    certify_box,
-    ideal_conditions,
-)
+from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box
 from noack.theory.printed import theorem_2
+from noack.theory.schedule import ideal_conditions
 from tests.noack.theory.loops import STEPS, System, Trace, networks, simulate, systems, times_s
 
 ROUNDING = 1 + 1e-9
