@@ -1,6 +1,7 @@
 """The tables that a person sees at the end of a run."""
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         console.print(f"[bold yellow]warning:[/] {escape(warning)}", highlight=False)
     if outcome.status:
         console.print(f"[bold red]the run failed:[/] {escape(outcome.reason)}")
+    console.print(f"in short       {_in_short(summary)}", highlight=False, soft_wrap=True)
     console.print(
         f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True, markup=False
     )
@@ -47,6 +49,17 @@ def print_outcome(console: Console, outcome: Outcome) -> None:
         soft_wrap=True,
         markup=False,
     )
+
+
+def _in_short(summary: Summary) -> str:
+    """How far the run came, and what became of its claims."""
+    verdicts = Counter(claim["verdict"] for claim in summary.get("claims") or ())
+    found = [
+        f"[{colour}]{verdicts[name]} {name}[/]"
+        for name, colour in _CLAIM_COLOURS.items()
+        if verdicts[name]
+    ]
+    return f"{summary['reached_s']:g} s; claims: {', '.join(found) or 'none'}"
 
 
 def _run_table(summary: Summary) -> Table:
@@ -108,7 +121,7 @@ def print_claims(console: Console, summary: Summary) -> None:
         if verdict != "held" and why:
             console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",
                           highlight=False, markup=False)  # fmt: skip
-    if summary["kind"] == "live" and any(
+    if summary.get("kind", "live") == "live" and any(
         "felt after" in c["why"] or " old" in c["why"] for c in claims
     ):
         console.print(
