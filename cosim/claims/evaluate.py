@@ -29,7 +29,8 @@ Reals = NDArray[np.float64]
 # What an exact computation may miss by rounding: the record holds 20 s in 10,000 steps.
 _ROUNDING = 1e-9
 _IDENTITY = 1e-9
-_ANY = Conditions(sys.maxsize, *[math.inf] * 5)
+_LONG_S = 1e300  # finite: what never came took longer
+_ANY = Conditions(sys.maxsize, *[_LONG_S] * 5)
 
 
 class ClaimVerdict(StrEnum):

@@ -120,7 +120,7 @@ def observe(record: RunRecord) -> Observed:
     age_ns = np.maximum(until_ns - model_ns, model_ns - steps["t_ns"])
     end_ns = max(int(rows["t_ns"][-1]) if len(rows) else 0 for rows in (steps, sensor))
     return Observed(
-        losses=_losses(record, events, felt),
+        losses=_losses(record, events, felt, end_ns),
         sampling=_sampling(sensor["t_ns"], end_ns),
         delay=_delays(record, events, felt, end_ns, start_s),
         hold=Series(step_s[feels], age_ns[feels] * 1e-9),
@@ -187,14 +187,14 @@ def _fates(record: RunRecord) -> tuple[set[int], set[int]]:
     return set(sequences[dropped].tolist()), set(sequences[~dropped].tolist())
 
 
-def _losses(record: RunRecord, events: NDArray[np.void], felt: Times) -> Losses:
+def _losses(record: RunRecord, events: NDArray[np.void], felt: Times, end_ns: int) -> Losses:
     """What never came; an update that is under way at the end is not lost."""
     taken, sequences = record[CONTROLLER_DELIVERY]["sequence"], events["event"]
     dropped, passed = (np.isin(sequences, list(fates)) for fates in _fates(record))
     superseded = sequences < taken.max(initial=NO_SEQUENCE)
     lost = ~np.isin(sequences, taken) & (superseded | dropped)
-    # Had it only been overtaken, a newer one made up for it.
-    step_s = np.append(record[PLANT_STEP]["t_ns"] * 1e-9, np.inf)
+    # Had it only been overtaken, a newer one made up for it, or has until the run's end not yet.
+    step_s = np.append(record[PLANT_STEP]["t_ns"], end_ns) * 1e-9
     felt_s = step_s[np.searchsorted(felt, sequences)] - events["t_ns"] * 1e-9
     made_up_s = np.where(lost, np.where(passed & superseded, felt_s, np.inf), 0.0)
     return Losses(events["t_ns"] * 1e-9, made_up_s)

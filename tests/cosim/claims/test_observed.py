@@ -332,3 +332,15 @@ def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
     one[PLANT_STEP]["actuation"] = NO_SEQUENCE
     assert observe(RunRecord(resolved, one, [], {})).start_s == np.inf
     assert NETEM_PACKET in rows
+
+
+def test_what_is_overtaken_as_the_run_ends_is_not_lost(make: Make) -> None:
+    """The controller has the newer update, but no step is left in which the plant could feel it."""
+    busy = make(trigger={"beta": 1e-6}, horizon_s=1.0)
+    events = simulate(busy, network_of(lambda n: 0))[SENSOR_MEASUREMENT]["event"]
+    late = int(events.max()) - 1
+    assert (events[-2:] == [late, late + 1]).all()  # an event at each of the last measurements
+    record = simulate(busy, network_of(lambda n: 18 if n == late else 0))
+    assert late not in record[CONTROLLER_DELIVERY]["sequence"]
+    assert late + 1 in record[CONTROLLER_DELIVERY]["sequence"]
+    assert observe(record).losses.runs(0.02).largest() == 0
