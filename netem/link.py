@@ -1,18 +1,31 @@
-"""One direction of a link: decides each datagram's fate, flow by flow. It reads no payload.
+"""One direction of a link as a machine: datagrams in, what survives out, now or later.
 
-Flows are independent of each other: each has its own loss process, random stream and MANSD counter,
-so that the fates of a flow depend on the seed and on its own arrival order only.
+It reads no payload. The rules are those of :mod:`netem.rules`; here they run as plain Python, in a
+run of the loop, in simulation and in replay, and in the relay where nothing faster is to be had.
 """
 
+import heapq
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from netem.loss import LossModel, loss_model
-from netem.mansd import MansdCap
+from netem.program import (
+    empty_state,
+    new_flow,
+    new_memory,
+    program_of,
+    recent_width,
+)
+from netem.records import Counters, Decision, FlowState, Memory, Verdict
+from netem.rules.change import carry
+from netem.rules.link import admit, leave
+from netem.rules.mansd import NEVER_NS
+from noack.impairments import LinkSettings
 from noack.machine import Notice, Record
-from noack.records import NETEM_PACKET, PACKET_HEAD_BYTES, Fate
-from noack.rng import stream
-from noack.scenario import Loss, Scenario
+from noack.records import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
+from noack.scenario import Scenario
+
+UPDATE_LINK = "update"
+"""Name of the link from sensor to controller; part of its random streams' names."""
 
 
 class Datagram(NamedTuple):
@@ -22,74 +35,209 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class _FlowState:
-    def __init__(self, loss: LossModel, cap: MansdCap) -> None:
-        self.loss = loss
-        self.cap = cap
-        self.packets = 0
+class _UnderWay(NamedTuple):
+    """A datagram, or a copy, that is to leave; ties leave in the order in which they came."""
+
+    release_ns: int
+    number: int
+    packet: int
+    copy: bool
+    counts: bool
+    """Whether it is the first intact copy."""
+    delayed: bool
+    datagram: Datagram
 
 
 class Link:
     """The machine of the network emulator.
 
     Args:
-        loss: settings of the loss model.
-        mansd: M − 1, or None for no cap.
-        seed: seed of the loss streams.
-        name: name of the link and direction; part of its random streams' names.
-        first_delivered: pass the first datagram of each flow.
+        settings: what it does to datagrams; files are read already.
+        seed: seed of its random streams.
+        name: names of the link and the direction; part of its random streams' names.
+        decisions: recorded decisions of each flow, taken again before the settings apply.
     """
 
     def __init__(
-        self, loss: Loss, mansd: int | None, seed: int, name: str, *, first_delivered: bool = True
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        decisions: Sequence[Sequence[Decision]] = (),
     ) -> None:
-        self._settings = loss
-        self._mansd = mansd
+        self._first_delivered = settings.first_delivered
         self._seed = seed
         self._name = name
-        self._first_delivered = first_delivered
+        self._program = program_of(settings, seed, *name, decisions=decisions)
+        self._rows: dict[int, int] = {}
+        self._free_rows: list[int] = []
+        self._flows: list[FlowState] = []
+        self._memory: list[list[Memory]] = []
+        self._recent_ns: list[list[int]] = []
+        self._state = empty_state(self._program)._replace(
+            flows=self._flows, memory=self._memory, recent_ns=self._recent_ns
+        )
+        self._verdict = Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._under_way: list[_UnderWay] = []
+        self._put_under_way = 0
         self._inputs = 0
-        self._flows: dict[int, _FlowState] = {}
+
+    @property
+    def counters(self) -> Counters:
+        """What has happened so far."""
+        return self._state.counters
+
+    @property
+    def verdict(self) -> Verdict:
+        """What was decided of the last datagram; overwritten by the next."""
+        return self._verdict
+
+    @property
+    def under_way(self) -> int:
+        """Datagrams, and copies, that are delayed now."""
+        return self._state.link.under_way
+
+    def flow(self, flow: int) -> FlowState | None:
+        """What is remembered of a flow; None if none of its datagrams has come."""
+        row = self._rows.get(flow)
+        return None if row is None else self._flows[row]
+
+    def forget(self, flow: int) -> None:
+        """Forget a flow that has ended, and of which nothing is under way."""
+        row = self._rows.pop(flow, None)
+        if row is not None:
+            self._free_rows.append(row)
+
+    def change(self, settings: LinkSettings) -> None:
+        """Go on with other settings; see :mod:`netem.rules.change`."""
+        old, before = self._program, self._state
+        self._first_delivered = settings.first_delivered
+        self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
+            decisions=old.decisions, decisions_begin=old.decisions_begin
+        )
+        self._memory = [new_memory(self._program) for _ in self._flows]
+        self._recent_ns = [[NEVER_NS] * recent_width(self._program) for _ in self._flows]
+        self._state = empty_state(self._program)._replace(
+            flows=self._flows,
+            memory=self._memory,
+            recent_ns=self._recent_ns,
+            link=before.link,
+            counters=before.counters,
+        )
+        latest_ns = [NEVER_NS] * len(self._flows)
+        for leaving in self._under_way:
+            row = self._rows[leaving.datagram.flow]
+            latest_ns[row] = max(latest_ns[row], leaving.release_ns)
+        carry(old, before, self._program, self._state, latest_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """None: nothing is delayed."""
-        return None
+        """When the next datagram leaves."""
+        return self._under_way[0].release_ns if self._under_way else None
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Nothing is ever due."""
-        return ()
-
-    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Take a datagram; return it if it survives."""
-        state = self._flows.get(message.flow)
-        if state is None:
-            state = self._flows[message.flow] = self._new_flow(message.flow)
-        fate = state.cap.decide(state.loss.lost())
-        head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+        """Let the datagram out that is due."""
+        due = heapq.heappop(self._under_way)
+        stale = self._leave(due)
         row = (
-            self._inputs, state.packets, now_ns, now_ns,
-            message.flow, fate, state.cap.run, len(message.data), head,
+            self._inputs, due.packet, due.release_ns, now_ns,
+            due.datagram.flow, int(due.copy), int(stale),
         )  # fmt: skip
         self._inputs += 1
-        state.packets += 1
-        record = Record(NETEM_PACKET, row)
-        return (record,) if fate is Fate.DROPPED else (message, record)
+        return (due.datagram, Record(NETEM_RELEASE, row))
 
-    def _new_flow(self, flow: int) -> _FlowState:
-        rng = stream(self._seed, "netem", self._name, "loss", str(flow))
-        return _FlowState(
-            loss_model(self._settings, rng),
-            MansdCap(self._mansd, first_delivered=self._first_delivered),
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Take a datagram; return it if it survives and is not delayed."""
+        verdict = self.decide(message.flow, len(message.data), now_ns)
+        head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+        row = (
+            self._inputs, verdict.packet, now_ns, now_ns, message.flow, Fate(verdict.fate),
+            verdict.run, verdict.release_ns, verdict.copy_ns, verdict.bit,
+            len(message.data), head,
+        )  # fmt: skip
+        self._inputs += 1
+        record = Record(NETEM_PACKET, row)
+        if verdict.release_ns == NEVER_NS:
+            return (record,)
+        outputs: list[Datagram | Record | Notice] = []
+        intact = verdict.bit < 0
+        self._release(
+            outputs, message, verdict.release_ns, verdict.bit, now_ns, copy=False, counts=intact
         )
+        if verdict.copy_ns != NEVER_NS:
+            counts = not intact and verdict.copy_bit < 0
+            self._release(
+                outputs, message, verdict.copy_ns, verdict.copy_bit, now_ns,
+                copy=True, counts=counts,
+            )  # fmt: skip
+        return (*outputs, record)
+
+    def decide(self, flow: int, size_bytes: int, now_ns: int) -> Verdict:
+        """Return what becomes of a flow's next datagram; the verdict is overwritten by the next."""
+        row = self._rows.get(flow)
+        if row is None:
+            row = self._add_flow(flow)
+        admit(self._program, self._state, row, size_bytes, now_ns, self._verdict)
+        return self._verdict
+
+    def _release(
+        self,
+        outputs: list[Datagram | Record | Notice],
+        message: Datagram,
+        release_ns: int,
+        bit: int,
+        now_ns: int,
+        *,
+        copy: bool,
+        counts: bool,
+    ) -> None:
+        """Send a datagram, or keep it until it is due."""
+        if bit >= 0:
+            message = message._replace(data=flipped(message.data, bit))
+        self._put_under_way += 1
+        leaving = _UnderWay(
+            release_ns, self._put_under_way, self._verdict.packet, copy, counts,
+            release_ns > now_ns, message,
+        )  # fmt: skip
+        # What was due before leaves before, even if nobody has come to let it out.
+        overdue = bool(self._under_way) and self._under_way[0].release_ns <= release_ns
+        if leaving.delayed or overdue:
+            heapq.heappush(self._under_way, leaving)
+        else:
+            self._leave(leaving)
+            outputs.append(message)
+
+    def _leave(self, leaving: _UnderWay) -> bool:
+        return leave(
+            self._state,
+            self._rows[leaving.datagram.flow],
+            leaving.packet,
+            len(leaving.datagram.data),
+            leaving.delayed,
+            leaving.counts,
+        )
+
+    def _add_flow(self, flow: int) -> int:
+        state = new_flow(flow, self._first_delivered)
+        memory, recent_ns = new_memory(self._program), [NEVER_NS] * recent_width(self._program)
+        if self._free_rows:
+            row = self._free_rows.pop()
+            self._flows[row], self._memory[row], self._recent_ns[row] = state, memory, recent_ns
+        else:
+            row = len(self._flows)
+            self._flows.append(state)
+            self._memory.append(memory)
+            self._recent_ns.append(recent_ns)
+        self._rows[flow] = row
+        return row
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """Return the data with one bit flipped; bit 0 is the first byte's lowest."""
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)
 
 
 def update_link_of(resolved: Scenario) -> Link:
     """Return the link from sensor to controller of a resolved scenario."""
-    network = resolved.network
-    return Link(
-        network.loss,
-        network.mansd if network.enforce_mansd else None,
-        resolved.seeds.loss,
-        "update",
-        first_delivered=network.initial_sync == "first_packet",
-    )
+    return Link(resolved.network.link, resolved.seeds.loss, UPDATE_LINK)

@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 from noack.clock import NS_PER_S, RunClock
 from noack.errors import PeerError
+from noack.io.address import Address
 from noack.io.loop import Channel, run_loop
 from noack.io.plane import Plane
 from noack.io.realtime import realtime
@@ -24,11 +25,18 @@ from noack.io.signals import Signals
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notices_of
 from noack.io.ticket import Ticket
-from noack.io.udp import Address, MessageSocket, bind
+from noack.io.udp import MessageSocket, bind
 from noack.machine import Machine
 from noack.records import OWNER, tables
 from noack.resolve import Loop, loop_of
-from noack.topology import LEGS, LOOP_ROLES, RECORDER, SENDER
+from noack.topology import (
+    ACKNOWLEDGED_BY,
+    ACKNOWLEDGES_TO,
+    LEGS,
+    LOOP_ROLES,
+    RECORDER,
+    SENDER,
+)
 from noack.wire import Decoder, Encoder, Flow, Message
 
 T = TypeVar("T")
@@ -103,6 +111,10 @@ class Node:
         dimension = self.loop.m if leg.receives is Flow.ACTUATION else self.loop.n
         decoder = Decoder(leg.receives, dimension, self.ticket.run_id, self.ticket.key)
         encoder = Encoder(self.ticket.run_id, self.ticket.key)
+        acknowledged = self.scenario.is_acknowledged
+        answers_from = ACKNOWLEDGED_BY.get(self.role) if acknowledged else None
+        answers_to = ACKNOWLEDGES_TO.get(self.role) if acknowledged else None
+        hears = Decoder(Flow.ACKNOWLEDGEMENT, 0, self.ticket.run_id, self.ticket.key)
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:
             return MessageSocket(
@@ -112,6 +124,8 @@ class Node:
                 leg.sends,
                 source=addresses[SENDER[self.role]],
                 destination=addresses[leg.to],
+                acknowledgements=(hears, addresses[answers_from]) if answers_from else None,
+                acknowledges_to=addresses[answers_to] if answers_to else None,
             )
 
         self.run(machine, channel)
@@ -127,8 +141,8 @@ class Node:
             CallerError: the process's port is taken.
             PeerError: the run never started.
         """
-        rows = tables(self.loop.n, self.loop.m)
-        owned = {table: rows[table] for table, owner in OWNER.items() if owner == self.role}
+        rows = tables(self.loop.n, self.loop.m, acknowledged=self.scenario.is_acknowledged)
+        owned = {table: dtype for table, dtype in rows.items() if OWNER[table] == self.role}
         telemetry = TelemetryBuffer(owned, self.plane.publish_telemetry)
         grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)

@@ -6,7 +6,7 @@ travels here, and nothing in the loop waits for it.
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Self
 
 import zenoh
@@ -20,7 +20,16 @@ _LEASE_MS = 2000
 _CONNECT_MS = 5000
 
 
-def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
+def star_config(
+    endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
+) -> zenoh.Config:
+    """Return the configuration of a star's centre (``listen``), or of one who connects to it.
+
+    Args:
+        endpoint: where the centre listens, e.g. ``tcp/127.0.0.1:7447``.
+        listen: this is the centre.
+        more: further settings of zenoh by their keys.
+    """
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
     settings: dict[str, Any] = {
@@ -38,12 +47,13 @@ def _config(endpoint: str, *, listen: bool) -> zenoh.Config:
         # A batch that finds no room is dropped at once; the loop does not wait for it.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
-    for key, value in settings.items():
+    for key, value in (settings | dict(more or {})).items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def _cause(error: zenoh.ZError) -> str:
+def cause_of(error: zenoh.ZError) -> str:
+    """Return what went wrong, in zenoh's words."""
     # zenoh ends its messages with the place in its own source.
     return str(error).partition(" at /")[0]
 
@@ -65,10 +75,10 @@ class Plane:
         self._prefix = f"noack/{run_id:016x}"
         self.role = role
         try:
-            self.session = zenoh.open(_config(endpoint, listen=listen))
+            self.session = zenoh.open(star_config(endpoint, listen=listen))
         except zenoh.ZError as error:
             verb = "listen on" if listen else "reach the run's coordinator at"
-            raise PeerError(f"{role}: cannot {verb} {endpoint}: {_cause(error)}") from None
+            raise PeerError(f"{role}: cannot {verb} {endpoint}: {cause_of(error)}") from None
         self._token = self.session.liveliness().declare_token(self.key("alive", role))
         self._stops = self.session.declare_subscriber(self.key("stop"), RingChannel(8))
         self._stop_reason: str | None = None

@@ -1,23 +1,31 @@
-"""SIGINT and SIGTERM as a flag that is looked at, so that nothing is torn in the middle."""
+"""SIGINT, SIGTERM and SIGHUP as a flag that is looked at, so that nothing is torn in the middle."""
 
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
 from noack.errors import ExitStatus
 
+_ECHO_NS = 500_000_000
+"""What started a process may pass a signal on that its group had already."""
+
 
 class Signals:
-    """Turns SIGINT and SIGTERM into a flag; a loop ends at its next look, nothing is torn."""
+    """Turns signals into a flag; a loop ends at its next look, nothing is torn."""
 
     def __init__(self) -> None:
         self.received: int | None = None
+        self._received_ns = 0
 
     @contextmanager
     def handled(self) -> Iterator["Signals"]:
-        """Handle the signals while the context lasts."""
-        before = {number: signal.signal(number, self._note) for number in _ENDING}
+        """Handle the signals while the context lasts; nohup is respected."""
+        heard = set(_ENDING)
+        if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+            heard.remove(signal.SIGHUP)
+        before = {number: signal.signal(number, self._note) for number in heard}
         try:
             yield self
         finally:
@@ -25,9 +33,11 @@ class Signals:
                 signal.signal(number, handler)
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self.received is not None:  # asked twice: the person means it
+        now_ns = time.monotonic_ns()
+        if self.received is None:
+            self.received, self._received_ns = number, now_ns
+        elif now_ns - self._received_ns > _ECHO_NS:  # asked twice: the person means it
             raise SystemExit(self.status)
-        self.received = number
 
     @property
     def status(self) -> ExitStatus:
@@ -38,4 +48,5 @@ class Signals:
 _ENDING = {
     signal.SIGINT.value: ExitStatus.INTERRUPTED,
     signal.SIGTERM.value: ExitStatus.TERMINATED,
+    signal.SIGHUP.value: ExitStatus.TERMINATED,
 }

@@ -8,10 +8,8 @@ a file that only its owner can read, in the user's runtime directory.
 import contextlib
 import json
 import os
-import re
 import secrets
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from noack.errors import CallerError, PeerError
+from noack.io.private import make_private, private_folder, require_name, require_private
 from noack.scenario import Scenario
 from noack.wire import KEY_BYTES
 
@@ -79,17 +78,8 @@ def ticket_path(session: str) -> Path:
     Raises:
         CallerError: the name is not fit for a file.
     """
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", session):
-        raise CallerError(f"session {session!r}: use letters, digits, _ and -, at most 64")
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    folder = Path(base) if base else Path(tempfile.gettempdir())
-    return folder / f"noack-{os.getuid()}" / f"{session}.json"
-
-
-def _require_private(folder: Path) -> None:
-    status = folder.stat()
-    if not folder.is_dir() or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise CallerError(f"{folder}: must be a folder of yours, closed to others (mode 700)")
+    require_name(session, "session")
+    return private_folder() / f"{session}.json"
 
 
 def _in_use(path: Path) -> bool:
@@ -110,11 +100,7 @@ def published(ticket: Ticket, session: str) -> Iterator[Path]:
         CallerError: the folder is not the user's own.
     """
     path = ticket_path(session)
-    try:
-        path.parent.mkdir(mode=0o700, exist_ok=True)
-    except OSError as error:
-        raise CallerError(f"{path.parent}: cannot be made ({error.strerror})") from None
-    _require_private(path.parent)
+    make_private(path.parent)
     if _in_use(path):
         raise CallerError(f"session {session!r}: another run is open in it; choose --session NAME")
     scratch = path.with_suffix(f".{os.getpid()}")
@@ -140,13 +126,13 @@ def wait_for_ticket(
     """
     path = ticket_path(session)
     if path.parent.exists():
-        _require_private(path.parent)
+        require_private(path.parent)
     deadline_s = time.monotonic() + timeout_s
     told = False
     while True:
         with contextlib.suppress(FileNotFoundError):
             text = path.read_text()
-            _require_private(path.parent)
+            require_private(path.parent)
             return loads(text)
         if stop() or time.monotonic() > deadline_s:
             raise PeerError(

@@ -8,9 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from noack.errors import CallerError
-from noack.wire import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message
+from noack.io.address import Address, text_of
+from noack.wire import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 
-Address = tuple[str, int]
 LOOPBACK = "127.0.0.1"
 
 # The default receive buffer holds 256 small datagrams; 4 MiB holds some 10,000. What overflows is
@@ -150,10 +150,10 @@ class CountingSocket:
         self._sources.add(source)
         return data, source
 
-    def put(self, data: bytes) -> None:
+    def put(self, data: bytes, destination: Address | None = None) -> None:
         """Send a datagram; a failure is counted, as nobody would learn of it anyway."""
         try:
-            self._endpoint.sendto(data, self._destination)
+            self._endpoint.sendto(data, destination or self._destination)
             self._sent += 1
         except OSError as error:
             self.send_errors[str(error)] += 1
@@ -173,6 +173,8 @@ class CountingSocket:
 class MessageSocket(CountingSocket):
     """A process's one socket in the loop: receives one flow, sends another.
 
+    Where updates are acknowledged, acknowledgements come or go beside them.
+
     Args:
         endpoint: a bound socket, from :func:`bind`.
         decoder: takes the flow that the process receives.
@@ -180,6 +182,8 @@ class MessageSocket(CountingSocket):
         sends: the flow that it sends.
         source: who sends to it; what comes from elsewhere is never acted on.
         destination: where it sends.
+        acknowledgements: takes acknowledgements, and who sends them.
+        acknowledges_to: where it sends them.
     """
 
     def __init__(
@@ -191,12 +195,16 @@ class MessageSocket(CountingSocket):
         *,
         source: Address,
         destination: Address,
+        acknowledgements: tuple[Decoder, Address] | None = None,
+        acknowledges_to: Address | None = None,
     ) -> None:
         super().__init__(endpoint, destination)
         self._decoder = decoder
         self._encoder = encoder
         self._sends = sends
         self._source = source
+        self._acknowledgements = acknowledgements
+        self._acknowledges_to = acknowledges_to
 
     def receive(self) -> Message | None:
         """Take one datagram; None if there was none or it was rejected."""
@@ -204,40 +212,23 @@ class MessageSocket(CountingSocket):
         if taken is None:
             return None
         data, source = taken
+        if self._acknowledgements is not None and flow_of(data) == Flow.ACKNOWLEDGEMENT:
+            decoder, peer = self._acknowledgements
+            return decoder.decode(data, from_peer=source == peer)
         return self._decoder.decode(data, from_peer=source == self._source)
 
     def send(self, message: Message) -> None:
         """Send a message."""
+        if message.flow is Flow.ACKNOWLEDGEMENT and self._acknowledges_to is not None:
+            self.put(self._encoder.encode(message), self._acknowledges_to)
+            return
         if message.flow is not self._sends:
             raise ValueError(f"this process sends {self._sends.name}, not {message.flow.name}")
         self.put(self._encoder.encode(message))
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        return super().report() | {
-            "sends": self._sends.name.lower(),
-            "accepted": self._decoder.accepted,
-            "rejected": {reason.value: n for reason, n in self._decoder.rejected.items() if n},
-        }
-
-
-def text_of(address: Address) -> str:
-    """``host:port`` of an address."""
-    return f"{address[0]}:{address[1]}"
-
-
-def parse_address(text: str, what: str) -> Address:
-    """Parse ``host:port``.
-
-    Raises:
-        CallerError: it is not of that form, or the host is unknown.
-    """
-    host, colon, port = text.rpartition(":")
-    if not colon or not port.isdecimal() or int(port) > 65535:
-        raise CallerError(f"{what}: expected HOST:PORT, for example 127.0.0.1:9000; found {text!r}")
-    try:
-        found = socket.getaddrinfo(host or LOOPBACK, int(port), socket.AF_INET, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise CallerError(f"{what}: {host}: no such IPv4 host ({error.strerror})") from None
-    address: Address = found[0][4]  # type: ignore[assignment]
-    return address
+        report = super().report() | {"sends": self._sends.name.lower(), **self._decoder.report()}
+        if self._acknowledgements is not None:
+            report["acknowledgements"] = self._acknowledgements[0].report()
+        return report

@@ -1,0 +1,151 @@
+"""A pcapng file of the emulator: one section, its interfaces, packets, and statistics at the end.
+
+An interface is one side of a link. Each packet carries its fate as a comment; ``inbound`` packets
+are datagrams as they came in, ``outbound`` ones as they went out. What the comment says::
+
+    delivered | dropped by the loss model | forced: delivered as the first of its flow |
+    forced: delivered by the cap of 4 losses in a row |
+    corrupted in bit 513 | dropped by the full queue | dropped in a blackout
+    [, 2 of at most 4 in a row] [, delayed 10.5 ms] [, held back 1.2 ms so that the cap holds]
+    ; forward, flow 3, datagram 17
+
+An outbound packet says instead ``, after 10.613 ms``, the delay that it really had, and where it
+applies ``copy, ...`` or ``overtaken: stale at the receiver``. A datagram has the same packet id
+wherever it is seen.
+
+Source: draft-ietf-opsawg-pcapng.
+"""
+
+import platform
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netem.capture.packets import MAX_HEADER_BYTES, Bytes, Events, blocks_bytes, put_blocks
+from netem.events import EVENT
+
+SNAP_BYTES = 262_144
+"""Payload bytes captured of a datagram unless told otherwise: all."""
+
+_LINKTYPE_RAW = 101
+_SECTION, _INTERFACE, _STATISTICS = 0x0A0D0D0A, 1, 5
+_HARDWARE, _OS, _APPLICATION = 2, 3, 4
+_NAME, _DESCRIPTION, _RESOLUTION = 2, 3, 9
+_START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
+
+
+@dataclass(frozen=True, slots=True)
+class Interface:
+    """One side of a link."""
+
+    name: str
+    """Short, for example ``link0 client``."""
+    description: str = ""
+    """For people, for example its address."""
+
+
+class Section:
+    """The blocks of one capture file, in their order: header, packets, ..., statistics.
+
+    Making one compiles the code that formats packets, which takes some seconds the first time.
+
+    Args:
+        interfaces: what an event's ``interface`` indexes.
+        snap_bytes: payload bytes captured of each datagram.
+    """
+
+    def __init__(self, interfaces: Sequence[Interface], snap_bytes: int = SNAP_BYTES) -> None:
+        self._interfaces = tuple(interfaces)
+        self._snap_bytes = snap_bytes
+        self._missing = np.zeros(len(interfaces), np.int64)
+        self._all_missing = np.zeros(len(interfaces), np.int64)
+        self._written = np.zeros(len(interfaces), np.int64)
+        self._start_ns = 0
+        self._end_ns = 0
+        self._out = np.empty(0, np.uint8)
+        self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
+
+    def header(self) -> bytes:
+        """Return the section header and the interfaces' descriptions."""
+        blocks = [
+            _block(
+                _SECTION,
+                struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1),
+                (_HARDWARE, platform.machine().encode()),
+                (_OS, f"{platform.system()} {platform.release()}".encode()),
+                (_APPLICATION, f"noack netem {version('noack')}".encode()),
+            )
+        ]
+        snap_bytes = min(self._snap_bytes + MAX_HEADER_BYTES, SNAP_BYTES)
+        blocks += [
+            _block(
+                _INTERFACE,
+                struct.pack("<HHI", _LINKTYPE_RAW, 0, snap_bytes),
+                (_NAME, interface.name.encode()),
+                (_DESCRIPTION, interface.description.encode()),
+                (_RESOLUTION, b"\x09"),
+            )
+            for interface in self._interfaces
+        ]
+        return b"".join(blocks)
+
+    def packets(self, events: Events, data: Bytes) -> memoryview:
+        """Return the events' packets; they are valid until the next call.
+
+        Args:
+            events: shape (n,), of type :data:`netem.events.EVENT`.
+            data: their payloads.
+
+        Raises:
+            ValueError: an event is impossible: no such interface, too large, beyond the data.
+        """
+        events = np.require(events, EVENT, ["C", "W"])  # other kinds would have to be compiled
+        data = np.require(data, np.uint8, ["C", "W"])
+        bound = blocks_bytes(events, data.size, self._snap_bytes, len(self._interfaces))
+        if bound < 0:
+            raise ValueError(f"event {-1 - bound} of a batch is impossible: {events[-1 - bound]}")
+        if bound > self._out.size:
+            self._out = np.empty(bound, np.uint8)
+        if events.size:
+            self._start_ns = self._start_ns or int(events["t_ns"][0])
+            self._end_ns = int(events["t_ns"][-1])
+        size = put_blocks(events, data, self._snap_bytes, self._missing, self._written, self._out)
+        return self._out.data[:size]
+
+    def miss(self, events: NDArray[np.int64]) -> None:
+        """Count events, per interface, that are missing at this place of the file."""
+        self._missing += events
+        self._all_missing += events
+
+    def statistics(self) -> bytes:
+        """Return how many packets each interface had and how many of them are missing."""
+        return b"".join(
+            _block(
+                _STATISTICS,
+                struct.pack("<I", index) + _time(self._end_ns),
+                (_START, _time(self._start_ns)),
+                (_END, _time(self._end_ns)),
+                (_RECEIVED, struct.pack("<q", written + missing)),
+                (_DROPPED, struct.pack("<q", missing)),
+            )
+            for index, (written, missing) in enumerate(
+                zip(self._written, self._all_missing, strict=True)
+            )
+        )
+
+
+def _time(t_ns: int) -> bytes:
+    return struct.pack("<II", t_ns >> 32, t_ns & 0xFFFF_FFFF)
+
+
+def _block(kind: int, body: bytes, *options: tuple[int, bytes]) -> bytes:
+    for code, value in options:
+        if value:
+            body += struct.pack("<HH", code, len(value)) + value + bytes(-len(value) % 4)
+    body += struct.pack("<HH", 0, 0)  # end of options
+    size = struct.pack("<I", len(body) + 12)
+    return struct.pack("<I", kind) + size + body + size

@@ -1,0 +1,34 @@
+"""The emulator on its own: from a command line to what it has done."""
+
+import json
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from netem.cli import options as command_line
+from netem.cli import relaying
+from netem.cli.explain import explain
+from netem.cli.totals import print_totals
+from noack.errors import ExitStatus
+
+
+def alone(arguments: Sequence[str]) -> ExitStatus:
+    """Run the emulator on its own until Ctrl-C, or explain what it would do.
+
+    Raises:
+        CallerError: the command line says something wrong.
+    """
+    parser = command_line.parser()
+    relaying.add_options(parser)
+    options = command_line.parsed(parser, arguments)
+    specs = command_line.specs_of(options)
+    if options.explain:
+        explain(specs, as_json=options.json, as_file=options.links is None)
+        return ExitStatus.OK
+    totals = relaying.relay(specs, options)
+    if options.json:
+        print(json.dumps(totals, indent=2))
+    else:
+        console = Console(stderr=True, highlight=False)
+        print_totals(totals, console, predicted=options.replay_fates is None)
+    return ExitStatus.OK

@@ -1,0 +1,67 @@
+"""Where compiled code is kept from one run to the next: in the user's cache, or nowhere."""
+
+import hashlib
+import importlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+_ROOM_BYTES = 16 * 1024 * 1024
+_KEPT_S = 30 * 24 * 3600
+
+
+def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
+    """Return where code of these sources is kept; None if it cannot be kept.
+
+    The folder's name depends on what all the sources say: numba itself looks at the file of the
+    outermost function only.
+    """
+    digest = hashlib.blake2b(_numba().__version__.encode(), digest_size=8)
+    for source in sources:
+        digest.update(source.read_bytes())
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = root / "noack" / f"{name}-{digest.hexdigest()}"
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        for file in folder.rglob("*.nb[ic]"):
+            if file.stat().st_size == 0:  # what a power failure leaves; numba fails on it for ever
+                file.unlink(missing_ok=True)
+        _forget_old(folder, name)
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            if next(folder.rglob("*.nbi"), None) is None:
+                os.posix_fallocate(probe.fileno(), 0, _ROOM_BYTES)
+    except (OSError, RuntimeError):  # not writable, full, or there is no home
+        return None
+    return folder
+
+
+def _forget_old(folder: Path, name: str) -> None:
+    """Delete what was compiled from other sources, and has not been used for long."""
+    os.utime(folder)
+    for other in folder.parent.glob(f"{name}-*"):
+        if other.stat().st_mtime < time.time() - _KEPT_S:
+            shutil.rmtree(other, ignore_errors=True)
+
+
+def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return what compiles a function, and keeps it in a folder if there is one.
+
+    Without one numba must not keep anything: it would find code elsewhere that is of other rules.
+    """
+    if folder is None:
+        compiling: Callable[[Callable[..., Any]], Any] = _numba().njit(**options)
+        return compiling
+
+    def compile_and_keep(function: Callable[..., Any]) -> Any:
+        _numba().config.CACHE_DIR = str(folder)
+        return _numba().njit(function, cache=True, **options)
+
+    return compile_and_keep
+
+
+def _numba() -> Any:
+    return importlib.import_module("numba")

@@ -1,0 +1,69 @@
+"""Both directions of a link as one machine, for the loop that acknowledges its updates.
+
+Flow 0 takes the way forward, flow 1 the way back. Neither direction knows of the other: settings,
+random streams and guarantees are each one's own.
+"""
+
+from collections.abc import Sequence
+
+from netem.link import Datagram, Link, update_link_of
+from noack.machine import Machine, Notice, Record
+from noack.records import ACKNOWLEDGEMENTS, UPDATES
+from noack.scenario import Scenario
+
+ACKNOWLEDGEMENT_LINK = "acknowledgement"
+"""Name of the link from controller to sensor; part of its random streams' names."""
+
+
+class Duplex:
+    """The machine of a network with a way back.
+
+    Args:
+        forward: takes the datagrams of flow 0.
+        back: takes those of flow 1.
+    """
+
+    def __init__(self, forward: Machine[Datagram], back: Machine[Datagram]) -> None:
+        self._ways = {UPDATES: forward, ACKNOWLEDGEMENTS: back}
+        self._inputs = 0
+
+    def next_deadline_ns(self) -> int | None:
+        """When the next datagram leaves, in whichever direction."""
+        due = (way.next_deadline_ns() for way in self._ways.values())
+        return min((t_ns for t_ns in due if t_ns is not None), default=None)
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Let the datagram out that is due; of two, the one that goes forward."""
+        next_ns = self.next_deadline_ns()
+        way = next(way for way in self._ways.values() if way.next_deadline_ns() == next_ns)
+        return self._numbered(way.on_timer(now_ns))
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Take a datagram; return it if it survives and is not delayed."""
+        if message.flow not in self._ways:
+            raise ValueError(f"a network with a way back has no flow {message.flow}")
+        return self._numbered(self._ways[message.flow].handle(message, now_ns))
+
+    def _numbered(
+        self, outputs: Sequence[Datagram | Record | Notice]
+    ) -> list[Datagram | Record | Notice]:
+        """Number the inputs over both directions; each answers an input with one row."""
+        number, self._inputs = self._inputs, self._inputs + 1
+        return [
+            output._replace(row=(number, *output.row[1:])) if isinstance(output, Record) else output
+            for output in outputs
+        ]
+
+
+def network_of(resolved: Scenario, forward: Machine[Datagram] | None = None) -> Machine[Datagram]:
+    """Return the network of a resolved scenario.
+
+    Args:
+        resolved: the scenario.
+        forward: takes the place of the link from sensor to controller.
+    """
+    forward = update_link_of(resolved) if forward is None else forward
+    if not resolved.is_acknowledged:
+        return forward
+    back = Link(resolved.network.way_back.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK)
+    return Duplex(forward, back)

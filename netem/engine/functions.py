@@ -1,0 +1,30 @@
+"""The pump's functions, compiled once for this machine."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+from netem.engine.compiled import compile_rule, is_kept, keeps
+from netem.engine.pump.clients import insert, remove
+from netem.engine.pump.pump import run_pump
+from netem.rules.change import carry
+from netem.say import say
+
+
+class Functions(NamedTuple):
+    """What Python calls."""
+
+    run_pump: Callable[..., int]
+    insert: Callable[..., None]
+    remove: Callable[..., None]
+    carry: Callable[..., None]
+
+
+@cache
+def functions() -> Functions:
+    """Return them; say so if they have to be compiled, which takes a while."""
+    sources: Any = (run_pump, insert, remove, carry)
+    if not all(map(is_kept, sources)):
+        once = "once" if keeps() else "as the user's cache (XDG_CACHE_HOME) takes nothing"
+        say(f"compiling the relay for this machine, {once} ...")
+    return Functions(*map(compile_rule, sources))

@@ -1,0 +1,80 @@
+"""A histogram of times: 32 buckets for each doubling, so that a bucket is at most 3 % wide.
+
+It is an array of counts, (BUCKETS,); bucket k holds the times t with lower_ns(k) ≤ t <
+lower_ns(k + 1).
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STEP_BITS = 5
+_STEPS = 1 << _STEP_BITS
+_MOST_BITS = 44
+_JOINED = 8
+BUCKETS = (_MOST_BITS - _STEP_BITS + 1) * _STEPS
+"""The last one also holds all that is longer: 4.8 hours and more."""
+
+
+def bucket_of(t_ns: int) -> int:
+    """Bucket of a time; times below 0 count as 0."""
+    if t_ns < _STEPS:
+        return max(t_ns, 0)
+    if t_ns >> _MOST_BITS != 0:
+        return BUCKETS - 1
+    octave, rest = 0, t_ns
+    if rest >> 32 != 0:
+        octave, rest = octave + 32, rest >> 32
+    if rest >> 16 != 0:
+        octave, rest = octave + 16, rest >> 16
+    if rest >> 8 != 0:
+        octave, rest = octave + 8, rest >> 8
+    if rest >> 4 != 0:
+        octave, rest = octave + 4, rest >> 4
+    if rest >> 2 != 0:
+        octave, rest = octave + 2, rest >> 2
+    if rest >> 1 != 0:
+        octave += 1
+    shift = octave - _STEP_BITS
+    return (shift << _STEP_BITS) + (t_ns >> shift)
+
+
+def lower_ns(bucket: int) -> int:
+    """Shortest time of a bucket."""
+    if bucket < _STEPS:
+        return bucket
+    shift = (bucket >> _STEP_BITS) - 1
+    return (_STEPS + (bucket & (_STEPS - 1))) << shift
+
+
+def coarse(counts: NDArray[np.int64]) -> list[list[int]]:
+    """Return what a person or a plot needs of a histogram: four buckets for each doubling.
+
+    Args:
+        counts: (BUCKETS,) of a histogram.
+
+    Returns:
+        Of each that is not empty: its shortest time in ns, and how many there are.
+    """
+    joined = counts.reshape(-1, _JOINED).sum(axis=1)
+    return [[lower_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
+
+
+def empty() -> NDArray[np.int64]:
+    """Return a histogram of nothing, (BUCKETS,)."""
+    return np.zeros(BUCKETS, dtype=np.int64)
+
+
+def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
+    """Return the time that ``share`` of all times do not exceed, to 3 %; nan of an empty one.
+
+    Args:
+        counts: (BUCKETS,) of a histogram.
+        share: 0.5 for the median.
+    """
+    reached = np.cumsum(counts)
+    if reached[-1] == 0:
+        return float("nan")
+    bucket = int(np.searchsorted(reached, max(share * reached[-1], 1)))
+    return (lower_ns(bucket) + lower_ns(bucket + 1) - 1) / 2

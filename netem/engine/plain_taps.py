@@ -1,0 +1,115 @@
+"""What the portable engine tells its taps."""
+
+import ipaddress
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from netem.engine.api import Address, Tap
+from netem.engine.plain_way import Departure
+from netem.events import ADDRESS_BYTES, EVENT
+from netem.records import Verdict
+from netem.rules.mansd import NEVER_NS
+
+_MOST = 512
+
+
+class Ends(NamedTuple):
+    """Where a client's datagrams go from and to."""
+
+    client: Address
+    listen: Address
+    path: Address
+    """The client's return path."""
+    server: Address
+
+
+class Way(NamedTuple):
+    """A direction of a link."""
+
+    link: int
+    back: bool
+    mansd: int
+
+
+class PlainTaps:
+    """Taps, and what they have not been told yet.
+
+    Args:
+        taps: the taps.
+    """
+
+    def __init__(self, taps: Sequence[Tap]) -> None:
+        self._taps = tuple(taps)
+        self._data = bytearray()
+        self._wants_data = any(tap.wants_data for tap in taps)
+        self._events = np.zeros(_MOST, EVENT)
+        self._count = 0
+        self.unix_ns = 0
+        """Unix time at which the relay began to run."""
+
+    def __bool__(self) -> bool:
+        return bool(self._taps)
+
+    def arrival(
+        self, way: Way, ends: Ends, flow: int, data: bytes, verdict: Verdict, now_ns: int
+    ) -> None:
+        """Tell that a datagram has come, and what was decided."""
+        event = self._add(way, ends, way.back, data, now_ns)
+        event["flow"], event["packet"], event["fate"] = flow, verdict.packet, verdict.fate
+        event["run"] = verdict.run
+        event["delay_ns"] = _delay(verdict.release_ns, now_ns)
+        event["copy_delay_ns"] = _delay(verdict.copy_ns, now_ns)
+        event["held_ns"] = verdict.held_ns
+        event["bit"], event["copy_bit"] = verdict.bit, verdict.copy_bit
+        event["departure"] = 0
+
+    def departure(self, way: Way, ends: Ends, departure: Departure, now_ns: int) -> None:
+        """Tell that a datagram, or a copy, has left."""
+        event = self._add(way, ends, not way.back, departure.data, now_ns)
+        event["flow"], event["packet"] = departure.flow, departure.packet
+        event["fate"] = departure.fate
+        event["delay_ns"] = now_ns - departure.arrival_ns
+        event["copy_delay_ns"] = event["copy_bit"] = -1
+        event["run"] = event["held_ns"] = 0
+        event["bit"] = departure.bit
+        event["departure"] = 1
+        event["copy"], event["stale"] = departure.copy, departure.stale
+
+    def tell(self) -> None:
+        """Let the taps take what there is."""
+        if self._count:
+            data = np.frombuffer(bytes(self._data), np.uint8)
+            for tap in self._taps:
+                tap.take(self._events[: self._count], data)
+            self._events[:] = np.zeros(1, EVENT)
+            self._count = 0
+            self._data.clear()
+
+    def _add(self, way: Way, ends: Ends, server_side: bool, data: bytes, now_ns: int) -> np.void:
+        if self._count == _MOST:
+            self.tell()
+        event: np.void = self._events[self._count]
+        self._count += 1
+        event["t_ns"] = self.unix_ns + now_ns
+        event["link"], event["direction"], event["mansd"] = way.link, way.back, way.mansd
+        event["interface"] = 2 * way.link + server_side
+        event["size_bytes"] = len(data)
+        event["offset"] = len(self._data)
+        near, far = (ends.path, ends.server) if server_side else (ends.client, ends.listen)
+        for field, (host, port) in zip(
+            ("source", "destination"), (far, near) if way.back else (near, far), strict=True
+        ):
+            address = ipaddress.ip_address(host.partition("%")[0])
+            packed = address.packed.ljust(ADDRESS_BYTES, b"\0")
+            event[field] = np.frombuffer(packed, np.uint8)
+            event[f"{field}_port"] = port
+            event["family"] = address.version
+        if self._wants_data:
+            self._data += data
+        return event
+
+
+def _delay(t_ns: int, now_ns: int) -> int:
+    return -1 if t_ns == NEVER_NS else t_ns - now_ns

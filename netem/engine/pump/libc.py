@@ -1,0 +1,94 @@
+"""The system's functions as compiled code calls them, and arrays over memory known by address.
+
+Everything is passed as integers: addresses too. Calls through symbols, unlike those through
+pointers from ctypes, can be kept in numba's cache.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np import arrayobj
+
+_codes: Any = cgutils
+_arrays: Any = arrayobj
+_int, _word = types.int32, types.intp
+
+
+def _function(name: str, result: Any, *arguments: Any) -> Any:
+    return types.ExternalFunction(name, result(*arguments))
+
+
+clock_gettime = _function("clock_gettime", _int, _int, _word)
+epoll_wait = _function("epoll_wait", _int, _int, _word, _int, _int)
+errno_location = _function("__errno_location", _word)
+memcpy = _function("memcpy", _word, _word, _word, _word)
+poll = _function("poll", _int, _word, _word, _int)
+ppoll = _function("ppoll", _int, _word, _word, _word, _word)
+recvmmsg = _function("recvmmsg", _int, _int, _word, types.uint32, _int, _word)
+sendmmsg = _function("sendmmsg", _int, _int, _word, types.uint32, _int)
+sendto = _function("sendto", types.int64, _int, _word, _word, _int, _word, types.uint32)
+syscall = _function("syscall", types.int64, *[types.int64] * 7)
+
+ECONNREFUSED = 111
+CLOCK_REALTIME = 0
+CLOCK_MONOTONIC = 1
+MSG_DONTWAIT = 0x40
+POLLIN = 1
+POLLOUT = 4
+SYS_EPOLL_PWAIT2 = 441
+"""The same number on every architecture; libc has it since glibc 2.35."""
+
+
+def _array_at(typing_context: Any, like: Any, address: Any, rows: Any, columns: Any) -> Any:
+    """Return an array of ``like``'s type over the memory at an address.
+
+    Args:
+        typing_context: numba's.
+        like: an array of one or two dimensions, contiguous.
+        address: of the first element.
+        rows: length of the first dimension.
+        columns: length of the second, if there is one.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = signature.return_type
+        element = context.get_data_type(kind.dtype)
+        item_bytes = context.get_constant(types.intp, context.get_abi_sizeof(element))
+        shape, strides = [arguments[2]], [item_bytes]
+        if kind.ndim == 2:
+            shape.append(arguments[3])
+            strides.insert(0, builder.mul(arguments[3], item_bytes))
+        array = _arrays.make_array(kind)(context, builder)
+        _arrays.populate_array(
+            array,
+            data=builder.inttoptr(arguments[1], element.as_pointer()),
+            shape=_codes.pack_array(builder, shape),
+            strides=_codes.pack_array(builder, strides),
+            itemsize=item_bytes,
+            meminfo=None,
+        )
+        return array._getvalue()
+
+    return like(like, types.intp, types.intp, types.intp), generate
+
+
+array_at: Any = intrinsic(_array_at)
+
+
+def address_of(array: Any) -> Any:
+    """Where an array begins, as an integer with sign."""
+    return np.int64(array.ctypes.data)
+
+
+def errno(integers: Any) -> Any:
+    """Why the last call failed; ``integers`` is any array of int32."""
+    return array_at(integers, errno_location(), 1, 1)[0]
+
+
+def clock_ns(clock: Any, time: Any) -> Any:
+    """Read a clock; ``time`` is room for a struct timespec, (2,) int64."""
+    clock_gettime(clock, address_of(time))
+    return time[0] * 1_000_000_000 + time[1]

@@ -1,0 +1,46 @@
+"""Counter-based random numbers: Philox4x32-10 (Salmon, Moraes, Dror & Shaw, SC 2011).
+
+The numbers drawn for a datagram are a function of the stream's key and of the datagram's place, so
+that they depend neither on time, nor on other flows, nor on how datagrams are batched; ten thousand
+flows have ten thousand streams and no state.
+"""
+
+_WORD = 0xFFFFFFFF
+_UNIT = 1.0 / 9007199254740992.0
+"""2⁻⁵³."""
+
+
+def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
+    """Return four random 32-bit words for a counter of four words and a key of two.
+
+    The products may wrap in 64 bits with sign; what is cut out of them is the same either way.
+    """
+    for _ in range(10):
+        p0 = 0xD2511F53 * c0
+        p1 = 0xCD9E8D57 * c2
+        c0, c1, c2, c3 = (
+            ((p1 >> 32) & _WORD) ^ c1 ^ k0,
+            p1 & _WORD,
+            ((p0 >> 32) & _WORD) ^ c3 ^ k1,
+            p0 & _WORD,
+        )
+        k0 = (k0 + 0x9E3779B9) & _WORD
+        k1 = (k1 + 0xBB67AE85) & _WORD
+    return c0, c1, c2, c3
+
+
+def uniforms(key0: int, key1: int, flow: int, packet: int, block: int) -> tuple[float, float]:
+    """Return two uniform numbers in [0, 1), multiples of 2⁻⁵³.
+
+    Args:
+        key0: the stream's key, low word.
+        key1: high word.
+        flow: number of the flow, below 2³².
+        packet: number of the datagram in its flow, below 2⁶³.
+        block: which pair of the datagram.
+    """
+    a, b, c, d = philox(packet & _WORD, packet >> 32, flow, block, key0, key1)
+    return (
+        ((a >> 5) * 67108864 + (b >> 6)) * _UNIT,
+        ((c >> 5) * 67108864 + (d >> 6)) * _UNIT,
+    )

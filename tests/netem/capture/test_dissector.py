@@ -1,0 +1,211 @@
+"""``docs/noack.lua`` in tshark, over datagrams of :mod:`noack.wire`."""
+
+import math
+import random
+import re
+import shlex
+import shutil
+import struct
+import subprocess
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.wire import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
+from tests.netem.capture.batches import file_of
+from tests.netem.capture.conftest import Tshark
+
+DOCS = Path(__file__).parents[3] / "docs"
+SCRIPT = DOCS / "noack.lua"
+RUN = 0x0123_4567_89AB_CDEF
+Fields = dict[str, list[dict[str, str]]]
+Dissect = Callable[..., list[Fields]]
+
+
+@pytest.fixture
+def dissect(tshark: Tshark, tmp_path: Path) -> Dissect:
+    """What tshark says of each payload, field by field: ``show`` for people, ``value`` as hex."""
+
+    def run(*payloads: bytes, snap_bytes: int = 2**18) -> list[Fields]:
+        path = tmp_path / "capture.pcapng"
+        path.write_bytes(
+            file_of(*({"payload": payload} for payload in payloads), snap_bytes=snap_bytes)
+        )
+        text = tshark(path, "-X", f"lua_script:{SCRIPT}", "-T", "pdml")
+        packets = []
+        for packet in ET.fromstring(text).iter("packet"):
+            fields: Fields = {}
+            for field in packet.iter("field"):
+                fields.setdefault(field.attrib["name"], []).append(field.attrib)
+            packets.append(fields)
+        assert len(packets) == len(payloads)
+        return packets
+
+    return run
+
+
+def encoded(flow: Flow, sequence: int, t_ns: int, vector: list[float], run_id: int = RUN) -> bytes:
+    encoder = Encoder(run_id, bytes(32))
+    return encoder.encode(Message(flow, sequence, t_ns, np.array(vector)))
+
+
+def shown(fields: Fields, name: str) -> str:
+    (field,) = fields[f"noack.{name}"]
+    return field["show"]
+
+
+def random_message(rng: random.Random) -> dict[str, Any]:
+    flow = rng.choice(list(Flow))
+    dimension = 0 if flow is Flow.ACKNOWLEDGEMENT else rng.randint(1, 64)
+    return {
+        "flow": flow, "sequence": rng.randrange(2**64),
+        "t_ns": rng.randrange(-(2**63), 2**63), "run_id": rng.randrange(2**64),
+        "vector": [rng.gauss(0, 1) * 10 ** rng.randint(-300, 300) for _ in range(dimension)],
+    }  # fmt: skip
+
+
+def test_every_field_is_shown(dissect: Dissect) -> None:
+    rng = random.Random(3)
+    messages = [random_message(rng) for _ in range(50)] + [
+        {"flow": Flow.UPDATE, "sequence": 2**64 - 1, "t_ns": -1, "run_id": 2**64 - 1,
+         "vector": [-0.0, 5e-324, -1.5e308]},
+        {"flow": Flow.ACTUATION, "sequence": 0, "t_ns": -(2**63), "run_id": 0, "vector": [1.0]},
+        {"flow": Flow.MEASUREMENT, "sequence": 1, "t_ns": 2**63 - 1, "run_id": 1,
+         "vector": [0.1] * 64},
+    ]  # fmt: skip
+    datagrams = [encoded(**message) for message in messages]
+    for fields, message, datagram in zip(dissect(*datagrams), messages, datagrams, strict=True):
+        assert shown(fields, "magic") == "NA"
+        assert shown(fields, "version") == "1"
+        assert shown(fields, "flow") == str(int(message["flow"]))
+        assert shown(fields, "dimension") == str(len(message["vector"]))
+        assert shown(fields, "reserved") == "0x0000"
+        assert shown(fields, "run_id") == f"0x{message['run_id']:016x}"
+        assert shown(fields, "sequence") == str(message["sequence"])
+        assert shown(fields, "t_ns") == str(message["t_ns"])
+        assert fields["noack.tag"][0]["value"] == datagram[-TAG_BYTES:].hex()
+        vector = fields.get("noack.vector", [])
+        assert [entry["value"] for entry in vector] == [
+            struct.pack("<d", entry).hex() for entry in message["vector"]
+        ]
+        # Wireshark shows 15 significant digits.
+        for entry, number in zip(vector, message["vector"], strict=True):
+            assert math.isclose(float(entry["show"]), number, rel_tol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("flow", "sequence", "t_ns", "info"),
+    [
+        (Flow.UPDATE, 17, 1_234_000_000, "update #17 t=1.234 s"),
+        (Flow.MEASUREMENT, 0, 0, "measurement #0 t=0 s"),
+        (Flow.ACTUATION, 2**64 - 1, 20_000_000_000, f"actuation #{2**64 - 1} t=20 s"),
+        (Flow.ACKNOWLEDGEMENT, 17, 1_234_000_000, "acknowledgement #17 t=1.234 s"),
+        (Flow.UPDATE, 1, -1, "update #1 t=-0.000000001 s"),
+        (Flow.UPDATE, 1, -5_100_000_000, "update #1 t=-5.1 s"),
+        (Flow.UPDATE, 1, 2**63 - 1, "update #1 t=9223372036.854775807 s"),
+        (Flow.UPDATE, 1, -(2**63), "update #1 t=-9223372036.854775808 s"),
+    ],
+)
+def test_the_list_tells_flow_number_and_time(
+    tshark: Tshark, tmp_path: Path, flow: Flow, sequence: int, t_ns: int, info: str
+) -> None:
+    path = tmp_path / "capture.pcapng"
+    vector = [] if flow is Flow.ACKNOWLEDGEMENT else [1.0, 2.0]
+    path.write_bytes(file_of({"payload": encoded(flow, sequence, t_ns, vector)}))
+    columns = ("-T", "fields", "-e", "_ws.col.Protocol", "-e", "_ws.col.Info")
+    shown = tshark(path, "-X", f"lua_script:{SCRIPT}", *columns)
+    assert shown == f"noack\t{info}\n"
+
+
+def test_fields_filter(tshark: Tshark, tmp_path: Path) -> None:
+    path = tmp_path / "capture.pcapng"
+    payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0]) for i in range(12)]
+    path.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+
+    def found(condition: str) -> list[int]:
+        words = (
+            "-X",
+            f"lua_script:{SCRIPT}",
+            "-Y",
+            condition,
+            "-T",
+            "fields",
+            "-e",
+            "noack.sequence",
+        )
+        return [int(number) for number in tshark(path, *words).split()]
+
+    assert found("noack.flow == 2") == [1, 4, 7, 10]
+    assert found('noack.flow == "update" and noack.sequence > 4') == [7, 10]
+    assert found("noack.t_ns >= 3000000000 and noack.t_ns < 5000000000") == [3, 4]
+    assert found(f"noack.run_id == {RUN:#x} and noack.vector < -3.5") == [0, 1]
+    assert found("noack.run_id != 0x0123456789abcdef") == []
+
+
+WHOLE = encoded(Flow.UPDATE, 7, 5, [1.0, 2.0, 3.0])
+
+
+def with_byte(offset: int, value: int) -> bytes:
+    return WHOLE[:offset] + bytes([value]) + WHOLE[offset + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("payload", "complaint"),
+    [
+        (WHOLE, None),
+        (with_byte(2, 2), "noack.version.unknown"),
+        (with_byte(3, 9), "noack.flow.unknown"),
+        (with_byte(4, 2), "noack.length.wrong"),
+        (WHOLE[:-1], "noack.length.wrong"),
+        (WHOLE + b"\0", "noack.length.wrong"),
+        (WHOLE[:HEADER_BYTES], "noack.length.wrong"),
+    ],
+    ids=["whole", "version", "flow", "dimension", "short", "long", "header"],
+)
+def test_a_damaged_datagram_is_shown_with_its_fault(
+    dissect: Dissect, payload: bytes, complaint: str | None
+) -> None:
+    (fields,) = dissect(payload)
+    assert shown(fields, "sequence") == "7"
+    complaints = [
+        name for name in fields if name.endswith((".unknown", ".wrong")) and "noack" in name
+    ]
+    assert complaints == ([complaint] if complaint else [])
+    assert ("noack.vector" in fields) == (complaint != "noack.length.wrong")
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"NA", WHOLE[: HEADER_BYTES - 1], with_byte(0, 0x4F), b"NAME" * 20, b"NA" + bytes(70)],
+)
+def test_what_is_not_ours_is_left_alone(dissect: Dissect, payload: bytes) -> None:
+    (fields,) = dissect(payload)
+    assert not any(name.startswith("noack") for name in fields)
+
+
+def test_of_a_truncated_capture_what_is_there_is_shown(dissect: Dissect) -> None:
+    (fields,) = dissect(WHOLE, snap_bytes=HEADER_BYTES + 8 + 7)
+    assert shown(fields, "sequence") == "7"
+    assert [entry["show"] for entry in fields["noack.vector"]] == ["1"]
+    assert "noack.tag" not in fields
+    assert "noack.length.wrong" not in fields
+
+
+@pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+def test_the_documented_command_works(tmp_path: Path) -> None:
+    (command,) = re.findall(r"^```sh\n(.*?)\n```", (DOCS / "wire.md").read_text(), re.DOTALL | re.M)
+    (tmp_path / "docs").symlink_to(DOCS)
+    payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0, 0.5]) for i in range(6)]
+    capture = tmp_path / "capture.pcapng"
+    capture.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+    done = subprocess.run(
+        shlex.split(command), cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.splitlines() == [
+        "40002\t1\t1000000000\t-4,0.5",
+        "40002\t4\t4000000000\t-1,0.5",
+    ]

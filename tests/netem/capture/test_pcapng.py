@@ -1,0 +1,227 @@
+"""Every file here is read by ``reader``, made from the draft and the RFCs and not from the code."""
+
+import struct
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.capture.packets import put_blocks
+from netem.capture.pcapng import Interface, Section
+from noack.records import Fate
+from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
+from tests.netem.capture.reader import Datagram, datagram, read
+
+
+def comment_of(**fields: Any) -> str:
+    (packet,) = read(file_of(fields)).packets
+    return packet.comment
+
+
+@given(st.lists(events, max_size=5))
+def test_an_independent_reader_finds_what_was_written(described: list[dict[str, Any]]) -> None:
+    packets = read(file_of(*described)).packets
+    assert len(packets) == len(described)
+    for packet, event in zip(packets, described, strict=True):
+        assert packet.interface == event["interface"]
+        assert packet.t_ns == event["t_ns"]
+        assert packet.original_bytes == len(packet.frame)
+        assert packet.options[2] == [struct.pack("<I", 2 if event["departure"] else 1)]
+        assert datagram(packet.frame) == Datagram(
+            event["source"],
+            event["destination"],
+            event["source_port"],
+            event["destination_port"],
+            event["payload"],
+        )
+        way = "back" if event["direction"] else "forward"
+        assert packet.comment.endswith(f"; {way}, flow {event['flow']}, datagram {event['packet']}")
+
+
+@given(st.lists(events, max_size=6), st.integers(0, 6), st.integers(0, 100))
+@settings(max_examples=30)
+def test_the_file_does_not_depend_on_batching_or_old_memory(
+    described: list[dict[str, Any]], cut: int, snap_bytes: int
+) -> None:
+    whole = file_of(*described, snap_bytes=snap_bytes)
+    section = Section(INTERFACES, snap_bytes)
+    parts = section.header()
+    for part in (described[:cut], described[cut:]):
+        table, data = batch(*part, snap_bytes=snap_bytes)
+        section._out = np.full(300_000, 0xA5, np.uint8)
+        parts += bytes(section.packets(table, data))
+    assert parts + section.statistics() == whole
+
+
+def test_a_file_says_who_wrote_it_and_describes_the_interfaces() -> None:
+    interfaces = (Interface("link0 client", "[::]:5000 → here"), Interface("link0 server"))
+    section = Section(interfaces, 100)
+    file = read(section.header() + section.statistics())
+    assert file.section[4][0].startswith(b"noack netem ")
+    assert set(file.section) == {2, 3, 4}
+    assert file.packets == []
+    assert [(kind, snap) for kind, snap, _ in file.interfaces] == [(101, 148)] * 2
+    assert [options for _, _, options in file.interfaces] == [
+        {2: [b"link0 client"], 3: ["[::]:5000 → here".encode()], 9: [b"\x09"]},
+        {2: [b"link0 server"], 9: [b"\x09"]},
+    ]
+
+
+LOST = {"fate": Fate.DROPPED, "run": 2}
+TAIL = "; forward, flow 3, datagram 17"
+
+
+@pytest.mark.parametrize(
+    ("fields", "comment"),
+    [
+        ({}, "delivered"),
+        (LOST, "dropped by the loss model, 2 in a row"),
+        (LOST | {"mansd": 4}, "dropped by the loss model, 2 of at most 4 in a row"),
+        (LOST | {"delay_ns": 10, "held_ns": 10}, "dropped by the loss model, 2 in a row"),
+        ({"fate": Fate.FORCED}, "forced: delivered by the cap"),
+        (
+            {"fate": Fate.FORCED, "packet": 0, "mansd": 4},
+            "forced: delivered as the first of its flow",
+        ),
+        (
+            {"fate": Fate.FORCED, "mansd": 4, "delay_ns": 10_000_000},
+            "forced: delivered by the cap of 4 losses in a row, delayed 10 ms",
+        ),
+        (
+            {"fate": 3, "bit": 513, "run": 1, "mansd": 4, "delay_ns": 1_000_000},
+            "corrupted in bit 513, 1 of at most 4 in a row, delayed 1 ms",
+        ),
+        ({"fate": 4, "run": 1, "mansd": 1}, "dropped by the full queue, 1 of at most 1 in a row"),
+        ({"fate": 5, "run": 12}, "dropped in a blackout, 12 in a row"),
+        ({"fate": 99}, "of unknown fate"),
+        (
+            {"delay_ns": 12_345_000, "held_ns": 1_200_000, "run": 1, "mansd": 4},
+            "delivered, delayed 12.345 ms, held back 1.2 ms so that the cap holds",
+        ),
+        ({"departure": 1, "delay_ns": 12_345_678}, "delivered, after 12.346 ms"),
+        ({"departure": 1, "delay_ns": -5}, "delivered, after 0 ms"),
+        ({"departure": 1, "copy": 1, "delay_ns": 499}, "copy, delivered, after 0 ms"),
+        (
+            {"departure": 1, "stale": 1, "delay_ns": 50_000},
+            "overtaken: stale at the receiver, after 0.05 ms",
+        ),
+        (
+            {"departure": 1, "fate": 3, "bit": 0, "stale": 1, "delay_ns": 10**18},
+            "corrupted in bit 0, overtaken: stale at the receiver, after 1000000000000 ms",
+        ),
+        (
+            {"departure": 1, "copy": 1, "bit": 8, "delay_ns": 1000},
+            "copy, delivered, corrupted in bit 8, after 0.001 ms",
+        ),
+    ],
+)
+def test_the_comment_tells_the_fate(fields: dict[str, Any], comment: str) -> None:
+    tail = TAIL.replace("17", str(fields.get("packet", 17)))
+    assert comment_of(**fields) == comment + tail
+
+
+def test_every_fate_has_its_own_words() -> None:
+    told = {comment_of(fate=fate) for fate in Fate}
+    assert len(told) == len(Fate)
+    assert comment_of(fate=255) not in told
+
+
+@given(st.integers(0, 2**63 - 1))
+def test_a_delay_is_told_to_the_microsecond(delay_ns: int) -> None:
+    told = comment_of(departure=1, delay_ns=delay_ns).split("after ")[1].split(" ms")[0]
+    assert abs(Decimal(told) - Decimal(delay_ns).scaleb(-6)) <= Decimal("0.0005")
+    assert "." not in told or not told.endswith("0")
+
+
+def test_a_datagram_has_one_number_wherever_it_is_seen() -> None:
+    seen = [
+        {"interface": 0},
+        {"interface": 1, "departure": 1},
+        {"interface": 1, "departure": 1, "copy": 1},
+        {"interface": 1, "direction": 1},
+        {"interface": 0, "packet": 18},
+        {"interface": 0, "flow": 4},
+    ]
+    numbers = [packet.options[5][0] for packet in read(file_of(*seen)).packets]
+    assert numbers[0] == numbers[1] == numbers[2]
+    assert len(set(numbers)) == 4
+
+
+@pytest.mark.parametrize(("family", "checksum"), [(4, b"\0\0"), (6, b"\xff\xff")])
+def test_of_a_truncated_datagram_the_true_length_is_kept(family: int, checksum: bytes) -> None:
+    address = {4: "192.0.2.1", 6: "2001:db8::1"}[family]
+    described = {
+        "family": family, "source": address, "destination": address, "payload": b"p" * 1000
+    }  # fmt: skip
+    (packet,) = read(file_of(described, snap_bytes=11)).packets
+    headers = len(packet.frame) - 11
+    assert packet.original_bytes == headers + 1000
+    assert packet.frame[headers:] == b"p" * 11
+    assert packet.frame[headers - 4 : headers] == (1008).to_bytes(2, "big") + checksum
+
+
+def test_a_checksum_of_0_is_sent_as_ffff() -> None:
+    """RFC 768: 0 says that there is none."""
+
+    def frame_of(payload: bytes) -> bytes:
+        return read(file_of({"payload": payload})).packets[0].frame
+
+    checksum = frame_of(bytes(2))[26:28]
+    frame = frame_of(checksum)  # adds just what is missing to all ones
+    assert frame[26:28] == b"\xff\xff"
+    assert datagram(frame).payload == checksum
+
+
+@pytest.mark.parametrize(("family", "most"), [(4, 65_507), (6, 65_527)])
+def test_the_largest_datagram_fits(family: int, most: int) -> None:
+    table, data = batch({"family": family, "payload": bytes(most)})
+    section = Section(INTERFACES)
+    file = read(section.header() + bytes(section.packets(table, data)))
+    assert len(datagram(file.packets[0].frame).payload) == most
+    table["size_bytes"] += 1
+    with pytest.raises(ValueError, match=r"event 0 .* is impossible"):
+        section.packets(table, np.append(data, np.uint8(0)))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("interface", 2), ("t_ns", -1), ("family", 0), ("size_bytes", 8),
+        ("offset", 19), ("offset", 2**63), ("offset", 2**64 - 1),
+    ],
+)  # fmt: skip
+def test_an_impossible_event_is_refused(field: str, value: int) -> None:
+    table, data = batch({}, {})
+    table, data = table[:1], data[:18]
+    Section(INTERFACES).packets(table, data)
+    table[field] = value
+    with pytest.raises(ValueError, match="event 0 of a batch is impossible"):
+        Section(INTERFACES).packets(table, data)
+
+
+def test_missing_events_are_told_where_they_are_missing_and_at_the_end() -> None:
+    section = Section(INTERFACES)
+    data = section.header()
+    data += bytes(section.packets(*batch({}, {"interface": 1})))
+    section.miss(np.array([0, 2**33 + 5]))
+    data += bytes(section.packets(*batch({}, {"interface": 1}, {"interface": 1, "t_ns": T_NS + 7})))
+    section.miss(np.array([4, 0]))
+    file = read(data + section.statistics())
+    counts = [packet.options.get(4) for packet in file.packets]
+    assert counts == [None, None, None, [struct.pack("<Q", 2**33 + 5)], None]
+    received_and_dropped = {
+        index: [struct.unpack("<Q", options[code][0])[0] for code in (4, 5)]
+        for index, (_, options) in file.statistics.items()
+    }
+    assert received_and_dropped == {0: [2 + 4, 4], 1: [3 + 2**33 + 5, 2**33 + 5]}
+    for t_ns, options in file.statistics.values():
+        ends = [struct.unpack("<II", options[code][0]) for code in (2, 3)]
+        assert [high << 32 | low for high, low in ends] == [T_NS, T_NS + 7]
+        assert t_ns == T_NS + 7
+
+
+def test_formatting_lets_go_of_the_interpreter() -> None:
+    assert put_blocks.targetoptions["nogil"]  # type: ignore[attr-defined]

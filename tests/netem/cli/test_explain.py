@@ -1,0 +1,212 @@
+"""What links would do, in tables and as JSON."""
+
+import json
+import re
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from netem.__main__ import main
+from netem.cli.explain import DirectionExplanation, Explanation, LinkExplanation
+from netem.cli.options import parser, specs_of
+from netem.engine.api import LinkSpec
+from netem.words.links import load_links
+from netem.words.parser import settings_of
+from noack.impairments import LinkSettings
+
+PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
+MUCH = (
+    "loss 5% 50% delay 10ms 11ms distribution normal lossrel 50% reorder 5% blackout 1s-2s "
+    "loss gemodel 1% 10% 70% 0.1% duplicate 1% rate 1mbit mansd 3 first limit 7"
+)
+LINKS = """
+[[link]]
+name = "uplink"
+listen = "127.0.0.1:9000"
+to = "[::1]:9001"
+words = "loss 50% mansd 4"
+back = "delay 10ms"
+seed = 7
+
+[[link]]
+name = "video"
+listen = "127.0.0.1:9002"
+to = "127.0.0.1:9003"
+return_path = false
+words = "loss 20%"
+"""
+
+
+class Explain:
+    """The program, with what it prints."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *arguments: str) -> str:
+        assert main(["--explain", *arguments]) == 0
+        out, err = self._capsys.readouterr()
+        assert err == ""
+        return out
+
+    def links(self, *arguments: str) -> Sequence[LinkExplanation]:
+        document: Explanation = json.loads(self("--json", *arguments))
+        assert document.keys() == get_type_hints(Explanation).keys()
+        return document["links"]
+
+
+@pytest.fixture
+def explain(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Explain:
+    monkeypatch.setenv("COLUMNS", "80")
+    return Explain(capsys)
+
+
+@pytest.fixture
+def links_file(tmp_path: Path) -> Path:
+    path = tmp_path / "links.toml"
+    path.write_text(LINKS)
+    return path
+
+
+def one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def test_words_are_explained(explain: Explain) -> None:
+    out = one_line(explain("loss burst 5% 3 mansd 2 first"))
+    assert "bad times begin with probability 1.75439% per datagram" in out
+    assert "mansd 2 the cap: at most 2 successive datagrams of a flow are not delivered" in out
+    assert "first the first datagram of each flow is delivered" in out
+    assert "predicted loss in the long run: 3.947% (without the cap 5%)" in out
+    assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out
+    assert "but tc lacks: mansd 2 (a cap on successive losses), first (that the first" in out
+
+
+def test_what_the_prediction_does_not_count_is_said(explain: Explain) -> None:
+    out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
+    assert "33.33% (without the cap 50%), not counting what is overtaken (stale)" in out
+    assert "what would be below 0 is 0 (25% of the draws)" in out
+
+
+def test_where_tc_can_do_nothing_that_is_said(explain: Explain) -> None:
+    out = one_line(explain("loss worst mansd 2"))
+    assert "tc cannot do it; it lacks: loss worst (a worst case), mansd 2 (" in out
+    assert "tc qdisc" not in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "titles"),
+    [
+        ("", ["in both directions, in each by itself: nothing happens"]),
+        ("loss 5%", ["forward, from clients to the server, in this order",
+                     "back, from the server to clients: nothing happens"]),
+        ("--back loss 5%", ["forward, from clients to the server: nothing happens",
+                            "back, from the server to clients, in this order"]),
+        ("loss 5% --back loss 6%", ["forward, from clients to the server, in this order",
+                                    "back, from the server to clients, in this order"]),
+        ("loss 5% --back loss none", ["forward, from clients to the server, in this order",
+                                      "back, from the server to clients, in this order"]),
+        ("--both loss 5%", ["in both directions, in each by itself, in this order"]),
+        ("--one-way loss 5%", ["forward, from clients to the server, in this order",
+                               "back: one way only, what the server answers is not relayed"]),
+    ],
+)  # fmt: skip
+def test_each_direction_is_explained(explain: Explain, arguments: str, titles: list[str]) -> None:
+    lines = explain(*shlex.split(arguments)).splitlines()
+    assert [line for line in lines if line.startswith(("forward", "back", "in both"))] == titles
+
+
+def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) -> None:
+    out = explain("--links", str(links_file))
+    uplink, video = out.split("\n\nvideo: 127.0.0.1:9002 → 127.0.0.1:9003\n")
+    assert uplink.startswith("uplink: 127.0.0.1:9000 → [::1]:9001, seed 7\n")
+    assert "loses 50%" in uplink
+    assert "holds each datagram back by 10ms" in uplink
+    assert "loses 20%" in video
+    assert video.endswith("back: one way only, what the server answers is not relayed\n")
+
+
+@pytest.mark.parametrize("columns", [120, 80, 60])
+def test_all_of_it_fits_into_a_terminal(
+    explain: Explain, links_file: Path, monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    for out in (explain(MUCH, "--both"), explain("--links", str(links_file))):
+        assert max(map(len, out.splitlines())) <= columns
+
+
+def test_what_is_to_be_copied_is_whole_at_any_width(
+    explain: Explain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands = set()
+    for columns in ("200", "80", "60", "30"):
+        monkeypatch.setenv("COLUMNS", columns)
+        out = explain("delay 10ms 2ms distribution normal loss gemodel 1% 10% 70% 0.1%")
+        command = out[out.index("tc qdisc") :].partition("\nbut")[0]
+        commands.add(tuple(command.replace("\\\n", "").split()))
+    whole = (
+        "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
+        "loss gemodel 1% 10% 70% 0.1%"
+    )
+    assert commands == {tuple(whole.split())}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        MUCH,
+        f"{MUCH} --seed 9 --back delay 10ms",
+        f"--back {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
+        "loss 5% --both --idle 5s",
+        "delay 0 samples 1ms,2ms --one-way",
+        "",
+    ],
+)
+def test_what_is_explained_as_toml_is_what_the_command_line_says(
+    explain: Explain, tmp_path: Path, arguments: str
+) -> None:
+    given = shlex.split(arguments)
+    path = tmp_path / "links.toml"
+    path.write_text(explain(*given).partition("(--links)\n")[2])
+    expected = specs_of(parser().parse_intermixed_args(["--explain", *given]))
+    assert load_links(path) == expected
+    assert isinstance(expected[0], LinkSpec)
+
+
+def test_links_are_explained_as_json(explain: Explain, links_file: Path) -> None:
+    uplink, video = explain.links("--links", str(links_file))
+    assert (uplink["name"], uplink["listen"], uplink["to"], uplink["seed"]) == (
+        "uplink", "127.0.0.1:9000", "[::1]:9001", 7,
+    )  # fmt: skip
+    assert uplink["forward"]["predicted_loss"] == pytest.approx(15 / 31)
+    assert uplink["forward"]["predicted_loss_without_cap"] == pytest.approx(0.5)
+    assert uplink["forward"]["tc"] == "limit 16384 loss random 50%"
+    assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on successive losses)"]
+    assert uplink["back"] is not None
+    assert uplink["back"]["words"] == "delay 10ms"
+    assert (video["forward"]["words"], video["back"]) == ("loss 20%", None)
+
+
+def test_each_direction_is_explained_as_json(explain: Explain) -> None:
+    (link,) = explain.links("delay 10ms loss 5%", "--back", "corrupt 1%")
+    assert link["name"] == "relay"
+    for side, words in (("forward", "delay 10ms loss 5%"), ("back", "corrupt 1%")):
+        direction: Any = link[side]  # type: ignore[literal-required]
+        assert direction["words"] == words
+        settings = LinkSettings.model_validate_json(json.dumps(direction["settings"]))
+        assert settings == settings_of(words)
+
+
+def rows(title: str) -> set[str]:
+    (table,) = re.findall(rf"^\| {title} \| \|\n\|---\|---\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    return {
+        name for row in table.splitlines() for name in re.findall("`(\\w+)`", row.split("|")[1])
+    }
+
+
+def test_every_key_is_documented_and_no_other() -> None:
+    assert rows("explained link") == get_type_hints(LinkExplanation).keys()
+    assert rows("explained direction") == get_type_hints(DirectionExplanation).keys()

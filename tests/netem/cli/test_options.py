@@ -1,0 +1,220 @@
+"""From a command line to links, and what is told of mistakes."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from netem.__main__ import main
+from netem.cli.options import parsed, parser, specs_of
+from netem.engine.api import LinkSpec
+from netem.words.examples import EXAMPLES
+from netem.words.losses import LOSS_MODELS
+from netem.words.parser import KEYWORDS, parse, settings_of
+from noack.errors import CallerError
+from noack.impairments import LinkSettings, LossOf, Scripted
+
+ADDRESSES = ["--listen", ":9000", "--to", ":9001"]
+NOTHING = LinkSettings()
+
+
+def specs(arguments: list[str]) -> tuple[LinkSpec, ...]:
+    return specs_of(parsed(parser(), arguments))
+
+
+def the_link(**changes: Any) -> LinkSpec:
+    given: dict[str, Any] = {
+        "name": "relay",
+        "listen": ("127.0.0.1", 9000),
+        "to": ("127.0.0.1", 9001),
+        "forward": NOTHING,
+        "back": NOTHING,
+    }
+    return LinkSpec(**given | changes)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changes"),
+    [
+        ([], {}),
+        (["loss", "5%", "mansd", "4"], {"forward": "loss 5% mansd 4"}),
+        (["loss 5%", "mansd 4"], {"forward": "loss 5% mansd 4"}),
+        (["rate", "1mbit", "-14"], {"forward": "rate 1mbit -14"}),
+        (["loss", "5%", "--back", "delay", "3ms"], {"forward": "loss 5%", "back": "delay 3ms"}),
+        (["--back", "delay 3ms", "--seed", "3"], {"back": "delay 3ms", "seed": 3}),
+        (["--both", "loss", "5%"], {"forward": "loss 5%", "back": "loss 5%"}),
+        (["loss", "5%", "--both"], {"forward": "loss 5%", "back": "loss 5%"}),
+        (["loss", "5%", "seed", "7"], {"forward": "loss 5%", "seed": 7}),
+        (["--one-way", "--idle", "500ms"], {"return_path": False, "idle_s": 0.5}),
+    ],
+)
+def test_a_command_line_describes_a_link(arguments: list[str], changes: dict[str, Any]) -> None:
+    for side in ("forward", "back"):
+        if side in changes:
+            changes = changes | {side: settings_of(changes[side])}
+    assert specs([*ADDRESSES, *arguments]) == (the_link(**changes),)
+
+
+def test_words_and_options_may_be_mixed() -> None:
+    arguments = ["loss", "5%", "--listen", ":9000", "delay", "1ms", "--to", ":9001", "mansd", "2"]
+    assert specs(arguments) == (the_link(forward=settings_of("loss 5% delay 1ms mansd 2")),)
+
+
+@pytest.mark.parametrize(
+    ("listen", "to", "addresses"),
+    [
+        ("127.0.0.1:0", "192.0.2.7:53", (("127.0.0.1", 0), ("192.0.2.7", 53))),
+        ("[::1]:9000", "[::1]:9001", (("::1", 9000), ("::1", 9001))),
+        ("[::1]:9000", ":9001", (("::1", 9000), ("::1", 9001))),
+        (":9000", "[::1]:9001", (("127.0.0.1", 9000), ("::1", 9001))),
+        ("0.0.0.0:9000", "localhost:9001", (("0.0.0.0", 9000), ("127.0.0.1", 9001))),
+    ],
+)
+def test_addresses(listen: str, to: str, addresses: tuple[Any, Any]) -> None:
+    (link,) = specs(["--listen", listen, "--to", to])
+    assert (link.listen, link.to) == addresses
+
+
+def test_files_in_words_lie_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "lost.txt").write_text("010")
+    monkeypatch.chdir(tmp_path)
+    (link,) = specs([*ADDRESSES, "--back", "loss", "trace", "lost.txt"])
+    assert link.back.impairments == (LossOf(loss=Scripted(lost=(1,), repeat_every=3)),)
+
+
+def test_links_come_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "links.toml"
+    path.write_text('[[link]]\nname = "a"\nlisten = ":1"\nto = ":2"\nwords = "loss 5%"\n')
+    (link,) = specs(["--links", str(path)])
+    assert (link.name, link.forward) == ("a", settings_of("loss 5%"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--listen", ":9000"], "--listen and --to go together"),
+        (["--to", ":9000"], "--listen and --to go together"),
+        (["loss", "5%"], "an emulator on its own needs --listen and --to, or --links"),
+        (["--listen", "x", "--to", ":9"], "--listen: expected HOST:PORT, e.g. 127.0.0.1:9000"),
+        (["--listen", ":0", "--to", "no such:9"], "--to: no such: no such host"),
+        ([*ADDRESSES, "lsos", "5%"], "lsos: no such word; did you mean loss?"),
+        ([*ADDRESSES, "--back", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
+        ([*ADDRESSES, "--back", "seed", "5"], "seed 5: belongs to the link"),
+        ([*ADDRESSES, "--seed", "-1"], "--seed -1: must be 0 or more"),
+        ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words say seed 1 already"),
+        ([*ADDRESSES, "--both", "--back", "loss", "5%"], "--back: goes without --both"),
+        ([*ADDRESSES, "--one-way", "--back", "loss", "5%"], "--one-way: nothing goes back"),
+        ([*ADDRESSES, "--idle", "5"], "--idle 5: expected a time in s, ms, us or ns"),
+        ([*ADDRESSES, "--idle", "0"], "--idle 0: must be more than 0"),
+        ([*ADDRESSES, "loss", "trace", "no.txt"], "no.txt: cannot be read: No such file"),
+        (
+            [*ADDRESSES, "--loss", "bernoulli:0.3"],
+            "--loss: words stand without the dashes, e.g. loss 30%",
+        ),
+        ([*ADDRESSES, "--mansd=4"], "--mansd=4: words stand without the dashes, e.g. mansd 4"),
+        ([*ADDRESSES, "--back", "--delay", "5ms"], "--delay: words stand without the dashes"),
+        ([*ADDRESSES, "-loss", "5%"], "-loss: words stand without the dashes"),
+        (
+            [*ADDRESSES, "loss", "bernoulli:0.3"],
+            "loss bernoulli:0.3: no such word; here it is loss PERCENT, e.g. loss 30%",
+        ),
+        (
+            [*ADDRESSES, "loss", "gilbert_elliott"],
+            "loss gilbert_elliott: no such word; here it is loss gemodel or loss burst",
+        ),
+        (
+            [*ADDRESSES, "loss", "worst_case"],
+            "loss worst_case: no such word; here it is loss worst",
+        ),
+        (["--session", "x", "loss", "5%"], "--session: joins a run, and goes alone"),
+        (["--session=noack", "--idle", "5s"], "--session: joins a run, and goes alone"),
+        (["--links", "no.toml"], "no.toml: no such file"),
+        (["--links", "no.toml", "loss", "5%"], "words: stands in the file that --links names"),
+        (["--links", "no.toml", "--one-way"], "--one-way: stands in the file that --links names"),
+    ],
+)
+def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
+    with pytest.raises(CallerError) as caught:
+        specs(arguments)
+    assert str(caught.value).startswith(says)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ([*ADDRESSES, "lsos", "5%"], "noack netem: lsos: no such word; did you mean loss?\n"),
+        ([*ADDRESSES, "--capture", "-", "--json"], "noack netem: --capture -: the standard output"),
+        ([*ADDRESSES, "--stats", "0"], "noack netem: --stats 0: must be 0.01 s or more"),
+        (
+            [*ADDRESSES, "--record-fates", "a.parquet", "--replay-fates", "./a.parquet"],
+            "noack netem: --replay-fates ",
+        ),
+        (
+            [*ADDRESSES, "--record-fates", __file__],
+            f"noack netem: --record-fates {__file__}: is there already, and no Parquet file",
+        ),
+        (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session: joins a run"),
+        (
+            [*ADDRESSES, "--replay-fates", "no.parquet"],
+            "noack netem: no.parquet: cannot be read",
+        ),
+    ],
+)
+def test_a_mistake_ends_the_program(
+    arguments: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith(says)
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("columns", ["120", "80", "60"])
+def test_the_examples_of_the_help_are_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", columns)
+    Path("links.toml").write_text('[[link]]\nname = "a"\nlisten = ":1"\nto = ":2"\n')
+    text = parser().format_help().partition("examples:\n")[2]
+    examples = text.replace("\\\n", "").splitlines()
+    assert len(examples) == 5
+    for line in examples:
+        program, command, *arguments = shlex.split(line)
+        assert (program, command) == ("noack", "netem")
+        assert specs(arguments)
+
+
+@pytest.mark.parametrize("columns", [120, 80, 60])
+def test_the_help_fits_into_a_terminal(monkeypatch: pytest.MonkeyPatch, columns: int) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    text = parser().format_help()
+    assert max(map(len, text.splitlines())) <= columns
+    assert "%%" not in text
+
+
+def test_the_help_has_every_word() -> None:
+    text = parser().format_help()
+    for word in (*KEYWORDS, *LOSS_MODELS):
+        # Other words for the same stand in the documentation.
+        assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
+
+
+@pytest.mark.parametrize(("word", "example"), EXAMPLES.items())
+def test_each_word_has_an_example_that_has_it(word: str, example: str) -> None:
+    assert parse(example)
+    synonyms = {"drop": "loss", "random": "loss", "latency": "delay", "jitter": "delay"}
+    assert synonyms.get(word, word) in example.split()
+
+
+def test_each_word_that_is_no_option_has_an_example() -> None:
+    assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
+    options = {word for group in parser()._action_groups for action in group._group_actions
+               for word in action.option_strings}  # fmt: skip
+    assert not {f"--{word}" for word in EXAMPLES} & options

@@ -1,0 +1,36 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from netem.control.errands import Errands
+from netem.control.server import ControlServer
+from tests.netem.control.relays import FakeRelay, running
+
+
+@pytest.fixture(autouse=True)
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A runtime directory of the test's own, in which nobody else's emulators are."""
+    folder = tmp_path / "runtime"
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    return folder
+
+
+@pytest.fixture
+def relay() -> FakeRelay:
+    return FakeRelay("up", "down")
+
+
+@pytest.fixture
+def errands(relay: FakeRelay) -> Iterator[Errands]:
+    """Of a relay that runs."""
+    with running(relay) as errands:
+        yield errands
+
+
+@pytest.fixture
+def server(errands: Errands) -> Iterator[ControlServer]:
+    """Of an emulator named ``lab``."""
+    with ControlServer("lab", errands) as server:
+        yield server

@@ -1,0 +1,77 @@
+"""Real emulators, in processes of their own."""
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+Address = tuple[str, int]
+_PATIENCE_S = 60.0
+
+
+def read_until(descriptor: int, done: Callable[[str], bool]) -> str:
+    """Read text until it is what is waited for."""
+    text = b""
+    deadline_s = time.monotonic() + _PATIENCE_S
+    while not done(text.decode(errors="replace")):
+        ready, _, _ = select.select([descriptor], (), (), deadline_s - time.monotonic())
+        more = os.read(descriptor, 65_536) if ready else b""
+        assert more, f"this is all that came: {text.decode(errors='replace')}"
+        text += more
+    return text.decode(errors="replace")
+
+
+def address_in(text: str) -> Address | None:
+    """Where an emulator listens, from the line that says so."""
+    for line in text.splitlines(keepends=True):
+        if "Ctrl-C ends\n" in line:
+            host, _, port = line.removeprefix("noack netem: ").split(" ")[0].rpartition(":")
+            return host, int(port)
+    return None
+
+
+@contextmanager
+def emulator(
+    to: Address, *arguments: str, status: int = 0
+) -> Iterator[tuple[Address, subprocess.Popen[bytes]]]:
+    """Run an emulator; yield where it listens, and its process. It is ended by SIGINT."""
+    command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to"]
+    with subprocess.Popen(
+        [*command, f"{to[0]}:{to[1]}", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as process:
+        try:
+            assert process.stderr is not None
+            text = read_until(process.stderr.fileno(), lambda text: address_in(text) is not None)
+            address = address_in(text)
+            assert address is not None
+            yield address, process
+            process.send_signal(signal.SIGINT)
+            assert process.wait(_PATIENCE_S) == status
+        finally:
+            process.kill()
+
+
+@contextmanager
+def udp_socket(to: Address | None = None) -> Iterator[socket.socket]:
+    """A socket on loopback that waits long."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
+        endpoint.settimeout(_PATIENCE_S)
+        if to is None:
+            endpoint.bind(("127.0.0.1", 0))
+        else:
+            endpoint.connect(to)
+        yield endpoint
+
+
+def send_through(address: Address, payloads: Sequence[bytes]) -> None:
+    """Send datagrams, from one socket."""
+    with udp_socket(address) as client:
+        for payload in payloads:
+            client.send(payload)

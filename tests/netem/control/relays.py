@@ -1,0 +1,111 @@
+"""A relay without sockets: what it reports is what a test says."""
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netem.control.errands import Errands
+from netem.engine import histogram
+from netem.engine.api import (
+    DIRECTIONS,
+    Address,
+    Direction,
+    DirectionReport,
+    FlowReport,
+    LinkReport,
+    LinkSpec,
+    Relay,
+)
+from netem.records import Counters
+from netem.words.parser import settings_of
+from noack.impairments import LinkSettings
+
+SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
+HERE: Address = ("127.0.0.1", 5000)
+THERE: Address = ("::1", 6000)
+
+
+def spec_of(name: str) -> LinkSpec:
+    return LinkSpec(name, HERE, THERE, SETTINGS, LinkSettings())
+
+
+def times(*t_ns: int) -> NDArray[np.int64]:
+    counts = histogram.empty()
+    for one_ns in t_ns:
+        counts[histogram.bucket_of(one_ns)] += 1
+    return counts
+
+
+class FakeRelay:
+    """Links whose counters a test sets."""
+
+    engine = "plain"
+
+    def __init__(self, *names: str) -> None:
+        self.specs: Sequence[LinkSpec] = [spec_of(name) for name in names]
+        self.counters = {(name, way): Counters() for name in names for way in DIRECTIONS}
+        self.settings = {
+            (spec.name, way): getattr(spec, way) for spec in self.specs for way in DIRECTIONS
+        }
+        self.unintended: dict[str, int] = {"lost_in_kernel": 0, "send_errors": 0}
+        self.delays = times()
+        self.lateness = times()
+        self.flows: list[FlowReport] = []
+        self.changes = 0
+        self.threads: set[int] = set()
+        """Of those that have looked or changed."""
+
+    def addresses(self) -> Mapping[str, Address]:
+        return {spec.name: spec.listen for spec in self.specs}
+
+    def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
+        pause = threading.Event()
+        while not stop():
+            housekeeping()
+            pause.wait(0.002)
+
+    def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
+        self.threads.add(threading.get_ident())
+        self.settings[link, direction] = settings
+        self.changes += 1
+
+    def report(self) -> Sequence[LinkReport]:
+        self.threads.add(threading.get_ident())
+        return [
+            LinkReport(
+                spec.name, spec.listen, spec.to, 1, 3, 0, 0, 0,
+                self._direction(spec.name, "forward"), self._direction(spec.name, "back"),
+            )
+            for spec in self.specs
+        ]  # fmt: skip
+
+    def close(self) -> None:
+        pass
+
+    def _direction(self, link: str, direction: Direction) -> DirectionReport:
+        counters = replace(self.counters[link, direction])
+        return DirectionReport(
+            self.settings[link, direction], counters, dict(self.unintended), 5,
+            list(self.flows), self.delays.copy(), self.lateness.copy(),
+        )  # fmt: skip
+
+
+_: Relay = FakeRelay()
+
+
+@contextmanager
+def running(relay: Relay) -> Iterator[Errands]:
+    """Run a relay in a thread of its own."""
+    errands, stopping = Errands(relay), threading.Event()
+    thread = threading.Thread(target=relay.run, args=(stopping.is_set, errands.run))
+    thread.start()
+    try:
+        yield errands
+    finally:
+        stopping.set()
+        thread.join()
+        errands.close()

@@ -1,0 +1,193 @@
+"""Commands against an emulator in this process."""
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from netem.control import commands
+from netem.control.errands import Errands
+from netem.control.server import ControlServer
+from netem.words.parser import settings_of
+from noack.errors import ExitStatus
+from tests.netem.control.processes import read_until
+from tests.netem.control.relays import SETTINGS, FakeRelay, running
+
+LEAVE = "\x1b[?1049l"
+"""Ends a terminal's other screen."""
+
+
+def run(arguments: str) -> ExitStatus:
+    return commands.main(arguments.split())
+
+
+def test_what_has_happened_is_shown(
+    relay: FakeRelay, server: ControlServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    relay.counters["up", "forward"].dropped = 12
+    assert run("show") == run("show lab") == ExitStatus.OK
+    out = capsys.readouterr().out
+    assert "noack netem lab" in out
+    assert "12 dropped" in out
+    assert run("show lab --json") == ExitStatus.OK
+    document = json.loads(capsys.readouterr().out)
+    assert document["links"][0]["forward"]["fates"]["dropped"] == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "changed"),
+    [
+        ("set lab --link up loss 5% mansd 4", ["forward"]),
+        ("set --link up loss 5% mansd 4", ["forward"]),
+        ("set loss 5% --link up mansd 4", ["forward"]),
+        ("set lab loss 5% mansd 4 --direction back --link up", ["back"]),
+        ("set lab --link up --direction both loss 5% mansd 4", ["forward", "back"]),
+    ],
+)
+def test_a_link_is_set_in_words(
+    relay: FakeRelay,
+    server: ControlServer,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    changed: Sequence[str],
+) -> None:
+    assert run(arguments) == ExitStatus.OK
+    assert relay.changes == len(changed)
+    wanted = settings_of("loss 5% mansd 4")
+    assert {way for (_, way), now in relay.settings.items() if now == wanted} == {*changed}
+    out = capsys.readouterr().out.splitlines()
+    assert len(out) == 4
+    for way in changed:
+        assert f"up {way}: loss 5% mansd 4" in out
+    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down back: nothing is done"]
+
+
+def test_files_are_read_where_the_command_is_given(
+    relay: FakeRelay,
+    server: ControlServer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "losses").write_text("0110")
+    monkeypatch.chdir(tmp_path)
+    assert run("set --link up loss trace losses once") == ExitStatus.OK
+    assert relay.settings["up", "forward"] == settings_of("loss script 1,2")
+    assert run("set --link up loss trace gone") == ExitStatus.CALLER
+    assert "gone" in capsys.readouterr().err
+    assert relay.changes == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("set", "say what the link shall do, e.g. loss 5% mansd 4; or: loss none"),
+        ("set lab", "say what the link shall do"),
+        ("set --link up lozz 5%", "lozz: "),
+        ("set lab --link up loss 5% 6% 7%", "7%"),
+        ("set lba --link up loss 5%", "no emulator 'lba' runs; there are lab"),
+        ("set lab loss 5%", "which link? There are up, down"),
+        ("set --link left loss 5%", "no link 'left'; there are up, down"),
+        ("show lba", "no emulator 'lba' runs; there are lab"),
+        ("watch lba", "no emulator 'lba' runs; there are lab"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(
+    relay: FakeRelay,
+    server: ControlServer,
+    capsys: pytest.CaptureFixture[str],
+    arguments: str,
+    message: str,
+) -> None:
+    assert run(arguments) == ExitStatus.CALLER
+    error = capsys.readouterr().err
+    assert error.startswith(f"noack netem {arguments.split()[0]}: ")
+    assert error.count("\n") == 1
+    assert message in error
+    assert relay.changes == 0
+    assert relay.settings["up", "forward"] == SETTINGS
+
+
+def test_among_several_one_is_named(
+    server: ControlServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = FakeRelay("x")
+    with running(other) as errands, ControlServer("loss", errands):
+        assert run("show") == ExitStatus.CALLER
+        assert "which emulator? There are lab, loss" in capsys.readouterr().err
+        assert run("set loss loss 5%") == ExitStatus.OK  # its name is a word, too
+    assert other.settings["x", "forward"] == settings_of("loss 5%")
+
+
+@contextmanager
+def watching(stdout: int, stdin: int) -> Iterator[subprocess.Popen[bytes]]:
+    with subprocess.Popen(
+        [sys.executable, "-m", "netem", "watch", "lab"],
+        env=os.environ | {"TERM": "xterm-256color"},
+        stdin=stdin,
+        stdout=stdout,
+        stderr=subprocess.PIPE,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_into_a_pipe_a_line_a_second_is_written(relay: FakeRelay, server: ControlServer) -> None:
+    relay.counters["up", "forward"].arrived = 7
+    with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        lines = [process.stdout.readline().decode() for _ in range(3)]
+        assert all("  up forward  " in line for line in lines)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == ExitStatus.OK
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(relay: FakeRelay, server: ControlServer) -> None:
+    relay.counters["up", "forward"].arrived = 7
+    with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.wait(60) == ExitStatus.OK
+        assert process.stderr.read() == b""
+
+
+def test_a_watcher_hears_that_the_emulator_has_ended(relay: FakeRelay, errands: Errands) -> None:
+    relay.counters["up", "forward"].arrived = 7
+    with ExitStack() as emulator:
+        emulator.enter_context(ControlServer("lab", errands))
+        with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            process.stdout.readline()
+            emulator.close()
+            assert process.wait(60) == ExitStatus.FAILED
+            assert process.stderr.read() == b"noack netem watch: emulator 'lab' has ended\n"
+
+
+def test_on_a_terminal_it_is_drawn_until_q(relay: FakeRelay, server: ControlServer) -> None:
+    relay.counters["up", "forward"].arrived = 7
+    terminal, end = pty.openpty()
+    termios.tcsetwinsize(end, (24, 80))
+    before = termios.tcgetattr(end)
+    with watching(end, end) as process:
+        drawn = read_until(terminal, lambda text: "q ends" in text and "→ up" in text)
+        assert LEAVE not in drawn
+        os.write(terminal, b"q")
+        # The last picture stays.
+        read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
+        assert process.wait(60) == ExitStatus.OK
+    assert termios.tcgetattr(end) == before
+    os.close(terminal)
+    os.close(end)

@@ -1,0 +1,90 @@
+"""docs/netem-control.md says what is."""
+
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from netem.control.server import ControlServer
+from netem.control.statistics import (
+    DirectionStatistics,
+    Flow,
+    LinkStatistics,
+    Loss,
+    Quantiles,
+    Recent,
+    Statistics,
+)
+from netem.engine.api import LinkSpec
+from netem.fates.recorder import FateRecorder
+from netem.fates.trace import SCHEMA
+from netem.words.parser import settings_of
+from noack.impairments import LinkSettings
+from tests.netem.control.relays import FakeRelay, running
+
+NOTHING = LinkSettings()
+PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
+
+
+def rows(title: str) -> dict[str, str]:
+    """The table with a title: from what its rows begin with, to what they say."""
+    (table,) = re.findall(rf"^\| {title} \| \|\n\|---\|---\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    return dict(row.strip("| \n").split(" | ", 1) for row in table.splitlines())
+
+
+def names(text: str) -> set[str]:
+    return set(re.findall("`([a-z0-9_]+)`", text))
+
+
+@pytest.mark.parametrize(
+    ("title", "keys"),
+    [
+        ("document", get_type_hints(Statistics)),
+        ("link", get_type_hints(LinkStatistics)),
+        ("direction", get_type_hints(DirectionStatistics)),
+        ("recent", get_type_hints(Recent)),
+        ("column", dict.fromkeys(SCHEMA.names)),
+        ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
+    ],
+)
+def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) -> None:
+    assert set().union(*map(names, rows(title))) == set(keys)
+
+
+def test_what_lies_deeper_is_documented() -> None:
+    said = rows("direction")
+    assert names(said["`loss`"]) == set(get_type_hints(Loss))
+    assert names(said["`flows`"]) == set(get_type_hints(Flow))
+    assert names(said["`delay_ns`"]) == set(get_type_hints(Quantiles))
+
+
+def programs() -> list[str]:
+    return re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+
+
+def test_the_program_runs() -> None:
+    relay = FakeRelay("relay")
+    program, _ = programs()
+    with running(relay) as errands, ControlServer("lab", errands):
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=False
+        )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == "None\n"
+    assert relay.settings["relay", "back"].mansd == 2
+
+
+def test_the_metadata_of_a_fate_trace_are_read(tmp_path: Path) -> None:
+    _, program = programs()
+    specs = [LinkSpec("relay", ("127.0.0.1", 1), ("127.0.0.1", 2), settings_of("mansd 3"), NOTHING)]
+    with FateRecorder(tmp_path / "monday.parquet", specs):
+        pass
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == [version("noack"), "0", "3"]

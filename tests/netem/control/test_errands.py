@@ -1,0 +1,70 @@
+import threading
+
+import pytest
+
+from netem.control.errands import Errands
+from netem.records import Counters
+from netem.words.parser import settings_of
+from noack.errors import CallerError, PeerError
+from tests.netem.control.relays import FakeRelay
+
+
+def test_the_relay_is_touched_in_its_own_thread_only(relay: FakeRelay, errands: Errands) -> None:
+    errands.snapshot()
+    errands.change("up", ["forward"], settings_of("loss 50%"))
+    (thread,) = relay.threads
+    assert thread != threading.get_ident()
+
+
+def test_a_change_says_since_when_it_holds(relay: FakeRelay, errands: Errands) -> None:
+    relay.counters["up", "back"] = Counters(arrived=17)
+    errands.change("up", ["back"], settings_of("loss 50% mansd 1"))
+    relay.counters["up", "back"].arrived = 20
+    in_force = errands.snapshot().in_force
+    assert in_force["up", "back"].since.arrived == 17
+    assert in_force["up", "back"].words == "loss 50% mansd 1"
+    assert in_force["up", "forward"].since == Counters()
+    assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
+
+
+def test_an_errands_error_is_the_askers(errands: Errands) -> None:
+    def refuse() -> None:
+        raise CallerError("no")
+
+    def expire() -> None:
+        raise TimeoutError("its own")
+
+    with pytest.raises(CallerError, match="no"):
+        errands.ask(refuse)
+    with pytest.raises(TimeoutError, match="its own"):
+        errands.ask(expire)
+    assert errands.ask(lambda: 7) == 7
+
+
+def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
+    errands = Errands(relay)
+    found: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            errands.snapshot()
+        except PeerError as error:
+            found.append(error)
+
+    asker = threading.Thread(target=ask)
+    asker.start()
+    while asker.is_alive():
+        errands.close()  # whether it has asked already, or asks after this
+    assert [str(error) for error in found] == ["the emulator has ended"]
+    assert errands.look().links[0].name == "up"
+
+
+def test_a_relay_that_is_stuck_is_not_waited_for_forever(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("netem.control.errands._PATIENCE_S", 0.01)
+    errands = Errands(relay)
+    with pytest.raises(PeerError, match="has not answered for"):
+        errands.snapshot()
+    errands.run()  # what nobody waits for any more is not done
+    assert relay.threads == set()

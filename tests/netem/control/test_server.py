@@ -1,0 +1,198 @@
+"""Live control over real zenoh, on loopback."""
+
+import json
+import threading
+from typing import Any
+
+import pytest
+import zenoh
+from zenoh.handlers import FifoChannel
+
+from netem.control.client import Client
+from netem.control.errands import Errands
+from netem.control.server import USER, ControlServer
+from netem.control.session import Session, find, running
+from netem.records import Counters
+from netem.words.parser import settings_of
+from noack.errors import CallerError
+from noack.impairments import LinkSettings
+from noack.io.plane import star_config
+from tests.netem.control.relays import SETTINGS, FakeRelay
+
+
+@pytest.fixture
+def client(server: ControlServer) -> Any:
+    with Client(find("lab")) as client:
+        yield client
+
+
+def test_statistics_are_asked_for(relay: FakeRelay, client: Client) -> None:
+    relay.counters["down", "back"] = Counters(arrived=12, delivered=12)
+    document = client.ask("report")
+    assert [link["name"] for link in document["links"]] == ["up", "down"]
+    assert document["links"][1]["back"]["arrived"] == 12
+
+
+def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
+    relay.counters["up", "forward"].arrived = 1
+    heard = client.follow(lambda: False)
+    first = next(heard)
+    relay.counters["up", "forward"].arrived = 1001
+    second = next(heard)
+    before, after = (document["links"][0]["forward"] for document in (first, second))
+    assert after["arrived"] - before["arrived"] in (0, 1000)  # it may just have been looked at
+    third = next(heard)["links"][0]["forward"]["recent"]
+    assert third is not None
+    assert third["seconds"] > 0
+
+
+def test_settings_are_told_in_words_and_as_settings(client: Client) -> None:
+    up, down = client.ask("settings")["links"]
+    assert (up["name"], down["name"]) == ("up", "down")
+    assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
+    told = LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"]))
+    assert told == SETTINGS
+    assert up["back"]["words"] == ""
+
+
+@pytest.mark.parametrize(
+    ("direction", "changed"),
+    [("forward", {"forward"}), ("back", {"back"}), ("both", {"forward", "back"})],
+)
+def test_a_direction_is_changed(
+    relay: FakeRelay, client: Client, direction: str, changed: set[str]
+) -> None:
+    before = dict(relay.settings)
+    answer = client.ask("change", link="down", direction=direction, words="loss 100% mansd 2")
+    for (link, way), settings in relay.settings.items():
+        is_changed = link == "down" and way in changed
+        assert settings == (
+            settings_of("loss 100% mansd 2") if is_changed else before[link, way]
+        )  # fmt: skip
+    told = {way for way in ("forward", "back") if "loss 100%" in answer["links"][1][way]["words"]}
+    assert told == changed
+
+
+def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
+    client.ask("change", link="up", direction="back", words=["loss", "5%"])
+    assert relay.settings["up", "back"] == settings_of("loss 5%")
+    table = settings_of("delay 1ms mansd 3").model_dump(mode="json")
+    client.ask("change", link="up", direction="back", settings=table)
+    assert relay.settings["up", "back"] == settings_of("delay 1ms mansd 3")
+
+
+def test_the_link_may_be_left_out_if_there_is_one() -> None:
+    from tests.netem.control.relays import running as run
+
+    relay = FakeRelay("only")
+    with run(relay) as errands, ControlServer("lab", errands), Client(find(None)) as client:
+        client.ask("change", words="loss 5%")
+    assert relay.settings["only", "forward"] == settings_of("loss 5%")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"link": "up", "words": "lozz 5%"}, "lozz: .*loss"),
+        ({"link": "up", "words": "loss 500%"}, "loss 500%"),
+        ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
+        ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
+        ({"words": "loss 5%"}, "which link. There are up, down"),
+        ({"link": "left", "words": "loss 5%"}, "no link 'left'; there are up, down"),
+        ({"link": "up"}, "give words, or settings"),
+        ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
+        ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
+        ({"link": "up", "settings": {"mansd": -1}}, "settings.mansd: should be greater than"),
+        ({"link": "up", "settings": {"mansd": "2"}}, "settings.mansd: should be a valid integer"),
+        ({"link": "up", "settings": {"seed": 1}}, "settings.seed: Extra inputs"),
+        ({"link": "up", "words": 5}, "words"),
+        ({"link": "up", "words": "loss 5%", "wordz": 1}, "wordz"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line_and_nothing_is_changed(
+    relay: FakeRelay, client: Client, content: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CallerError, match=message) as caught:
+        client.ask("change", **content)
+    assert "\n" not in str(caught.value)
+    assert relay.changes == 0
+
+
+def ask_with(session: Session, payload: str | bytes | None, what: str = "change") -> str:
+    """Ask on a connection that is let in; return the error."""
+    secret = {"transport/auth/usrpwd/user": USER, "transport/auth/usrpwd/password": session.token}
+    with zenoh.open(star_config(session.endpoint, listen=False, more=secret)) as connection:
+        key = f"netem/{session.name}/{what}"
+        replies = connection.get(key, FifoChannel(4), payload=payload, timeout=60)
+        (error,) = [reply.err for reply in replies if reply.err is not None]
+        return error.payload.to_string()
+
+
+@pytest.mark.parametrize("what", ["report", "settings", "change"])
+@pytest.mark.parametrize("token", ["", "0" * 64, "é", None, 5, ["a"]])
+def test_a_wrong_token_is_refused(
+    relay: FakeRelay, server: ControlServer, what: str, token: object
+) -> None:
+    content = {"token": token, "link": "up", "words": "loss 5%"}
+    assert "token" in ask_with(find("lab"), json.dumps(content), what)
+    assert relay.changes == 0
+
+
+@pytest.mark.parametrize("payload", [None, "", "{", "[]", "7", "{}", "null", b"\xff\xfe"])
+def test_what_is_no_query_is_refused(
+    relay: FakeRelay, server: ControlServer, payload: str | bytes | None
+) -> None:
+    expected = 'a query is a JSON object with "token", the secret'
+    assert ask_with(find("lab"), payload) == expected
+    assert relay.changes == 0
+
+
+@pytest.mark.parametrize(
+    "secret",
+    [{}, {"user": USER, "password": "0" * 64}, {"user": "root"}],
+    ids=["none", "wrong", "other user"],
+)
+def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict[str, str]) -> None:
+    session = find("lab")
+    secret = {"password": session.token, **secret} if "user" in secret else secret
+    more: dict[str, Any] = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
+    more["connect/timeout_ms"] = 500
+    with pytest.raises(zenoh.ZError, match="Unable to connect"):
+        zenoh.open(star_config(session.endpoint, listen=False, more=more))
+
+
+def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) -> None:
+    from netem.control.session import make_folder
+
+    assert [path.name for path in make_folder().iterdir()] == ["lab.json"]
+    with pytest.raises(CallerError, match="runs; choose another name"):
+        ControlServer("lab", Errands(FakeRelay("up"))).__enter__()
+    assert [path.name for path in make_folder().iterdir()] == ["lab.json"]
+    assert running() == ["lab"]
+
+
+def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
+    errands: Errands, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held, free = threading.Event(), threading.Event()
+
+    def slow(*_: Any) -> None:
+        held.set()
+        assert free.wait(60)
+
+    monkeypatch.setattr("netem.control.server.statistics", slow)
+    assert held.wait(60)
+    try:
+        for _ in range(10):
+            errands.snapshot()  # done by the relay's thread
+    finally:
+        free.set()
+
+
+def test_when_it_ends_nothing_is_left(errands: Errands) -> None:
+    with ControlServer("lab", errands):
+        session = find("lab")
+    assert running() == []
+    more = {"connect/timeout_ms": 500}
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(star_config(session.endpoint, listen=False, more=more))

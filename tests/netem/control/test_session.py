@@ -1,0 +1,110 @@
+import signal
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from netem.control.session import Session, find, published, running
+from noack.errors import CallerError, PeerError
+
+LAB = Session("lab", "tcp/127.0.0.1:1", "secret")
+
+
+def test_a_session_is_found_while_it_lasts() -> None:
+    assert running() == []
+    with published(LAB) as path:
+        assert running() == ["lab"]
+        assert find("lab") == find(None) == LAB
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        assert [file.name for file in path.parent.iterdir()] == ["lab.json"]
+    assert running() == []
+    assert list(path.parent.iterdir()) == []
+
+
+def test_a_name_is_used_once() -> None:
+    with published(LAB):
+        with (
+            pytest.raises(CallerError, match="--control lab: an emulator of this name runs"),
+            published(LAB._replace(token="other")),
+        ):
+            pass
+        assert find("lab") == LAB
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "../up", ".hidden", "x" * 65])
+def test_unfit_names_are_refused(name: str) -> None:
+    with pytest.raises(CallerError, match="use letters, digits"), published(Session(name, "", "")):
+        pass
+
+
+HOLDER = """
+import sys
+from netem.control.session import Session, published
+with published(Session("dead", "tcp/127.0.0.1:1", "secret")):
+    print("published", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_the_file_of_a_killed_emulator_is_recognised() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "published\n"
+        assert running() == ["dead"]
+        holder.send_signal(signal.SIGKILL)
+    with published(LAB) as path:
+        left = path.with_name("dead.json")
+        assert left.exists()
+        assert running() == ["lab"]
+        assert not left.exists()
+    with published(LAB._replace(name="dead")):
+        assert running() == ["dead"]
+
+
+def test_a_name_is_free_again_after_its_emulator_was_killed(runtime_dir: Path) -> None:
+    with published(LAB) as path:
+        text = path.read_text()
+    path.write_text(text)  # nobody holds its lock
+    with published(LAB._replace(token="new")):
+        assert find("lab").token == "new"
+
+
+def test_who_is_not_there_is_answered_with_who_is() -> None:
+    with pytest.raises(CallerError, match="no emulator runs that can be reached; start one"):
+        find(None)
+    with pytest.raises(CallerError, match="no emulator 'lab' runs that can be reached"):
+        find("lab")
+    with published(LAB), published(LAB._replace(name="b")):
+        with pytest.raises(CallerError, match=r"which emulator\? There are b, lab"):
+            find(None)
+        with pytest.raises(CallerError, match="no emulator 'lba' runs; there are b, lab"):
+            find("lba")
+
+
+def test_a_folder_open_to_others_is_refused() -> None:
+    with published(LAB) as path:
+        pass
+    path.parent.chmod(0o755)
+    for use in (running, lambda: published(LAB).__enter__()):
+        with pytest.raises(CallerError, match="closed to others"):
+            use()
+
+
+def test_a_file_of_another_version_is_said_to_be_unreadable() -> None:
+    with published(LAB) as path:
+        path.write_text("{}")
+        with pytest.raises(PeerError, match="its session file cannot be read"):
+            find("lab")
+
+
+def test_a_file_that_another_has_replaced_is_not_removed(runtime_dir: Path) -> None:
+    with published(LAB) as path:
+        other = path.with_name("other")
+        other.write_text("mine")
+        other.replace(path)
+    assert path.read_text() == "mine"

@@ -1,0 +1,149 @@
+import json
+from typing import Any, get_type_hints
+
+import numpy as np
+import pytest
+
+from netem.control.errands import InForce, Snapshot
+from netem.control.statistics import (
+    DirectionStatistics,
+    Recent,
+    Statistics,
+    statistics,
+)
+from netem.engine.api import DIRECTIONS, FlowReport
+from netem.records import Counters
+from netem.words.parser import settings_of
+from noack.clock import NS_PER_S
+from tests.netem.control.relays import FakeRelay, times
+
+UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
+
+
+def look(relay: FakeRelay, elapsed_s: float, since: Any = None) -> Snapshot:
+    in_force = {
+        key: InForce(settings, (since or {}).get(key, Counters()))
+        for key, settings in relay.settings.items()
+    }
+    return Snapshot(relay.engine, relay.report(), in_force, round(elapsed_s * NS_PER_S), UNIX_NS)
+
+
+def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
+    return document["links"][link]["forward"]
+
+
+def test_everything_that_a_relay_counts_is_there(relay: FakeRelay) -> None:
+    relay.counters["up", "forward"] = Counters(
+        arrived=100, arrived_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
+        overflowed=2, blacked_out=1, duplicated=3, held_back=6, forwarded=91,
+        forwarded_bytes=6552, overtaken=9, longest_run=2, most_under_way=17,
+    )  # fmt: skip
+    relay.flows = [FlowReport(3, ("::1", 4000), 60, 2)]
+    relay.unintended["lost_in_kernel"] = 7
+    document = statistics(look(relay, 2.5))
+    assert document["time"] == "2026-09-21T14:13:20.250000+00:00"
+    assert (document["elapsed_s"], document["engine"]) == (2.5, "plain")
+    up, down = document["links"]
+    assert (up["name"], up["listen"], up["to"]) == ("up", "127.0.0.1:5000", "[::1]:6000")
+    assert (up["clients"], up["clients_ever"], up["refused"]) == (1, 3, 0)
+    found = forward(document)
+    assert found["words"] == "loss 10% delay 10ms mansd 2"
+    assert (found["arrived"], found["arrived_bytes"]) == (100, 7200)
+    assert (found["forwarded"], found["forwarded_bytes"]) == (91, 6552)
+    assert found["fates"] == {
+        "delivered": 80, "dropped": 8, "forced": 5, "corrupted": 4, "overflowed": 2,
+        "blacked_out": 1,
+    }  # fmt: skip
+    assert (found["duplicated"], found["overtaken"], found["held_back"]) == (3, 9, 6)
+    assert (found["longest_run"], found["mansd"]) == (2, 2)
+    assert (found["under_way"], found["most_under_way"]) == (5, 17)
+    assert found["unintended"] == {"lost_in_kernel": 7, "send_errors": 0}
+    assert found["flows"] == [
+        {"flow": 3, "client": "[::1]:4000", "packets": 60, "longest_run": 2}
+    ]  # fmt: skip
+    assert found["loss"]["realised"] == pytest.approx((100 - 80 - 5 + 9) / 100)
+    assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
+    assert found["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
+    assert found["recent"] is None
+    assert (down["name"], down["forward"]["arrived"], down["back"]["mansd"]) == ("down", 0, None)
+
+
+def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> None:
+    first = look(relay, 1)
+    relay.counters["up", "forward"] = Counters(arrived=10, delivered=10)
+    relay.delays = times(1000)
+    document = statistics(look(relay, 2), first)
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert set(document) == set(get_type_hints(Statistics))
+    for way in DIRECTIONS:
+        found = document["links"][0][way]
+        assert set(found) == set(get_type_hints(DirectionStatistics))
+        assert found["recent"] is not None
+        assert set(found["recent"]) == set(get_type_hints(Recent))
+
+
+def test_rates_are_those_between_two_documents(relay: FakeRelay) -> None:
+    relay.counters["up", "forward"] = Counters(
+        arrived=50, arrived_bytes=5000, delivered=40, dropped=10, forwarded=40, forwarded_bytes=4000
+    )
+    relay.delays = times(1_000_000)
+    before = look(relay, 10)
+    relay.counters["up", "forward"] = Counters(
+        arrived=450, arrived_bytes=45_000, delivered=140, dropped=310, forwarded=140,
+        forwarded_bytes=14_000,
+    )  # fmt: skip
+    relay.delays = times(1_000_000, 5_000_000, 5_000_000)
+    recent = forward(statistics(look(relay, 12), before))["recent"]
+    assert recent is not None
+    assert recent["seconds"] == 2
+    assert (recent["arrived_per_s"], recent["arrived_bits_per_s"]) == (200, 160_000)
+    assert (recent["forwarded_per_s"], recent["forwarded_bits_per_s"]) == (50, 40_000)
+    assert recent["loss"] == pytest.approx(0.75)
+    assert recent["delay_ns"]["p50"] == pytest.approx(5_000_000, rel=0.03)
+
+
+def test_loss_is_that_since_the_settings_came_into_force(relay: FakeRelay) -> None:
+    now = Counters(arrived=300, delivered=150, dropped=150)
+    relay.counters["up", "forward"] = now
+    since = {("up", "forward"): Counters(arrived=100, delivered=100)}
+    found = forward(statistics(look(relay, 1, since)))
+    assert found["loss"]["realised"] == pytest.approx(0.75)
+    assert found["loss"]["lost"] == pytest.approx(0.75)
+    assert (found["arrived_before"], found["arrived"]) == (100, 300)
+
+
+def test_the_prediction_is_that_of_the_settings_in_force(relay: FakeRelay) -> None:
+    """Bernoulli p, at most m in a row: p(1 − p^m)/(1 − p^(m+1))."""
+    found = forward(statistics(look(relay, 1)))
+    assert found["loss"]["predicted"] == pytest.approx(0.1 * (1 - 0.1**2) / (1 - 0.1**3))
+
+
+def test_what_is_overtaken_late_is_no_loss_beyond_everything(relay: FakeRelay) -> None:
+    before = look(relay, 1)
+    relay.counters["up", "forward"] = Counters(arrived=1, delivered=1, overtaken=5)
+    recent = forward(statistics(look(relay, 2), before))["recent"]
+    assert recent is not None
+    assert recent["loss"] == 1
+
+
+def test_nothing_is_said_of_what_has_not_happened(relay: FakeRelay) -> None:
+    found = forward(statistics(look(relay, 1)))
+    assert found["loss"]["realised"] is None
+    assert set(found["delay_ns"].values()) == {None}
+
+
+def test_quantiles_are_those_of_the_times(relay: FakeRelay) -> None:
+    drawn_ns = np.random.default_rng(4).lognormal(13, 2, 20_000).astype(np.int64)
+    relay.delays = times(*drawn_ns.tolist())
+    found = forward(statistics(look(relay, 1)))["delay_ns"]
+    for name, share in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999), ("max", 1.0)):
+        exact = np.quantile(drawn_ns, share, method="inverted_cdf")
+        assert found[name] == pytest.approx(exact, rel=0.03)  # type: ignore[literal-required]
+
+
+def test_long_words_are_cut(relay: FakeRelay) -> None:
+    relay.settings["up", "forward"] = settings_of("loss script " + ",".join(map(str, range(99))))
+    found = forward(statistics(look(relay, 1)))["words"]
+    assert len(found) == 200
+    assert found.startswith("loss script 0,1,2,")
+    assert found.endswith("…")

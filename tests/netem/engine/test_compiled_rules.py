@@ -1,0 +1,119 @@
+"""Compiled rules decide bit for bit as the same rules run by Python."""
+
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.engine.compiled import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.many import admit_many
+from netem.link import Link
+from netem.program import empty_state, program_of, recent_width
+from netem.records import Counters, Decision, FlowState, Verdict, array_of, dtype_of
+from netem.rules.change import carry
+from netem.rules.link import Program, State
+from noack.impairments import LinkSettings
+from tests.netem.engine import impairments
+
+FLOWS = 4
+arrivals = st.lists(
+    st.tuples(st.integers(0, FLOWS - 1), st.integers(0, 2000), st.integers(0, 3_000_000)),
+    min_size=1,
+    max_size=120,
+)
+
+
+class Compiled:
+    """A link with compiled rules, whose rows do not lie in the order of its flows."""
+
+    def __init__(self, own: LinkSettings, **others: Any) -> None:
+        self.program: Program = compiled_program(plain := program_of(own, 3, "a", **others))
+        self.state = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
+        self._first_delivered = own.first_delivered
+        self._seen: set[int] = set()
+
+    def decide(self, batch: list[tuple[int, int, int]]) -> list[tuple[Any, ...]]:
+        flows, sizes, times = (np.array(column, np.int64) for column in zip(*batch, strict=True))
+        for flow in set(flows.tolist()) - self._seen:
+            self._seen.add(flow)
+            set_flow(self.state, row_of(flow), flow, self._first_delivered)
+        verdicts = np.zeros(len(batch), dtype_of(Verdict))
+        rows = np.array([row_of(flow) for flow in range(FLOWS)])[flows]
+        compile_rule(admit_many)(self.program, self.state, rows, sizes, times, verdicts)
+        return [tuple(verdict) for verdict in verdicts.tolist()]
+
+    def change(self, own: LinkSettings) -> None:
+        self._first_delivered = own.first_delivered
+        plain = program_of(own, 3, "a", tracks=self.program.tracks)
+        state: State = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
+        np.asarray(state.recent_ns)[:] = -1
+        state = state._replace(
+            flows=self.state.flows, link=self.state.link, counters=self.state.counters
+        )
+        program = compiled_program(plain)
+        compile_rule(carry)(self.program, self.state, program, state, np.full(FLOWS, -1))
+        self.program, self.state = program, state
+
+
+def row_of(flow: int) -> int:
+    return FLOWS - 1 - flow
+
+
+def ascending(batch: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
+    times = np.cumsum([gap for _, _, gap in batch]).tolist()
+    return [(flow, size, t) for (flow, size, _), t in zip(batch, times, strict=True)]
+
+
+@settings(max_examples=400)
+@given(own=impairments.settings, other=st.none() | impairments.settings, batch=arrivals)
+def test_compiled_and_plain_rules_agree(
+    own: LinkSettings, other: LinkSettings | None, batch: list[tuple[int, int, int]]
+) -> None:
+    plain, compiled = Link(own, 3, "a"), Compiled(own)
+    batch = ascending(batch)
+    half = len(batch) // 2
+    parts = [batch] if other is None or not half else [batch[:half], batch[half:]]
+    for number, part in enumerate(parts):
+        if number and other is not None:
+            plain.change(other)
+            compiled.change(other)
+        assert compiled.decide(part) == [astuple(plain.decide(*arrival)) for arrival in part]
+    assert Counters(*compiled.state.counters.tolist()) == plain.counters  # type: ignore[attr-defined]
+    for flow in range(FLOWS):
+        expected = plain.flow(flow)
+        found = FlowState(*compiled.state.flows[row_of(flow)].tolist())  # type: ignore[attr-defined]
+        assert expected is None or found == expected
+
+
+@settings(max_examples=100)
+@given(own=impairments.settings, batch=arrivals, sizes=st.lists(st.integers(1, 30), min_size=1))
+def test_batches_do_not_matter(
+    own: LinkSettings, batch: list[tuple[int, int, int]], sizes: list[int]
+) -> None:
+    batch = ascending(batch)
+    together, apart = Compiled(own), Compiled(own)
+    found, begin = [], 0
+    while begin < len(batch):
+        size = sizes[begin % len(sizes)]
+        found += apart.decide(batch[begin : begin + size])
+        begin += size
+    assert found == together.decide(batch)
+
+
+@pytest.mark.parametrize("mansd", [None, 2])
+def test_recorded_decisions_are_repeated_by_flow_not_by_row(mansd: int | None) -> None:
+    own = LinkSettings(mansd=mansd)
+    recorded = [[Decision(0, 5 * flow, -1, -1, -1)] * 3 for flow in range(FLOWS)]
+    compiled = Compiled(own, decisions=recorded)
+    verdicts = compiled.decide([(flow, 10, 1000) for flow in range(FLOWS)])
+    names = list(Verdict.__slots__)
+    releases = [verdict[names.index("release_ns")] for verdict in verdicts]
+    assert releases == [1000 + 5 * flow for flow in range(FLOWS)]
+
+
+def test_records_and_rows_hold_the_same() -> None:
+    rows = array_of(Verdict, [Verdict(*range(9))])
+    assert [rows[0][name] for name in dtype_of(Verdict).names or ()] == list(range(9))

@@ -1,0 +1,105 @@
+"""At the receiver: never more than M − 1 in a row that are missing, damaged or stale."""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.engine.start import Engine
+from noack.impairments import LinkSettings
+from tests.netem.engine import impairments
+from tests.netem.engine.relays import drain, endpoints, link, name_of, running
+
+CLIENTS = 4
+
+
+def sealed(number: int, way: str, size: int) -> bytes:
+    """A payload that tells its number, and whether it is intact."""
+    head = number.to_bytes(4, "big") + way.encode()
+    body = head.ljust(size, b".")
+    return hashlib.blake2b(body, digest_size=8).digest() + body
+
+
+def number_of(payload: bytes) -> int | None:
+    intact = hashlib.blake2b(payload[8:], digest_size=8).digest() == payload[:8]
+    return int.from_bytes(payload[8:12], "big") if intact else None
+
+
+def longest_run(received: Sequence[bytes], sent: int) -> int:
+    """Most in a row of ``sent`` that a receiver who wants the newest gets no use of."""
+    newest, longest = -1, 0
+    for payload in received:
+        number = number_of(payload)
+        if number is not None and number > newest:
+            longest = max(longest, number - newest - 1)
+            newest = number
+    return max(longest, sent - newest - 1)
+
+
+@pytest.mark.parametrize("engine", ["batched", "plain"])
+@settings(max_examples=60)
+@given(
+    forward=impairments.capped,
+    back=impairments.capped,
+    rounds=st.lists(st.integers(1, 40), min_size=1, max_size=4),
+    other=st.none() | impairments.capped,
+    segment=st.booleans(),
+)
+def test_the_cap_holds_in_both_directions_for_every_client(
+    engine: Engine,
+    forward: LinkSettings,
+    back: LinkSettings,
+    rounds: list[int],
+    other: LinkSettings | None,
+    segment: bool,
+) -> None:
+    assert forward.mansd is not None
+    assert back.mansd is not None
+    forward_cap, back_cap = forward.mansd, back.mansd
+    if other is not None:
+        assert other.mansd is not None
+        forward_cap = max(forward_cap, other.mansd)
+    with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
+        spec = link(name_of(server), forward, back)
+        with running([spec], engine, segment=segment) as one:
+            there, sent = one.relay.addresses()["test"], 0
+            for count in rounds:
+                for number in range(sent, sent + count):
+                    for client in clients:
+                        client.sendto(sealed(number, "there", 20 + number % 3), there)
+                sent += count
+                if other is not None:
+                    settings_now, other = other, None
+                    one.ask(lambda new=settings_now: one.relay.change("test", "forward", new))
+            one.settled(sent * CLIENTS)
+            by_source = defaultdict(list)
+            for payload, source in drain(server):
+                by_source[source].append(payload)
+            assert len(by_source) == CLIENTS
+            for received in by_source.values():
+                assert longest_run(received, sent) <= forward_cap
+            for number in range(sent):
+                for source in by_source:
+                    server.sendto(sealed(number, "back", 30), source)
+            one.settled(sent * CLIENTS, "back")
+            for client in clients:
+                received = [payload for payload, _ in drain(client)]
+                assert longest_run(received, sent) <= back_cap
+            report = one.report()
+    assert report.forward.counters.longest_run <= forward_cap
+    assert report.back.counters.longest_run <= back_cap
+    for way in (report.forward, report.back):
+        assert way.unintended == {"lost_in_kernel": 0}
+
+
+def test_the_judge_sees_what_is_missing_damaged_or_stale() -> None:
+    all_of_them = [sealed(number, "there", 20) for number in range(6)]
+    assert longest_run(all_of_them, 6) == 0
+    assert longest_run(all_of_them[:2] + all_of_them[4:], 6) == 2
+    assert longest_run(all_of_them[:3], 6) == 3
+    assert longest_run([all_of_them[k] for k in (0, 3, 1, 2, 4, 5)], 6) == 2
+    damaged = bytes([all_of_them[1][0] ^ 4]) + all_of_them[1][1:]
+    assert longest_run([all_of_them[0], damaged, *all_of_them[2:]], 6) == 1

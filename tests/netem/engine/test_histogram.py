@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.engine.histogram import BUCKETS, bucket_of, coarse, empty, lower_ns, quantile_ns
+
+TIMES = st.lists(st.integers(0, 2**43), min_size=1, max_size=200)
+
+
+@given(st.integers(0, 2**44 - 1))
+def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
+    bucket = bucket_of(t_ns)
+    assert lower_ns(bucket) <= t_ns < lower_ns(bucket + 1)
+    assert lower_ns(bucket + 1) - lower_ns(bucket) <= max(1, lower_ns(bucket) / 32)
+
+
+def test_what_has_no_bucket_of_its_own() -> None:
+    assert bucket_of(-5) == 0
+    assert bucket_of(2**60) == BUCKETS - 1
+
+
+@given(TIMES)
+def test_quantiles_are_those_of_the_times(times_ns: list[int]) -> None:
+    counts = empty()
+    for t_ns in times_ns:
+        counts[bucket_of(t_ns)] += 1
+    for share in (0.5, 0.99, 1.0):
+        exact = float(np.quantile(times_ns, share, method="inverted_cdf"))
+        assert quantile_ns(counts, share) == pytest.approx(exact, rel=1 / 32, abs=1)
+
+
+@given(TIMES)
+def test_the_coarse_one_counts_the_same_times(times_ns: list[int]) -> None:
+    counts = empty()
+    for t_ns in times_ns:
+        counts[bucket_of(t_ns)] += 1
+    steps = coarse(counts)
+    begins = [begin for begin, _ in steps]
+    assert begins == sorted(begins)
+    assert sum(n for _, n in steps) == len(times_ns)
+    for begin, n in steps:
+        # Four for each doubling; below 32 ns eight ns each.
+        width = 8 if begin < 32 else 1 << (begin.bit_length() - 3)
+        assert n == sum(begin <= t_ns < begin + width for t_ns in times_ns)

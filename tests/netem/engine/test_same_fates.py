@@ -1,0 +1,104 @@
+"""What the engines do with datagrams is what the machine says, whatever the settings."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from netem.engine.api import LinkSpec
+from netem.engine.start import Engine
+from netem.link import Datagram, Link
+from noack.impairments import LinkSettings
+from tests.netem.engine import impairments
+from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
+
+CLIENTS = 3
+DECIDED = ("packet", "fate", "run", "held_ns", "bit", "copy_bit")
+
+
+def replayed(
+    spec: LinkSpec, side: int, events: NDArray[Any], payloads: list[bytes], began_ns: int
+) -> dict[int, list[bytes]]:
+    """Give the machine what arrived, when it did; check decisions; return what leaves, by flow."""
+    own: LinkSettings = (spec.forward, spec.back)[side]
+    machine = Link(own, spec.seed, spec.name, ("forward", "back")[side])
+    left: dict[int, list[bytes]] = defaultdict(list)
+
+    def take(outputs: Any) -> None:
+        for output in outputs:
+            if isinstance(output, Datagram):
+                left[output.flow].append(output.data)
+
+    def let_out(now_ns: float) -> None:
+        while (due_ns := machine.next_deadline_ns()) is not None and due_ns <= now_ns:
+            take(machine.on_timer(due_ns))
+
+    for event, payload in zip(events, payloads, strict=True):
+        if event["direction"] != side or event["departure"]:
+            continue
+        now_ns = int(event["t_ns"]) - began_ns
+        let_out(now_ns)
+        take(machine.handle(Datagram(int(event["flow"]), payload), now_ns))
+        verdict = machine.verdict
+        assert [event[field] for field in DECIDED] == [getattr(verdict, f) for f in DECIDED]
+        for field, t_ns in (("delay_ns", verdict.release_ns), ("copy_delay_ns", verdict.copy_ns)):
+            assert event[field] == (-1 if t_ns < 0 else t_ns - now_ns)
+    let_out(np.inf)
+    return left
+
+
+@pytest.mark.parametrize("engine", ["batched", "plain"])
+@settings(max_examples=60)
+@given(
+    forward=impairments.settings,
+    back=impairments.settings,
+    sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=30, max_size=150),
+    segment=st.booleans(),
+)
+def test_fates_and_order_are_the_machines(
+    engine: Engine, forward: LinkSettings, back: LinkSettings, sizes: list[int], segment: bool
+) -> None:
+    tap = KeepAll()
+    with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
+        spec = link(name_of(server), forward, back)
+        with running([spec], engine, taps=[tap], segment=segment) as one:
+            there = one.relay.addresses()["test"]
+            for k, size in enumerate(sizes):
+                clients[k % CLIENTS].sendto(payload_of(k, size), there)
+            one.settled(len(sizes))
+            came = drain(server)
+            for data, source in came:
+                server.sendto(data, source)
+            one.settled(len(came), "back")
+        ports = [name_of(client)[1] for client in clients]
+        at_clients = [[data for data, _ in drain(client)] for client in clients]
+        events, began_ns = tap.events, one.relay.began_unix_ns
+        assert began_ns is not None
+        assert tap.lost == 0
+    by_flow: dict[int, list[bytes]] = defaultdict(list)
+    flow_of = {
+        (bytes(event["source"][:4]), int(event["source_port"])): int(event["flow"])
+        for event in events
+        if event["departure"] and not event["direction"]
+    }
+    for data, (_, port) in came:
+        by_flow[flow_of[b"\x7f\0\0\1", port]].append(data)
+    assert by_flow == replayed(spec, 0, events, tap.payloads, began_ns)
+    flow_at = {
+        int(event["source_port"]): int(event["flow"])
+        for event in events
+        if not event["departure"] and not event["direction"]
+    }
+    expected = replayed(spec, 1, events, tap.payloads, began_ns)
+    for port, found in zip(ports, at_clients, strict=True):
+        assert found == expected.get(flow_at[port], [])
+    departures = events[events["departure"] == 1]
+    assert len(departures) == len(came) + sum(map(len, at_clients))
+
+
+def payload_of(number: int, size: int) -> bytes:
+    return (number.to_bytes(8, "little") * (size // 8 + 1))[:size]

@@ -1,0 +1,162 @@
+"""Links that do everything, and datagrams for them: for traces of what really happens."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from netem.engine.api import LinkSpec
+from netem.events import EVENT
+from netem.fates.recorder import FateRecorder
+from netem.link import Datagram, Link
+from netem.records import Verdict
+from noack.impairments import (
+    Bernoulli,
+    Blackout,
+    Corrupt,
+    Delay,
+    Duplicate,
+    GilbertElliott,
+    Impairment,
+    LinkSettings,
+    LossOf,
+    Periodic,
+    Rate,
+    Reorder,
+    Scripted,
+    WorstCase,
+)
+
+US = 1e-6
+shares = st.floats(0, 1)
+times_s = st.floats(0, 50 * US)
+losses = st.one_of(
+    st.builds(Bernoulli, probability=shares, correlation=st.sampled_from([0.0, 0.5])),
+    st.builds(GilbertElliott, good_to_bad=shares, bad_to_good=shares),
+    st.builds(Periodic, period=st.just(4), burst=st.integers(0, 4)),
+    st.builds(Scripted, lost=st.sets(st.integers(0, 30)).map(sorted).map(tuple)),
+    st.just(WorstCase()),
+)
+impairments: st.SearchStrategy[Impairment] = st.one_of(
+    st.builds(LossOf, loss=losses),
+    st.builds(Duplicate, probability=shares),
+    st.builds(Corrupt, probability=shares),
+    st.builds(
+        Delay,
+        delay_s=times_s,
+        jitter_s=times_s,
+        distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
+        correlation=st.sampled_from([0.0, 0.9]),
+    ),
+    st.builds(Reorder, probability=shares, gap=st.integers(1, 3)),
+    st.builds(Rate, rate_bps=st.integers(10**6, 10**9), queue=st.integers(1, 5)),
+    st.builds(
+        Blackout,
+        intervals_s=st.just(((10 * US, 20 * US),)),
+        every_s=st.sampled_from([None, 25 * US]),
+    ),
+)
+settings = st.builds(
+    LinkSettings,
+    impairments=st.lists(impairments, max_size=5).map(tuple),
+    mansd=st.none() | st.integers(0, 4),
+    first_delivered=st.booleans(),
+    limit=st.sampled_from([1, 3, 1000]),
+)
+
+
+class Arrival(NamedTuple):
+    """A datagram that comes in."""
+
+    gap_ns: int
+    """After the one before."""
+    flow: int
+    size_bytes: int
+
+
+def _numbered(came: list[Arrival]) -> list[Arrival]:
+    """Number flows as a relay does, in the order of their first datagrams."""
+    numbers: dict[int, int] = {}
+    return [one._replace(flow=numbers.setdefault(one.flow, len(numbers))) for one in came]
+
+
+arrivals = st.lists(
+    st.builds(Arrival, st.integers(0, 30_000), st.integers(0, 2), st.integers(0, 40)), max_size=40
+).map(_numbered)
+
+
+def payload(flow: int, packet: int, size_bytes: int) -> bytes:
+    return np.random.default_rng([flow, packet]).bytes(size_bytes)
+
+
+@dataclass
+class Run:
+    """What a link did."""
+
+    verdicts: list[Verdict] = field(default_factory=list)
+    arrivals: list[tuple[int, int, int]] = field(default_factory=list)
+    """Time in ns, flow, size in bytes."""
+    departures: list[tuple[int, int, bytes]] = field(default_factory=list)
+    """Time in ns, flow, payload; in the order in which they left."""
+
+    @property
+    def events(self) -> NDArray[Any]:
+        """What a relay would have told a tap of the arrivals."""
+        events = np.zeros(len(self.verdicts), EVENT)
+        for event, verdict, came in zip(events, self.verdicts, self.arrivals, strict=True):
+            now_ns, event["flow"], event["size_bytes"] = came
+            event["t_ns"] = 10**18 + now_ns
+            for name in ("packet", "run", "fate", "bit", "copy_bit", "held_ns"):
+                event[name] = getattr(verdict, name)
+            gone, copied = verdict.release_ns != -1, verdict.copy_ns != -1
+            event["delay_ns"] = verdict.release_ns - now_ns if gone else -1
+            event["copy_delay_ns"] = verdict.copy_ns - now_ns if copied else -1
+        return events
+
+
+def drive(link: Link, came: Sequence[Arrival]) -> Run:
+    """Send datagrams through a link, and let everything out at the end."""
+    run, now_ns, counts = Run(), 0, dict.fromkeys(range(10), 0)
+
+    def release(until_ns: float) -> None:
+        while (due_ns := link.next_deadline_ns()) is not None and due_ns <= until_ns:
+            leaves(due_ns, link.on_timer(due_ns))
+
+    def leaves(t_ns: int, outputs: Sequence[object]) -> None:
+        run.departures.extend(
+            (t_ns, output.flow, output.data) for output in outputs if isinstance(output, Datagram)
+        )
+
+    for arrival in came:
+        now_ns += arrival.gap_ns
+        release(now_ns)
+        data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
+        counts[arrival.flow] += 1
+        leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
+        run.verdicts.append(Verdict(**asdict(link.verdict)))
+        run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
+    release(float("inf"))
+    return run
+
+
+def spec_of(link_settings: LinkSettings, name: str = "a") -> LinkSpec:
+    here = ("127.0.0.1", 0)
+    return LinkSpec(name, here, here, link_settings, LinkSettings(), seed=7)
+
+
+def record(path: Path, link_settings: LinkSettings, came: Sequence[Arrival]) -> Run:
+    """Send datagrams through a link, and record what becomes of them."""
+    run = drive(Link(link_settings, 7, "a", "forward"), came)
+    with FateRecorder(path, [spec_of(link_settings)]) as recorder:
+        events = run.events
+        middle = len(events) // 2
+        departures = np.zeros(3, EVENT)
+        departures["departure"] = 1
+        recorder.take(np.concatenate([events[:middle], departures]), np.zeros(0, np.uint8))
+        recorder.take(events[middle:], np.zeros(0, np.uint8))
+    assert (recorder.rows, recorder.missing_events) == (len(came), 0)
+    return run

@@ -1,0 +1,230 @@
+import json
+import os
+import resource
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+
+from netem.events import EVENT
+from netem.fates.recorder import FateRecorder
+from netem.fates.replay import read_fates
+from netem.fates.trace import METADATA
+from noack.errors import CallerError
+from noack.impairments import Corrupt, LinkSettings
+from noack.records import Fate
+from tests.netem.fates.links import Arrival, record, spec_of
+
+NOTHING = np.zeros(0, np.uint8)
+LINK = LinkSettings(impairments=(Corrupt(probability=0.5),), mansd=2)
+
+
+def arrivals(count: int, link: int = 0, direction: int = 0, first: int = 0) -> NDArray[Any]:
+    events = np.zeros(count, EVENT)
+    events["packet"] = np.arange(first, first + count)
+    events["link"], events["direction"] = link, direction
+    for name in ("bit", "copy_bit", "copy_delay_ns"):
+        events[name] = -1
+    return events
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "fates.parquet"
+
+
+def test_a_row_says_what_an_event_says(path: Path) -> None:
+    event = arrivals(1, link=1, direction=1)
+    told = {
+        "t_ns": 1_790_000_000_123_456_789, "size_bytes": 1400, "fate": Fate.CORRUPTED, "run": 2,
+        "delay_ns": 5, "copy_delay_ns": 2**40, "bit": 17, "copy_bit": 11_199, "held_ns": 3,
+    }  # fmt: skip
+    for name, value in told.items():
+        event[name] = value
+    with FateRecorder(path, [spec_of(LINK), spec_of(LINK, "up")]) as recorder:
+        recorder.take(event, NOTHING)
+    (row,) = pq.read_table(path).to_pylist()
+    arrival_ns = told.pop("t_ns")
+    assert row == told | {
+        "link": "up", "direction": "back", "flow": 0, "packet": 0, "arrival_ns": arrival_ns,
+    }  # fmt: skip
+
+
+def test_the_file_says_of_which_links_it_is(path: Path) -> None:
+    record(path, LINK, [])
+    document = json.loads(pq.ParquetFile(path).metadata.metadata[METADATA.encode()])
+    assert document["missing_events"] == 0
+    (link,) = document["links"]
+    assert (link["name"], link["seed"]) == ("a", 7)
+    assert LinkSettings.model_validate_json(json.dumps(link["forward"])) == LINK
+
+
+def test_directions_are_kept_apart_and_a_flow_may_be_silent_in_one(path: Path) -> None:
+    back = arrivals(2, direction=1)
+    back["flow"] = 1
+    back["fate"], back["delay_ns"] = Fate.DROPPED, -1
+    other = arrivals(1)
+    other["flow"] = 1
+    with FateRecorder(path, [spec_of(LINK), spec_of(LINK, "up")]) as recorder:
+        recorder.take(np.concatenate([arrivals(3), other, back]), NOTHING)
+    fates = read_fates(path).decisions
+    assert {key: [len(flow) for flow in flows] for key, flows in fates.items()} == {
+        ("a", "forward"): [3, 1],
+        ("a", "back"): [0, 2],
+        ("up", "forward"): [],
+        ("up", "back"): [],
+    }
+    assert [decision.fate for decision in fates["a", "back"][1]] == [Fate.DROPPED] * 2
+    assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "back")}
+
+
+def test_many_rows_are_written_in_groups(path: Path) -> None:
+    rows = 200_000
+    with FateRecorder(path, [spec_of(LINK)]) as recorder:
+        for first in range(0, rows, 1000):
+            recorder.take(arrivals(1000, first=first), NOTHING)
+    assert (recorder.rows, recorder.missing_events) == (rows, 0)
+    assert pq.ParquetFile(path).metadata.num_row_groups > 1
+    (flow,) = read_fates(path).decisions["a", "forward"]
+    assert len(flow) == rows
+
+
+def test_what_comes_too_fast_is_missing_and_told_at_once(
+    path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+    write_table = pq.ParquetWriter.write_table
+
+    def slow(self: pq.ParquetWriter, table: pa.Table) -> None:
+        assert free.wait(60)
+        write_table(self, table)
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", slow)
+    with FateRecorder(path, [spec_of(LINK)], most_waiting=100_000) as recorder:
+        recorder.take(arrivals(100_000), NOTHING)
+        recorder.take(arrivals(7), NOTHING)  # returns, although nothing can be written
+        assert recorder.missing_events == 7
+        free.set()
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "events are missing" in error
+    with pytest.raises(CallerError, match="7 events are missing; a trace with holes"):
+        read_fates(path)
+
+
+def test_events_that_the_relay_had_no_room_for_are_missing(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with FateRecorder(path, [spec_of(LINK)]) as recorder:
+        recorder.missing(0)
+        recorder.take(arrivals(3), NOTHING)
+        recorder.missing(2)
+        recorder.missing(1)
+    assert "events are missing" in capsys.readouterr().err
+    with pytest.raises(CallerError, match="3 events are missing"):
+        read_fates(path)
+
+
+def test_when_the_file_cannot_grow_the_relay_goes_on(
+    path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with FateRecorder(path, [spec_of(LINK)]) as recorder:
+            for first in range(0, 600_000, 100_000):
+                recorder.take(arrivals(100_000, first=first), NOTHING)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "cannot be written any more (File too large)" in error
+    assert (recorder.rows, recorder.missing_events) == (0, 600_000)
+    with pytest.raises(CallerError, match="not finished"):
+        read_fates(path)
+
+
+def test_a_file_that_cannot_be_made_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"none/x: cannot be written \(No such file"):
+        FateRecorder(tmp_path / "none" / "x", [spec_of(LINK)])
+    with pytest.raises(CallerError, match=r"cannot be written \(No space left on device\)"):
+        FateRecorder(Path("/dev/full"), [spec_of(LINK)])
+
+
+def rewritten(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Write a trace anew, with other rows."""
+    file = pq.ParquetFile(path)
+    table, metadata = change(file.read()), file.metadata.metadata
+    with pq.ParquetWriter(path, table.schema) as writer:
+        writer.write_table(table)
+        writer.add_key_value_metadata({METADATA: metadata[METADATA.encode()].decode()})
+
+
+def test_a_hole_is_found(path: Path) -> None:
+    record(path, LINK, [Arrival(10, 0, 4), Arrival(10, 1, 4)] * 5)
+    rewritten(path, lambda table: pa.concat_tables([table.slice(0, 5), table.slice(6)]))
+    with pytest.raises(CallerError, match="a forward: flow 1: expected datagram 2 and found 3"):
+        read_fates(path)
+
+
+def test_a_datagram_twice_is_found(path: Path) -> None:
+    record(path, LINK, [Arrival(10, 0, 4)] * 3)
+    rewritten(path, lambda table: pa.concat_tables([table, table.slice(2)]))
+    with pytest.raises(CallerError, match="flow 0: expected datagram 3 and found 2"):
+        read_fates(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("fate", 9), ("delay_ns", -1), ("delay_ns", -5), ("copy_delay_ns", 0), ("bit", -2),
+     ("flow", -1), ("flow", 10**12), ("copy_bit", -3)],
+)  # fmt: skip
+def test_what_no_emulator_does_is_refused(path: Path, name: str, value: int) -> None:
+    events = arrivals(3)
+    events["delay_ns"] = 100
+    events[name][1] = value
+    with FateRecorder(path, [spec_of(LINK)]) as recorder:
+        recorder.take(events, NOTHING)
+    with pytest.raises(CallerError, match=f"a forward: no emulator did this: .*{name} {value}"):
+        read_fates(path)
+
+
+def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"cannot be read \(.*No such file"):
+        read_fates(path)
+    with pytest.raises(CallerError, match="cannot be read"):
+        read_fates(tmp_path)
+    path.write_text("fates")
+    with pytest.raises(CallerError, match="is no fate trace, or one that was not finished"):
+        read_fates(path)
+    pq.write_table(pa.table({"a": [1]}), path)
+    with pytest.raises(CallerError, match="is no fate trace of this program"):
+        read_fates(path)
+
+
+def test_a_trace_whose_emulator_was_killed_is_not_finished(path: Path) -> None:
+    record(path, LINK, [Arrival(10, 0, 4)] * 3)
+    os.truncate(path, path.stat().st_size - 8)
+    with pytest.raises(CallerError, match="not finished as the emulator was killed"):
+        read_fates(path)
+
+
+def test_a_link_that_the_trace_does_not_know_is_named(path: Path) -> None:
+    record(path, LINK, [])
+    with pytest.raises(CallerError, match="no fates of a link 'b'; it has those of a"):
+        read_fates(path, ["b"])
+
+
+def test_a_trace_of_another_format_is_refused(path: Path) -> None:
+    record(path, LINK, [])
+    file = pq.ParquetFile(path)
+    with pq.ParquetWriter(path, file.schema_arrow) as writer:
+        writer.add_key_value_metadata({METADATA: json.dumps({"format": 2, "version": "9.9"})})
+    with pytest.raises(CallerError, match=r"is of another format, that of noack 9\.9"):
+        read_fates(path)

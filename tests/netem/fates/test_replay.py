@@ -1,0 +1,168 @@
+"""A replay does what was recorded."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.fates.replay import read_fates
+from netem.link import Link
+from netem.records import Decision
+from noack.impairments import (
+    Corrupt,
+    Delay,
+    Duplicate,
+    GilbertElliott,
+    LinkSettings,
+    LossOf,
+    Rate,
+    WorstCase,
+)
+from noack.records import Fate
+from tests.netem.fates.links import Arrival, Run, arrivals, drive, payload, record, settings
+
+BAD = LinkSettings(
+    impairments=(
+        LossOf(loss=GilbertElliott(good_to_bad=0.2, bad_to_good=0.4)),
+        Duplicate(probability=0.4),
+        Corrupt(probability=0.4),
+        Delay(delay_s=100e-6, jitter_s=100e-6),
+        Rate(rate_bps=50_000_000, queue=3),
+    ),
+    mansd=3,
+    limit=12,
+)
+"""Everything happens, often."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fates")
+
+
+def fates_of(folder: Path) -> Sequence[Sequence[Decision]]:
+    return read_fates(folder / "fates.parquet").decisions["a", "forward"]
+
+
+def seen(run: Run) -> list[tuple[int, ...]]:
+    """What a datagram's sender and receiver could tell."""
+    return [
+        (one.fate, one.packet, one.run, one.release_ns, one.copy_ns, one.bit, one.copy_bit)
+        for one in run.verdicts
+    ]
+
+
+@given(settings, arrivals, st.booleans())
+def test_the_same_arrivals_meet_the_same_fates(
+    folder: Path, link: LinkSettings, came: list[Arrival], capped: bool
+) -> None:
+    """Whatever the replaying link would have decided: another seed, and no impairments at all."""
+    before = record(folder / "fates.parquet", link, came)
+    bare = LinkSettings(mansd=link.mansd) if capped else LinkSettings()
+    for replaying in (link, bare):
+        again = drive(Link(replaying, 8, "b", decisions=fates_of(folder)), came)
+        assert seen(again) == seen(before)
+        assert again.departures == before.departures
+
+
+@given(settings, arrivals, st.data())
+def test_at_other_times_the_delays_are_kept_and_so_is_the_cap(
+    folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
+) -> None:
+    """Even a lower one than that of the record."""
+    before = record(folder / "fates.parquet", link, came)
+    gaps = st.lists(st.integers(0, 30_000), min_size=len(came), max_size=len(came))
+    mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))
+    moved = moved_to(came, data.draw(gaps))
+    check_moved(before, moved, link.model_copy(update={"mansd": mansd}), fates_of(folder))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_long_records_are_repeated(folder: Path, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    came = [
+        Arrival(int(gap_ns), 0, int(size_bytes))
+        for gap_ns, size_bytes in random.integers(0, (60_000, 200), (300, 2))
+    ]
+    before = record(folder / "fates.parquet", BAD, came)
+    assert {verdict.fate for verdict in before.verdicts} == set(Fate) - {Fate.BLACKED_OUT}
+    again = drive(Link(BAD, 8, "b", decisions=fates_of(folder)), came)
+    assert seen(again) == seen(before)
+    assert again.departures == before.departures
+    moved = moved_to(came, random.integers(0, 20_000, 300).tolist())
+    check_moved(before, moved, BAD, fates_of(folder))
+    check_moved(before, moved, BAD.model_copy(update={"mansd": 1}), fates_of(folder))
+
+
+def moved_to(came: Sequence[Arrival], gaps_ns: Sequence[int]) -> list[Arrival]:
+    return [one._replace(gap_ns=gap_ns) for one, gap_ns in zip(came, gaps_ns, strict=True)]
+
+
+def check_moved(
+    before: Run, moved: list[Arrival], link: LinkSettings, fates: Sequence[Sequence[Decision]]
+) -> None:
+    again = drive(Link(link, 8, "b", decisions=fates), moved)
+    for old, old_came, new, new_came in zip(
+        before.verdicts, before.arrivals, again.verdicts, again.arrivals, strict=True
+    ):
+        if old.fate == new.fate and old.release_ns >= 0:
+            delay_ns = new.release_ns - new_came[0]
+            assert delay_ns >= old.release_ns - old_came[0]
+            assert new.held_ns or delay_ns == old.release_ns - old_came[0]
+        lost = (Fate.DROPPED, Fate.CORRUPTED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
+        assert old.fate == new.fate or (old.fate in lost and new.fate == Fate.FORCED)
+    if link.mansd is not None:
+        assert longest_run(again) <= link.mansd
+
+
+def longest_run(run: Run) -> int:
+    """Most successive datagrams of a flow that a receiver which wants the newest does not get."""
+    longest = 0
+    for flow in {flow for _, flow, _ in run.arrivals}:
+        sizes = [size_bytes for _, other, size_bytes in run.arrivals if other == flow]
+        sent = [payload(flow, packet, size_bytes) for packet, size_bytes in enumerate(sizes)]
+        received = [data for _, other, data in run.departures if other == flow]
+        newest = -1
+        for data in received:
+            # Payloads may be equal by chance, the short ones: it then is the one that helps most.
+            fresh = [packet for packet in range(newest + 1, len(sent)) if sent[packet] == data]
+            if fresh:
+                longest = max(longest, fresh[0] - newest - 1)
+                newest = fresh[0]
+        longest = max(longest, len(sent) - 1 - newest)
+    return longest
+
+
+@given(arrivals, st.data())
+def test_a_bit_that_a_datagram_does_not_have_is_not_flipped(
+    folder: Path, came: list[Arrival], data: st.DataObject
+) -> None:
+    broken = LinkSettings(impairments=(Corrupt(probability=1.0),))
+    record(folder / "fates.parquet", broken, came)
+    sizes = st.lists(st.integers(0, 40), min_size=len(came), max_size=len(came))
+    other = [
+        arrival._replace(size_bytes=size_bytes)
+        for arrival, size_bytes in zip(came, data.draw(sizes), strict=True)
+    ]
+    again = drive(Link(broken, 8, "b", decisions=fates_of(folder)), other)
+    for was, now, verdict in zip(came, other, again.verdicts, strict=True):
+        corrupted = was.size_bytes > 0 and now.size_bytes > 0
+        assert verdict.fate == (Fate.CORRUPTED if corrupted else Fate.DELIVERED)
+        assert (0 <= verdict.bit < 8 * now.size_bytes) == corrupted
+
+
+def test_what_is_not_in_the_trace_meets_the_links_own_settings(folder: Path) -> None:
+    record(folder / "fates.parquet", BAD, [Arrival(1000, 0, 8)] * 5)
+    again = drive(
+        Link(
+            LinkSettings(impairments=(LossOf(loss=WorstCase()),)), 8, "b",
+            decisions=fates_of(folder),
+        ),
+        [Arrival(1000, 0, 8)] * 8 + [Arrival(1000, 1, 8)] * 3,
+    )  # fmt: skip
+    fates = [verdict.fate for verdict in again.verdicts]
+    assert fates[5:] == [Fate.DROPPED] * 6
+    assert fates[:5] != [Fate.DROPPED] * 5

@@ -1,0 +1,86 @@
+"""A running emulator, started by its command line."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow.parquet as pq
+
+from noack.records import Fate
+
+LET_OUT = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
+
+
+class Departure(NamedTuple):
+    """A datagram, or a copy of it, that left."""
+
+    due_ns: int
+    packet: int
+    """Its number in its flow."""
+    delay_ns: int
+
+
+class Emulator:
+    """``python -m netem`` with one link, in a folder of its own.
+
+    Args:
+        folder: where its fate trace goes.
+        to: the server, HOST:PORT.
+        words: what it does, and options.
+        listen: where clients send to.
+        inside: begin of a command line that runs another, e.g. in a network namespace.
+    """
+
+    def __init__(
+        self, folder: Path, to: str, *words: str, listen: str, inside: Sequence[str] = ()
+    ) -> None:
+        self._trace = folder / "fates.parquet"
+        self._process = subprocess.Popen(
+            [
+                *inside, sys.executable, "-m", "netem", "--listen", listen, "--to", to, "--json",
+                "--record-fates", str(self._trace), *words,
+            ],
+            cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self._process.stderr is not None
+        said = self._process.stderr.readline()
+        assert "Ctrl-C ends" in said, said + self._process.communicate()[1]
+        self.host, _, port = said.removeprefix("noack netem: ").split(" → ")[0].rpartition(":")
+        self.port = int(port)
+
+    def finish(self) -> dict[str, Any]:
+        """End it; return what it says of its link."""
+        self._process.send_signal(signal.SIGINT)
+        stdout, stderr = self._process.communicate(timeout=30)
+        assert self._process.returncode == 0, stderr
+        # A program may end with something on its way to it.
+        assert all("ICMP port unreachable" in line for line in stderr.splitlines()), stderr
+        (link,) = json.loads(stdout)["links"]
+        for direction in ("forward", "back"):
+            assert not any(link[direction]["unintended"].values()), link[direction]["unintended"]
+        return dict(link)
+
+    def kill(self) -> None:
+        if self._process.poll() is None:
+            self._process.kill()
+        self._process.communicate()
+
+    def fates(self, direction: str, flow: int = 0) -> list[dict[str, Any]]:
+        """What became of each datagram of a flow, in the order of arrival."""
+        rows: list[dict[str, Any]] = pq.read_table(self._trace).to_pylist()
+        return [row for row in rows if row["direction"] == direction and row["flow"] == flow]
+
+    def departures(self, direction: str, flow: int = 0) -> list[Departure]:
+        """What left of a flow, in the order in which it was to leave."""
+        leaving = []
+        for row in self.fates(direction, flow):
+            if row["fate"] in LET_OUT:
+                for delay_ns in (row["delay_ns"], row["copy_delay_ns"]):
+                    if delay_ns >= 0:
+                        due_ns = row["arrival_ns"] + delay_ns
+                        leaving.append(Departure(due_ns, row["packet"], delay_ns))
+        return sorted(leaving, key=lambda departure: departure.due_ns)  # a stable order

@@ -1,0 +1,167 @@
+"""Client, emulator and server in three network namespaces, with addresses of their own.
+
+There is no other way from client to server: nobody forwards packets.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from noack.records import Fate
+from tests.netem.programs.conftest import Emulate
+from tests.netem.programs.emulator import LET_OUT
+
+ECHO = Path(__file__).with_name("echo.py")
+COUNT = 20
+CLIENT_PORT = 5000
+ROLES = ("client", "emulator", "server")
+
+
+class Side(NamedTuple):
+    """Addresses of one network between two namespaces, by version of IP."""
+
+    clients: Sequence[str]
+    """Of the side that sends first: two."""
+    servers: str
+
+
+OUTER = {
+    4: Side(("10.83.1.2", "10.83.1.3"), "10.83.1.1"),
+    6: Side(("fd83:1::2", "fd83:1::3"), "fd83:1::1"),
+}
+INNER = {4: Side(("10.83.2.2",), "10.83.2.1"), 6: Side(("fd83:2::2",), "fd83:2::1")}
+WIDTH = {4: 24, 6: 64}
+
+
+class Namespaces:
+    """Three namespaces in a row, joined by two pairs of devices."""
+
+    def __init__(self) -> None:
+        self._names = {role: f"noack-{os.getpid()}-{role}" for role in ROLES}
+
+    def inside(self, role: str) -> tuple[str, ...]:
+        """Begin of a command line that runs another in a namespace."""
+        return ("ip", "netns", "exec", self._names[role])
+
+    def make(self) -> None:
+        for name in self._names.values():
+            _ip("netns", "add", name)
+            _ip("-n", name, "link", "set", "lo", "up")
+        for networks, device, here, there in (
+            (OUTER, "outer", "client", "emulator"),
+            (INNER, "inner", "emulator", "server"),
+        ):
+            ends = (self._names[here], self._names[there])
+            _ip(
+                "-n", ends[0], "link", "add", device, "type", "veth",
+                "peer", "name", device, "netns", ends[1],
+            )  # fmt: skip
+            for version, side in networks.items():
+                for address in side.clients:
+                    _add_address(ends[0], device, version, address)
+                _add_address(ends[1], device, version, side.servers)
+            for end in ends:
+                _ip("-n", end, "link", "set", device, "up")
+
+    def remove(self) -> None:
+        for name in self._names.values():
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], capture_output=True, text=True, check=True)
+
+
+def _add_address(name: str, device: str, version: int, address: str) -> None:
+    at_once = ("nodad",) if version == 6 else ()
+    _ip("-n", name, "address", "add", f"{address}/{WIDTH[version]}", "dev", device, *at_once)
+
+
+@pytest.fixture(scope="module")
+def namespaces() -> Iterator[Namespaces]:
+    if shutil.which("ip") is None:
+        pytest.skip("ip (iproute2) is not installed")
+    made = Namespaces()
+    try:
+        try:
+            made.make()
+        except subprocess.CalledProcessError as error:
+            pytest.skip(f"no network namespaces here: {error.stderr.strip()}")
+        yield made
+    finally:
+        made.remove()
+
+
+def url(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+@pytest.mark.parametrize("there", [4, 6], ids=["to IPv4", "to IPv6"])
+@pytest.mark.parametrize("here", [4, 6], ids=["from IPv4", "from IPv6"])
+def test_each_client_address_is_a_flow_with_a_way_back(
+    namespaces: Namespaces, emulate: Emulate, here: int, there: int
+) -> None:
+    outer, inner = OUTER[here], INNER[there]
+    serving = subprocess.Popen(
+        [*namespaces.inside("server"), sys.executable, str(ECHO), "serve", inner.servers],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert serving.stdout is not None
+        port = int(serving.stdout.readline())
+        emulator = emulate(
+            url(inner.servers, port), "--both", "loss 30% mansd 2",
+            listen=url(outer.servers, 0), inside=namespaces.inside("emulator"),
+        )  # fmt: skip
+
+        def ask(address: str) -> list[str]:
+            done = subprocess.run(
+                [
+                    *namespaces.inside("client"), sys.executable, str(ECHO), "ask",
+                    outer.servers, str(emulator.port), address, str(CLIENT_PORT), str(COUNT),
+                ],
+                stdout=subprocess.PIPE, text=True, check=True, timeout=60,
+            )  # fmt: skip
+            return list(json.loads(done.stdout))
+
+        with ThreadPoolExecutor() as threads:
+            came = dict(zip(outer.clients, threads.map(ask, outer.clients), strict=True))
+        link = emulator.finish()
+    finally:
+        serving.kill()
+        said, _ = serving.communicate()
+    seen = [tuple(json.loads(line)) for line in said.splitlines()]
+
+    flows = {flow["client"]: flow for flow in link["forward"]["flows"]}
+    assert flows.keys() == {url(address, CLIENT_PORT) for address in outer.clients}
+    assert link["clients_ever"] == len(outer.clients)
+    ports = set()
+    for address in outer.clients:
+        flow = flows[url(address, CLIENT_PORT)]
+        assert flow["packets"] == COUNT
+        there_fates = [row["fate"] for row in emulator.fates("forward", flow["flow"])]
+        back_fates = [row["fate"] for row in emulator.fates("back", flow["flow"])]
+        passed = [f"{address} {n}" for n, fate in enumerate(there_fates) if fate in LET_OUT]
+        of_server = [one for one in seen if one[2].startswith(f"{address} ")]
+        # The server sees the emulator, at a port for each client, and what the emulator let out.
+        assert [text for _, _, text in of_server] == passed
+        sources = {(host, port) for host, port, _ in of_server}
+        assert len(sources) == 1
+        ((host, port),) = sources
+        assert host == inner.clients[0]
+        ports.add(port)
+        assert came[address] == [
+            text for text, fate in zip(passed, back_fates, strict=True) if fate in LET_OUT
+        ]
+        assert Fate.DROPPED in there_fates
+        assert flow["longest_run"] <= 2
+    assert len(ports) == len(outer.clients)
+    assert len(seen) == link["forward"]["forwarded"]

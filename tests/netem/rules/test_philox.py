@@ -1,0 +1,128 @@
+"""Known answers, and what a test of statistics can find in the use that is made of them."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import stats
+
+from netem.engine.compiled import compile_rule
+from netem.rules.philox import philox, uniforms
+
+ONES = 0xFFFFFFFF
+WORDS = st.integers(0, ONES)
+DRAWS = 200_000
+
+
+@pytest.fixture(scope="module")
+def fill() -> Any:
+    """Two uniform numbers for each row of (key0, key1, flow, packet, block), compiled."""
+
+    def rows(places: Any, out: Any) -> None:
+        for i in range(len(places)):
+            key0, key1, flow, packet, block = (
+                places[i, 0], places[i, 1], places[i, 2], places[i, 3], places[i, 4],
+            )  # fmt: skip
+            out[i, 0], out[i, 1] = uniforms(key0, key1, flow, packet, block)
+
+    return compile_rule(rows)
+
+
+def drawn(fill: Any, **places: Any) -> NDArray[np.float64]:
+    names = ("key0", "key1", "flow", "packet", "block")
+    columns = np.broadcast_arrays(*(np.asarray(places.get(name, 0), np.int64) for name in names))
+    out = np.empty((columns[0].size, 2))
+    fill(np.stack(columns, axis=-1).reshape(-1, 5), out)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("counter", "key", "answer"),
+    [
+        ((0,) * 4, (0,) * 2, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((ONES,) * 4, (ONES,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            (0xA4093822, 0x299F31D0),
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    ],
+    ids=["zeros", "ones", "digits of pi"],
+)
+def test_the_known_answers_of_random123(
+    counter: tuple[int, int, int, int], key: tuple[int, int], answer: tuple[int, ...]
+) -> None:
+    """From kat_vectors of the authors' library."""
+    assert philox(*counter, *key) == answer
+
+
+@given(WORDS, WORDS, WORDS, st.integers(0, 2**63 - 1), st.integers(0, 3))
+def test_uniform_numbers_are_the_words_of_the_counter(
+    key0: int, key1: int, flow: int, packet: int, block: int
+) -> None:
+    a, b, c, d = philox(packet & ONES, packet >> 32, flow, block, key0, key1)
+    expected = tuple(((x << 32 | y) >> 11) / 2**53 for x, y in ((a, b), (c, d)))
+    found = uniforms(key0, key1, flow, packet, block)
+    assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in found)
+    # The upper 27 bits are the first word's; the lower 26 are the upper ones of the second.
+    for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):
+        assert divmod(int(u * 2**53), 2**26) == (x >> 5, y >> 6)
+    assert np.allclose(found, expected, rtol=0, atol=2**-27)
+
+
+def test_compiled_ones_are_the_same(fill: Any) -> None:
+    rng = np.random.default_rng(1)
+    places = rng.integers(0, 2**32, (2000, 5))
+    places[:, 3] = rng.integers(0, 2**63, 2000)
+    places[:8] = [[ONES, ONES, ONES, 2**63 - 1, ONES]] * 8
+    out = np.empty((len(places), 2))
+    fill(places, out)
+    plain = [uniforms(*place) for place in places.tolist()]
+    np.testing.assert_array_equal(out, plain)
+
+
+VARIED = {
+    "packets": {"packet": np.arange(DRAWS)},
+    "late packets": {"packet": 2**32 - DRAWS // 2 + np.arange(DRAWS)},
+    "flows": {"flow": np.arange(DRAWS)},
+    "blocks": {"block": np.arange(DRAWS)},
+    "low keys": {"key0": np.arange(DRAWS)},
+    "high keys": {"key1": np.arange(DRAWS)},
+}
+
+
+@pytest.mark.parametrize("places", VARIED.values(), ids=VARIED.keys())
+def test_they_are_uniform_and_independent(fill: Any, places: dict[str, Any]) -> None:
+    """χ² over 256 cells each, over 64 × 64 of a pair and of successive ones; lags 1 to 50."""
+    pair = drawn(fill, **places)
+    for u in pair.T:
+        assert stats.chisquare(np.histogram(u, 256, (0, 1))[0]).pvalue > 1e-6
+        z = (u - 0.5) * np.sqrt(12)
+        for lag in range(1, 51):
+            assert abs(np.mean(z[lag:] * z[:-lag])) < 5.5 / np.sqrt(DRAWS - lag)
+    for one, other in ((pair[:, 0], pair[:, 1]), (pair[1:, 0], pair[:-1, 0])):
+        cells = np.histogram2d(one, other, 64, ((0, 1), (0, 1)))[0].ravel()
+        assert stats.chisquare(cells).pvalue > 1e-6
+
+
+def test_neighbours_in_every_respect_are_uncorrelated(fill: Any) -> None:
+    """All pairs of streams whose key, flow and block differ by one."""
+    packets = np.arange(20_000)
+    streams = [
+        column
+        for key0, key1, flow, block in itertools.product((0, 1), repeat=4)
+        for column in drawn(fill, packet=packets, key0=key0, key1=key1, flow=flow, block=block).T
+    ]
+    correlation = np.corrcoef(streams) - np.eye(len(streams))
+    assert np.abs(correlation).max() < 5.5 / np.sqrt(len(packets))
+
+
+def test_the_low_bits_are_fair(fill: Any) -> None:
+    numbers = (drawn(fill, packet=np.arange(DRAWS)) * 2**53).astype(np.int64)
+    for bit in range(53):
+        ones = int((numbers >> bit & 1).sum())
+        assert abs(ones - DRAWS) < 5 * np.sqrt(DRAWS / 2)

@@ -1,0 +1,142 @@
+"""Against a queue in exact fractions, by Lindley's recursion, that knows all departures."""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from math import ceil
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.program import empty_state, program_of
+from netem.rules.rate import enters, serve
+from noack.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCase
+
+NS = 10**9
+Queue = tuple[Rate, list[tuple[int, int, bool]]]
+
+rates = st.builds(
+    Rate,
+    rate_bps=st.sampled_from([1, 7, 1000, 9_600, 1_000_003, 10**9, 10**12]),
+    queue=st.integers(1, 6),
+    overhead_bytes=st.sampled_from([-40, 0, 28]),
+    cell_bytes=st.sampled_from([0, 48]),
+    cell_overhead_bytes=st.sampled_from([0, 5]),
+)
+
+
+def bits(rate: Rate, size_bytes: int) -> int:
+    line = max(size_bytes + rate.overhead_bytes, 0)
+    if rate.cell_bytes:
+        line = ceil(Fraction(line, rate.cell_bytes)) * (rate.cell_bytes + rate.cell_overhead_bytes)
+    return 8 * line
+
+
+def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[int | None]:
+    """When each leaves, cut to whole nanoseconds; None if the queue is full and it need not pass.
+
+    A forced one in a full queue shares the place of the last.
+    """
+    free = Fraction(0)
+    waiting: list[int] = []
+    found: list[int | None] = []
+    for t_ns, size_bytes, forced in arrivals:
+        waiting = [leaves for leaves in waiting if leaves > t_ns]
+        if len(waiting) == rate.queue and not forced:
+            found.append(None)
+            continue
+        # Whole nanoseconds tell whether the line is still busy.
+        begin = free if int(free) >= t_ns else Fraction(t_ns)
+        free = begin + Fraction(bits(rate, size_bytes) * NS, rate.rate_bps)
+        if len(waiting) == rate.queue:
+            waiting.pop()
+        waiting.append(int(free))
+        found.append(int(free))
+    return found
+
+
+@given(
+    rates,
+    st.lists(
+        st.tuples(st.sampled_from([0, 0, 1, 1000, 10**6, 10**9]), st.integers(0, 2000),
+                  st.booleans()),
+        max_size=40,
+    ),
+)  # fmt: skip
+def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
+    times = np.cumsum([step[0] for step in steps]).tolist()
+    arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
+    other = Rate(rate_bps=1000, queue=3)  # so that the ring does not begin at 0
+    program = program_of(LinkSettings(impairments=(other, rate)), 0, "a")
+    state = empty_state(program)
+    found: list[int | None] = []
+    for t_ns, size_bytes, forced in arrivals:
+        own = program.bottlenecks[1], state.queues[1], state.departures_ns
+        room = enters(*own, t_ns)
+        found.append(serve(*own, size_bytes) if room or forced else None)
+    assert found == departures(rate, arrivals)
+    assert state.departures_ns[:3] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("rate_bps", [9_600, 999_983, 10**9 + 7])
+def test_in_the_long_run_the_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) -> None:
+    """A line that is never idle: the k-th leaves when all bits before are through."""
+    count = 20_000
+    sizes = np.random.default_rng(3).integers(0, 1500, count)
+    rate = Rate(rate_bps=rate_bps, queue=count)
+    decided = decide([rate], count, sizes_bytes=sizes, arrivals_ns=0)
+    through = np.cumsum(8 * (sizes + 28)).tolist()
+    expected = [bits_so_far * NS // rate_bps for bits_so_far in through]
+    assert decided.verdicts["release_ns"].tolist() == expected
+
+
+def test_what_finds_the_queue_full_is_dropped(decide: Any) -> None:
+    """1 kB every ms through 4 Mbit/s: one in two has room once the queue is full."""
+    rate = Rate(rate_bps=4_000_000, queue=10, overhead_bytes=0)
+    arrivals = np.arange(10_000) * 10**6
+    decided = decide([rate], 10_000, sizes_bytes=1000, arrivals_ns=arrivals)
+    exact = departures(rate, [(t, 1000, False) for t in arrivals.tolist()])
+    np.testing.assert_array_equal(decided.fates, [4 if t is None else 0 for t in exact])
+    assert abs(np.mean(decided.fates[100:] == 4) - 0.5) < 1e-3
+    assert decided.delays_ns.max() <= 10 * 2 * 10**6
+
+
+def test_a_forced_one_has_its_turn_behind_a_full_queue(decide: Any) -> None:
+    rate = Rate(rate_bps=8_000, queue=2, overhead_bytes=0)  # 1 s each
+    settings = LinkSettings(impairments=(rate,), mansd=2)
+    decided = decide(settings, 8, sizes_bytes=1000, arrivals_ns=0)
+    assert decided.fates.tolist() == [0, 0, 4, 4, 2, 4, 4, 2]
+    leaving = decided.verdicts["release_ns"]
+    assert leaving[decided.leaves].tolist() == [k * NS for k in (1, 2, 3, 4)]
+
+
+def test_what_is_lost_before_takes_no_time_and_after_it_does(decide: Any) -> None:
+    rate = Rate(rate_bps=8_000, queue=100, overhead_bytes=0)
+    lost = LossOf(loss=WorstCase())
+    for impairments, last_s in (((lost, rate), 2), ((rate, lost), 5)):
+        settings = LinkSettings(impairments=impairments, mansd=1, first_delivered=True)
+        decided = decide(settings, 5, sizes_bytes=1000, arrivals_ns=0)
+        assert decided.fates.tolist() == [2, 1, 2, 1, 2]
+        assert decided.verdicts["release_ns"][-1] == (last_s + (impairments[0] is lost)) * NS
+
+
+def test_copies_take_their_time_unless_the_original_found_no_room(decide: Any) -> None:
+    rate = Rate(rate_bps=8_000, queue=3, overhead_bytes=0)
+    arrivals = np.array([0, 0, 0, NS, 10 * NS])
+    decided = decide([Duplicate(probability=1.0), rate], 5, sizes_bytes=1000, arrivals_ns=arrivals)
+    verdicts = decided.verdicts
+    assert verdicts["fate"].tolist() == [0, 0, 4, 0, 0]
+    assert (verdicts["release_ns"] // NS).tolist() == [1, 3, -1, 4, 11]
+    assert (verdicts["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
+
+
+def test_however_many_must_pass_they_leave_at_a_time_that_there_is(decide: Any) -> None:
+    """Centuries of work, all of which must pass, at a rate of a bit per second."""
+    slow = Rate(rate_bps=1, queue=1, cell_bytes=1, cell_overhead_bytes=1000)
+    decided = decide(LinkSettings(impairments=(slow,), mansd=0), 30, sizes_bytes=65_507)
+    assert np.all(np.diff(decided.verdicts["release_ns"]) >= 0)
+    assert decided.verdicts["release_ns"][0] == (65_507 + 28) * 1001 * 8 * NS
+    assert decided.verdicts["release_ns"][-1] == 2**61
+    assert np.all(decided.verdicts["run"] == 0)

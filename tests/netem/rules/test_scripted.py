@@ -1,0 +1,53 @@
+"""Losses that are written down, against sets."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.program import program_of
+from netem.rules.scripted import lost
+from noack.impairments import LinkSettings, Loss, LossOf, Periodic, Scripted, WorstCase
+
+
+def flags(loss: Loss, packets: Any) -> list[bool]:
+    settings = LinkSettings(impairments=(LossOf(loss=Scripted(lost=(1, 4))), LossOf(loss=loss)))
+    program = program_of(settings, 0, "a")
+    return [lost(program.scripts[1], program.integers, packet) for packet in packets]
+
+
+@given(st.sets(st.integers(0, 60)), st.integers(0, 40))
+def test_exactly_the_named_ones_are_lost(names: set[int], extra: int) -> None:
+    """Played once, and again and again."""
+    script = tuple(sorted(names))
+    assert flags(Scripted(lost=script), range(80)) == [k in names for k in range(80)]
+    every = max(names, default=0) + 1 + extra
+    again = flags(Scripted(lost=script, repeat_every=every), range(300))
+    assert again == [k % every in names for k in range(300)]
+
+
+@given(st.integers(1, 30), st.data(), st.integers(0, 50))
+def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first: int) -> None:
+    burst = data.draw(st.integers(0, period))
+    expected = {first + k * period + j for k in range(200) for j in range(burst)}
+    found = flags(Periodic(period=period, burst=burst, first=first), range(200))
+    assert found == [k in expected for k in range(200)]
+
+
+def test_great_numbers() -> None:
+    assert flags(Scripted(lost=(0, 2**40 - 1)), [0, 1, 2**40 - 2, 2**40 - 1, 2**40]) == [
+        True, False, False, True, False,
+    ]  # fmt: skip
+
+
+def test_each_flow_has_its_own_count(decide: Any) -> None:
+    flows = np.array([0, 1, 1, 0, 1, 0, 0, 1])
+    decided = decide([LossOf(loss=Scripted(lost=(0, 2)))], len(flows), flows=flows)
+    assert (decided.fates == 1).tolist() == [
+        packet in (0, 2) for packet in decided.verdicts["packet"]
+    ]
+
+
+def test_the_worst_case_loses_all_that_may_be_lost(decide: Any) -> None:
+    assert (decide([LossOf(loss=WorstCase())], 1000).fates == 1).all()

@@ -1,0 +1,92 @@
+"""Where compiled code is kept, and what happens where it cannot be."""
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from netem.code_cache import cache_folder, compiler
+
+SOURCES = [Path(__file__)]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def doubled(number: int) -> int:
+    return 2 * number
+
+
+def kept_at(function: Any) -> object:
+    return function._cache.cache_path
+
+
+def test_other_sources_have_another_folder(home: Path) -> None:
+    other = home / "other.py"
+    other.write_text("None")
+    folders = {cache_folder("netem", sources) for sources in (SOURCES, [*SOURCES, other], SOURCES)}
+    assert len(folders) == 2
+    other.write_text("pass")
+    assert cache_folder("netem", [*SOURCES, other]) not in folders
+
+
+def test_what_is_compiled_is_kept_there(home: Path) -> None:
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    assert compiler(folder)(doubled)(21) == 42
+    assert list(folder.rglob("*.doubled-*.nbi"))
+    assert home in folder.parents
+
+
+def test_what_a_power_failure_left_empty_is_compiled_anew(home: Path) -> None:
+    for suffix in ("nbi", "nbc"):
+        folder = cache_folder("netem", SOURCES)
+        assert folder is not None
+        assert compiler(folder)(doubled)(21) == 42
+        (file,) = folder.rglob(f"*.doubled-*.{suffix}")
+        file.write_bytes(b"")
+        assert compiler(cache_folder("netem", SOURCES))(doubled)(21) == 42
+        assert file.stat().st_size > 0
+
+
+def test_without_a_home_nothing_is_kept_and_nothing_fails(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (home / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "file" / "below"))
+    assert cache_folder("netem", SOURCES) is None
+    function = compiler(None)(doubled)
+    assert function(21) == 42
+    assert kept_at(function) is None  # numba has no place of its own for it, with older rules
+
+
+def test_nor_in_a_folder_of_somebody_else(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    assert cache_folder("netem", SOURCES) is not None
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    assert cache_folder("netem", SOURCES) is None
+
+
+def test_nor_on_a_full_disk_unless_it_is_there_already(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    assert cache_folder("netem", SOURCES) is None
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    assert compiler(folder)(doubled)(21) == 42
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    assert cache_folder("netem", SOURCES) == folder

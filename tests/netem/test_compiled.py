@@ -1,0 +1,217 @@
+"""The compiled rules decide as the plain ones do, bit for bit."""
+
+from collections.abc import Sequence
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from netem.engine.many import admit_many
+from netem.program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.records import Decision, Verdict, dtype_of
+from netem.rules.link import State
+from noack.impairments import (
+    Bernoulli,
+    Blackout,
+    Corrupt,
+    Delay,
+    Duplicate,
+    FourState,
+    GilbertElliott,
+    Impairment,
+    LinkSettings,
+    LossOf,
+    Periodic,
+    Rate,
+    Reorder,
+    Scripted,
+    WorstCase,
+)
+
+chances = st.floats(0, 1)
+correlations = st.just(0.0) | st.floats(0, 0.999)
+times_s = st.floats(0, 100.0)
+losses = st.one_of(
+    st.just(WorstCase()),
+    st.builds(Bernoulli, probability=chances, correlation=correlations),
+    st.builds(
+        GilbertElliott, good_to_bad=chances, bad_to_good=chances, loss_in_good=chances,
+        loss_in_bad=chances,
+    ),
+    st.builds(FourState, p13=st.floats(0, 0.5), p31=st.floats(0, 0.5), p32=st.floats(0, 0.5),
+              p23=chances, p14=st.floats(0, 0.5)),
+    st.builds(Periodic, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
+    st.sets(st.integers(0, 30)).map(lambda names: Scripted(lost=tuple(sorted(names)))),
+).map(lambda loss: LossOf(loss=loss))  # fmt: skip
+impairments: st.SearchStrategy[Impairment] = st.one_of(
+    losses,
+    st.builds(Duplicate, probability=chances, correlation=correlations),
+    st.builds(Corrupt, probability=chances, correlation=correlations),
+    st.builds(
+        Delay, delay_s=times_s, jitter_s=times_s, correlation=correlations,
+        distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
+    ),
+    st.builds(Delay, distribution=st.just("empirical"),
+              samples_s=st.lists(times_s, min_size=2, max_size=9).map(tuple)),
+    st.builds(Reorder, probability=chances, correlation=correlations, gap=st.integers(1, 4)),
+    st.builds(Rate, rate_bps=st.integers(1000, 10**10), queue=st.integers(1, 9),
+              cell_bytes=st.sampled_from([0, 48]), cell_overhead_bytes=st.just(5)),
+    st.just(Blackout(intervals_s=((0.001, 0.003), (0.004, 0.01)), every_s=0.012)),
+)  # fmt: skip
+
+
+def aware(loss: LossOf, correlation: float, of_loss: float) -> tuple[Impairment, ...]:
+    """A loss, and a delay that knows of it."""
+    return loss, Delay(
+        delay_s=0.01, jitter_s=0.01, distribution="normal", correlation=correlation,
+        loss_correlation=of_loss,
+    )  # fmt: skip
+
+
+pairs = st.builds(
+    aware,
+    losses.filter(lambda one: isinstance(one.loss, Bernoulli | GilbertElliott)),
+    correlations,
+    st.floats(-1, 1),
+)
+links = st.builds(
+    LinkSettings,
+    impairments=st.tuples(
+        st.just(()) | pairs, st.lists(impairments, max_size=5).map(tuple)
+    ).map(lambda both: both[0] + both[1]),
+    mansd=st.none() | st.integers(0, 5),
+    first_delivered=st.booleans(),
+    limit=st.sampled_from([1, 10, 10_000]),
+)  # fmt: skip
+decisions = st.builds(
+    Decision, fate=st.integers(0, 5), delay_ns=st.integers(-1, 10**7),
+    copy_delay_ns=st.just(-1) | st.integers(0, 10**7), bit=st.integers(-1, 9),
+    copy_bit=st.integers(-1, 9),
+)  # fmt: skip
+
+
+def plain(
+    of: LinkSettings, flows: Any, sizes: Any, arrivals: Any, seed: int,
+    recorded: Sequence[Sequence[Decision]] = (),
+) -> tuple[list[Verdict], State]:  # fmt: skip
+    program = program_of(of, seed, "test", decisions=recorded)
+    many = max(flows) + 1
+    state = empty_state(program)._replace(
+        flows=[new_flow(flow, of.first_delivered) for flow in range(many)],
+        memory=[new_memory(program) for _ in range(many)],
+        recent_ns=[[-1] * recent_width(program) for _ in range(many)],
+    )
+    verdicts = [Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0) for _ in flows]
+    admit_many(program, state, flows, sizes, arrivals, verdicts)
+    return verdicts, state
+
+
+def rows(records: Sequence[Any]) -> Any:
+    return np.array([astuple(one) for one in records], dtype_of(type(records[0])))
+
+
+def assert_equal(decided: Any, verdicts: Any, state: State) -> None:
+    """Verdicts, and all that is remembered."""
+    np.testing.assert_array_equal(decided.verdicts, rows(verdicts))
+    np.testing.assert_array_equal(decided.state.flows, rows(state.flows))
+    np.testing.assert_array_equal(decided.state.recent_ns, state.recent_ns)
+    np.testing.assert_array_equal(decided.state.departures_ns, state.departures_ns)
+    if state.queues:
+        np.testing.assert_array_equal(decided.state.queues, rows(state.queues))
+    for compiled_row, memories in zip(decided.state.memory, state.memory, strict=True):
+        if memories:
+            np.testing.assert_array_equal(compiled_row, rows(memories))
+    assert decided.state.counters.tolist() == astuple(state.counters)
+    assert decided.state.link.tolist() == astuple(state.link)
+
+
+@settings(max_examples=300)
+@given(
+    links,
+    st.lists(
+        st.tuples(st.integers(0, 2), st.integers(0, 1500), st.integers(0, 10**7)),
+        min_size=1, max_size=40,
+    ),
+    st.integers(0, 2**64 - 1),
+    st.lists(st.lists(decisions, max_size=8), max_size=3),
+)  # fmt: skip
+def test_any_link_decides_the_same(
+    decide: Any, of: LinkSettings, steps: Any, seed: int, recorded: Any
+) -> None:
+    flows, sizes, gaps = (list(column) for column in zip(*steps, strict=True))
+    arrivals = np.cumsum(gaps).tolist()
+    for again in ((), recorded):
+        verdicts, state = plain(of, flows, sizes, arrivals, seed, again)
+        decided = decide(
+            of, len(flows), seed=seed, flows=flows, sizes_bytes=sizes, arrivals_ns=arrivals,
+            decisions=again,
+        )  # fmt: skip
+        assert_equal(decided, verdicts, state)
+
+
+EVERYTHING = LinkSettings(
+    impairments=(
+        LossOf(loss=GilbertElliott(good_to_bad=0.1, bad_to_good=0.2, loss_in_bad=0.9)),
+        Duplicate(probability=0.1),
+        Corrupt(probability=0.1, correlation=0.5),
+        Delay(delay_s=0.005, jitter_s=0.003, distribution="paretonormal", loss_correlation=0.5),
+        Reorder(probability=0.1),
+        Rate(rate_bps=10_000_000, queue=20),
+        Blackout(intervals_s=((0.5, 0.6),), every_s=1.0),
+    ),
+    mansd=4,
+    limit=1_000_000,
+)
+
+
+def test_for_long(decide: Any) -> None:
+    """Twenty thousand datagrams of three flows, through everything at once."""
+    count = 20_000
+    rng = np.random.default_rng(5)
+    flows = rng.integers(0, 3, count)
+    sizes = rng.integers(0, 1500, count)
+    arrivals = np.cumsum(rng.integers(0, 2_000_000, count))
+    verdicts, state = plain(EVERYTHING, flows.tolist(), sizes.tolist(), arrivals.tolist(), 9)
+    decided = decide(
+        EVERYTHING, count, seed=9, flows=flows, sizes_bytes=sizes, arrivals_ns=arrivals
+    )
+    assert_equal(decided, verdicts, state)
+    assert (np.bincount(decided.fates, minlength=6) > 0).all()
+
+
+def test_a_record_is_repeated_exactly(decide: Any) -> None:
+    """What was decided, taken again at the same times, is decided again; later the rules go on."""
+    count, recorded = 20_000, 15_000
+    rng = np.random.default_rng(6)
+    arrivals = np.cumsum(rng.integers(0, 2_000_000, count))
+    first = decide(EVERYTHING, count, seed=1, arrivals_ns=arrivals)
+    past = first.verdicts[:recorded]
+    delays = np.where(past["release_ns"] >= 0, past["release_ns"] - arrivals[:recorded], -1)
+    copies = np.where(past["copy_ns"] >= 0, past["copy_ns"] - arrivals[:recorded], -1)
+    taken = [
+        Decision(*row)
+        for row in zip(
+            past["fate"].tolist(), delays.tolist(), copies.tolist(), past["bit"].tolist(),
+            past["copy_bit"].tolist(), strict=True,
+        )
+    ]  # fmt: skip
+    again = decide(EVERYTHING, count, seed=2, arrivals_ns=arrivals, decisions=[taken])
+    for field in ("fate", "packet", "run", "release_ns", "copy_ns", "bit", "copy_bit"):
+        np.testing.assert_array_equal(again.verdicts[field][:recorded], past[field])
+    assert (again.verdicts["held_ns"][:recorded] == 0).all()
+    assert (again.fates[recorded:] != first.fates[recorded:]).any()
+
+
+@pytest.mark.parametrize("mansd", [0, 2, 9])
+def test_a_million_decisions(decide: Any, longest_undelivered: Any, mansd: int) -> None:
+    count = 1_000_000
+    rng = np.random.default_rng(mansd)
+    arrivals = np.cumsum(rng.integers(0, 1_000_000, count))
+    decided = decide(
+        EVERYTHING.model_copy(update={"mansd": mansd}), count, seed=mansd, arrivals_ns=arrivals,
+        flows=rng.integers(0, 10, count), sizes_bytes=rng.integers(0, 1500, count),
+    )  # fmt: skip
+    assert longest_undelivered(decided).max() == mansd

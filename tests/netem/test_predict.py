@@ -1,0 +1,173 @@
+"""Predicted loss rates, against closed forms and a million decisions of the compiled link."""
+
+import re
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from netem.engine.compiled import compile_rule, compiled_program, compiled_state
+from netem.engine.many import admit_many
+from netem.link import Link
+from netem.predict import predict, predicted_loss
+from netem.program import empty_state, program_of, recent_width
+from netem.records import Verdict, dtype_of
+from netem.rules.mansd import NEVER_NS
+from netem.words.parser import settings_of
+from noack.impairments import LinkSettings
+from noack.records import Fate
+
+DECISIONS = 1_000_000
+BATCHES = 200
+ERRORS = 5
+"""Standard errors allowed; by chance one test in a million would fail, and the seeds are fixed."""
+
+BERNOULLI = [(p, m) for p in (0.05, 0.5, 0.97) for m in (0, 1, 4, 17)]
+
+
+def not_delivered(settings: LinkSettings, seed: int) -> NDArray[np.bool_]:
+    """Which of a million datagrams of a flow are not effectively delivered."""
+    program = program_of(settings, seed, "test")
+    state = compiled_state(program, empty_state(program), 1, recent_width(program))
+    verdicts = np.zeros(DECISIONS, dtype_of(Verdict))
+    flows = np.zeros(DECISIONS, np.int64)
+    compile_rule(admit_many)(
+        compiled_program(program), state, flows, flows + 100, np.arange(DECISIONS), verdicts
+    )
+    return ~np.isin(verdicts["fate"], (Fate.DELIVERED, Fate.FORCED))
+
+
+@pytest.mark.parametrize(("p", "m"), BERNOULLI)
+def test_independent_losses_follow_the_closed_form(p: float, m: int) -> None:
+    predicted = predicted_loss(settings_of(f"loss {100 * p}% mansd {m}"))
+    assert predicted == pytest.approx(p * (1 - p**m) / (1 - p ** (m + 1)), rel=1e-12, abs=1e-15)
+
+
+def test_losses_without_chance_are_exact() -> None:
+    for words, rate in (
+        ("", 0.0),
+        ("loss none mansd 3", 0.0),
+        ("loss worst", 1.0),
+        ("loss worst mansd 4", 4 / 5),
+        ("loss worst mansd 0", 0.0),
+        ("loss 100% mansd 4", 4 / 5),
+        ("loss 100% 50% mansd 1000000", 1_000_000 / 1_000_001),
+        ("loss periodic 2/100", 0.02),
+        ("loss periodic 100/100 mansd 3", 3 / 4),
+        ("loss periodic 7/100 from 3 mansd 2", 5 / 100),  # lost, lost, not, lost, lost, not, lost
+        ("loss script 0,1,2,7,8,9 every 10 mansd 4", 5 / 10),  # six in a row, across the end
+        ("loss script none every 10", 0.0),
+        ("loss periodic 1/2 loss periodic 1/3", 4 / 6),
+    ):
+        assert predicted_loss(settings_of(words)) == pytest.approx(rate, rel=1e-12), words
+
+
+def test_chains_that_do_not_mix_go_where_they_start() -> None:
+    for words, rate in (
+        ("loss gemodel 0% 0% 100% 10%", 0.1),  # stays good
+        ("loss gemodel 10% 0% 60% 10%", 0.6),  # ends up bad
+        ("loss gemodel 100% 100% 100% 0%", 0.5),  # alternates
+        ("loss gemodel 100% 100% 100% 0% mansd 1", 0.5),
+        ("loss gemodel 0.0001% 0.0001%", 0.5),
+        ("loss state 100% 100% 0% 100% 0%", 0.5),
+        ("loss state 0% 0% 0% 0% 100%", 0.5),  # every other is a single loss
+    ):
+        assert predicted_loss(settings_of(words)) == pytest.approx(rate, rel=1e-9), words
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss 30% mansd 2",
+        "loss gemodel 1% 10% 70% 0.1%",
+        "loss gemodel 1% 10% 70% 0.1% mansd 1",
+        "loss gemodel 5% 2% 97% 10% mansd 4",
+        "loss gemodel 5% 2% 97% 10% mansd 40",
+        "loss burst 20% 4 mansd 3",
+        "loss state 10% 20% 3% 40% 5%",
+        "loss state 10% 20% 3% 40% 5% mansd 2",
+        "loss 30% 60%",
+        "loss 30% 60% mansd 1",
+        "loss 20% 90% mansd 3",
+        "loss 85% 30% mansd 6",
+        "loss 10% loss gemodel 5% 20% mansd 2",
+        "loss burst 10% 3 loss burst 10% 5 loss 3% mansd 4",
+        "loss periodic 3/20 loss 20% mansd 3",
+        "loss script 1,2,3,4,5 every 9 loss gemodel 10% 30% mansd 5",
+        "loss worst loss 10% mansd 3",
+        "corrupt 10%",
+        "corrupt 10% 50% mansd 1",
+        "loss 20% corrupt 30% mansd 2",
+        "duplicate 50% corrupt 40% mansd 3",
+        "corrupt 40% duplicate 50%",
+        "corrupt 20% duplicate 50% corrupt 40% duplicate 30% mansd 2",
+        "duplicate 40% 60% corrupt 30%",
+        "delay 1ms 1ms loss 30% reorder 20% mansd 2 limit 1000000",
+    ],
+)
+def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
+    """The standard error is that of batch means: losses hardly correlate over 5,000 datagrams."""
+    settings = settings_of(words)
+    predicted = predicted_loss(settings)
+    assert predicted is not None
+    lost = not_delivered(settings, seed=5)
+    means = lost.reshape(BATCHES, -1).mean(axis=1)
+    error = means.std(ddof=1) / np.sqrt(BATCHES)
+    assert abs(lost.mean() - predicted) <= ERRORS * error
+    assert error < 0.02 * predicted  # so that the line above says something
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        ("loss 5% blackout 1s-2s", "what a blackout takes depends on when datagrams come"),
+        ("loss script 3,4", "a script that is played once"),
+        ("loss trace a.txt", "a.txt has not been read"),
+        ("loss 5% 99.9%", "a correlation of 0.999 is too high"),
+        ("loss 5% 90% loss 5% 90%", "together they have .* states"),
+        ("loss periodic 1/1000 loss 5%", "together they have 1000 states"),
+        ("loss periodic 1/100000000", "its pattern repeats only after 100000000 datagrams"),
+        ("loss periodic 1/9999991 loss periodic 1/2", "their pattern repeats only after"),
+    ],
+)
+def test_what_cannot_be_told_says_why(words: str, why: str) -> None:
+    prediction = predict(settings_of(words))
+    assert prediction.rate is None
+    assert re.search(why, prediction.note)
+
+
+QUEUE, OVERTAKEN = "as long as no queue overflows", "not counting what is overtaken (stale)"
+
+
+@pytest.mark.parametrize(
+    ("words", "note"),
+    [
+        ("loss 5%", ""),
+        ("loss 5% delay 10ms", ""),
+        ("loss 5% rate 1mbit", QUEUE),
+        ("delay 10ms 2ms loss 5%", OVERTAKEN),
+        ("delay 0 2ms distribution pareto mansd 1", OVERTAKEN),
+        ("delay 10ms 2ms mansd 0", ""),
+        ("delay 0 samples 1ms,2ms", OVERTAKEN),
+        ("delay 10ms reorder 5%", OVERTAKEN),
+        ("delay 10ms reorder 0%", ""),
+        ("delay 0 reorder 5%", ""),
+        ("rate 1mbit reorder 5%", f"{QUEUE}; {OVERTAKEN}"),
+        ("delay 10ms 2ms reorder 5% rate 1mbit", QUEUE),
+        ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OVERTAKEN}"),
+    ],
+)
+def test_what_is_not_counted_is_said(words: str, note: str) -> None:
+    assert predict(settings_of(words)).note == note
+    assert overtakes(settings_of(words)) == (OVERTAKEN in note)
+
+
+def overtakes(settings: LinkSettings) -> bool:
+    """Whether one of some datagrams, 10 µs apart, leaves before one that came before it."""
+    link = Link(settings, 1, "test")
+    leaves_ns = []
+    for packet in range(2000):
+        release_ns = link.decide(0, 100, 10_000 * packet).release_ns
+        if release_ns != NEVER_NS:
+            leaves_ns.append(release_ns)
+    return leaves_ns != sorted(leaves_ns)

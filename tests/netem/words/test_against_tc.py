@@ -1,0 +1,258 @@
+"""The same words, read here and by ``tc`` itself."""
+
+import pytest
+from hypothesis import given
+from hypothesis import settings as example_settings
+from hypothesis import strategies as st
+
+from netem.words.parser import settings_of
+from netem.words.tc import tc_command
+from noack import impairments as imp
+from noack.errors import CallerError
+from tests.netem import any_settings
+from tests.netem.words.tc_request import Request, Tc
+
+pytestmark = pytest.mark.skipif(not Tc.available(), reason="needs tc and gcc")
+
+SHARE = 1 / 2**31
+"""tc counts probabilities in 2³² steps."""
+TIME_S = 1.1e-6
+"""tc counts whole microseconds."""
+ETHERNET_BYTES = 42
+
+
+@pytest.fixture(scope="module")
+def tc(tmp_path_factory: pytest.TempPathFactory) -> Tc:
+    return Tc(tmp_path_factory.mktemp("tc"))
+
+
+def assert_the_same(settings: imp.LinkSettings, request: Request | None, overhead: int) -> None:
+    assert request is not None
+    kinds = {one.kind: one for one in settings.impairments}
+    assert len(kinds) == len(settings.impairments)
+    assert request.limit == settings.limit
+
+    delay = kinds.get("delay", imp.Delay())
+    assert isinstance(delay, imp.Delay)
+    assert request.delay_s == pytest.approx(delay.delay_s, abs=TIME_S)
+    assert request.jitter_s == pytest.approx(delay.jitter_s, abs=TIME_S)
+    assert request.delay_correlation == pytest.approx(delay.correlation, abs=SHARE)
+
+    loss = kinds.get("loss", imp.LossOf(loss=imp.Lossless()))
+    assert isinstance(loss, imp.LossOf)
+    assert_the_same_loss(loss.loss, request)
+
+    duplicate = kinds.get("duplicate", imp.Duplicate(probability=0))
+    assert isinstance(duplicate, imp.Duplicate)
+    assert request.duplicate == pytest.approx(duplicate.probability, abs=SHARE)
+    for kind, found in (("corrupt", request.corrupt), ("reorder", request.reorder)):
+        chance = kinds.get(kind, imp.Corrupt(probability=0))
+        assert isinstance(chance, imp.Corrupt | imp.Reorder)
+        assert found == pytest.approx((chance.probability, chance.correlation), abs=SHARE)
+        if isinstance(chance, imp.Reorder):
+            assert request.gap == chance.gap
+
+    rate = kinds.get("rate")
+    if isinstance(rate, imp.Rate):
+        assert request.rate is not None
+        bytes_per_s, *numbers = request.rate
+        assert bytes_per_s == min(rate.rate_bps // 8, 2**32 - 1)
+        assert numbers == [
+            rate.overhead_bytes - overhead, rate.cell_bytes, rate.cell_overhead_bytes
+        ]  # fmt: skip
+
+
+def assert_the_same_loss(loss: imp.Loss, request: Request) -> None:
+    if isinstance(loss, imp.Bernoulli):
+        found = (request.loss, request.loss_correlation)
+        assert found == pytest.approx((loss.probability, loss.correlation), abs=SHARE)
+    elif isinstance(loss, imp.GilbertElliott):
+        p, r = loss.transitions
+        expected = (p, r, 1 - loss.loss_in_bad, loss.loss_in_good)
+        assert request.gemodel == pytest.approx(expected, abs=SHARE)
+    elif isinstance(loss, imp.FourState):
+        order = (loss.p13, loss.p31, loss.p32, loss.p14, loss.p23)
+        assert request.state == pytest.approx(order, abs=SHARE)
+    else:
+        assert isinstance(loss, imp.Lossless)
+        assert (request.loss, request.gemodel, request.state) == (0, None, None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "delay 100", "delay 1500us", "delay 10ms", "delay 0.5s", "delay 2sec", "delay 7MSECS",
+        "latency 10ms 2ms", "delay 100ms 20ms 25%", "delay 1.5ms 300", "loss 5", "loss 5%",
+        "loss 0.3%", "loss 0.3% 25%", "loss random 1e1%", "drop 7% 50",
+        "loss state 10%", "loss state 10% 20%", "loss state 10% 20% 3%", "loss state 1 2 3 4",
+        "loss state 10% 20% 3% 40% 5%", "loss gemodel 1%", "loss gemodel 1% 10%",
+        "loss gemodel 1% 10% 70%", "loss gemodel 1% 10% 70% 0.1%", "duplicate 1%", "dup 3",
+        "corrupt 0.1%", "corrupt 0.1% 10%", "delay 10ms reorder 25% 50%",
+        "delay 10ms reorder 25% 50% gap 5", "delay 10ms reorder 25%", "rate 1mbit 0",
+        "rate 5kbit 20 100 5", "rate 100kbps 0", "rate 1Mibit -14", "rate 80 0", "rate 1.5MBps 4",
+        "limit 50 delay 1ms", "loss 1% delay 10ms 1ms duplicate 2% rate 1gbit 0 limit 77",
+    ],
+)  # fmt: skip
+def test_words_of_tc_say_here_what_they_say_there(tc: Tc, words: str) -> None:
+    # tc holds at most 1000 datagrams unless told otherwise.
+    limited = words if "limit" in words else f"{words} limit 1000"
+    assert_the_same(settings_of(limited), tc.request(words), overhead=0)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss 101%", "loss x", "loss", "loss gemodle 1%", "loss gemodel x", "delay", "delay 10mm",
+        "delay x", "reorder 25%", "delay 1ms gap", "rate 1mb", "rate", "rate 10%", "lsos 5%",
+        "duplicate 5%%", "corrupt", "limit", "delay 10ms distribution", "help",
+    ],
+)  # fmt: skip
+def test_what_tc_refuses_is_refused_here(tc: Tc, words: str) -> None:
+    assert tc.request(words) is None
+    with pytest.raises(CallerError):
+        settings_of(words)
+
+
+@pytest.mark.parametrize("words", ["slot 800us", "loss 5% ecn"])
+def test_what_tc_takes_and_this_emulator_cannot_do_is_refused(tc: Tc, words: str) -> None:
+    assert tc.request(words) is not None
+    with pytest.raises(CallerError, match="this emulator"):
+        settings_of(words)
+
+
+times_s = st.floats(3e-6, 200)
+"""From tc's smallest to its largest, of 32 bits."""
+tcs_losses = st.one_of(
+    st.just(imp.Lossless()),
+    st.builds(
+        imp.Bernoulli,
+        probability=any_settings.probabilities,
+        correlation=any_settings.correlations,
+    ),
+    any_settings.gilbert_elliott,
+    any_settings.four_states(),
+)
+tcs_delays = st.builds(
+    imp.Delay,
+    delay_s=times_s,
+    jitter_s=times_s,
+    correlation=any_settings.correlations,
+    distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
+)
+tcs_reorders = st.builds(
+    imp.Reorder,
+    probability=st.floats(1e-6, 1),
+    correlation=any_settings.correlations,
+    gap=st.integers(1, 2**32 - 1),
+)
+
+
+@st.composite
+def tcs_settings(draw: st.DrawFn) -> imp.LinkSettings:
+    """What tc can do; a reorder after a delay, everything else anywhere."""
+    chance = {"probability": any_settings.probabilities}
+    chain: list[imp.Impairment] = draw(
+        st.lists(
+            st.one_of(
+                st.builds(imp.LossOf, loss=tcs_losses),
+                st.builds(imp.Duplicate, **chance),
+                st.builds(imp.Corrupt, **chance, correlation=any_settings.correlations),
+                any_settings.rates,
+            ),
+            unique_by=lambda one: one.kind,
+        )
+    )
+    if draw(st.booleans()):
+        place = draw(st.integers(0, len(chain)))
+        chain.insert(place, draw(tcs_delays))
+        if draw(st.booleans()):
+            chain.insert(draw(st.integers(place + 1, len(chain))), draw(tcs_reorders))
+    return imp.LinkSettings(impairments=tuple(chain), limit=draw(st.integers(1, 1_000_000)))
+
+
+@example_settings(max_examples=200)
+@given(settings=tcs_settings())
+def test_tc_understands_the_command_that_it_is_given(tc: Tc, settings: imp.LinkSettings) -> None:
+    command = tc_command(settings)
+    assert command.words is not None
+    assert command.lacks == ()
+    assert_the_same(settings, tc.request(command.words), ETHERNET_BYTES)
+
+
+CAP = "mansd 4 (a cap on successive losses)"
+FIRST = "first (that the first datagram of each flow is delivered)"
+NUMBERS = "losses by the datagrams' numbers"
+
+
+@pytest.mark.parametrize(
+    ("words", "remains", "lacks"),
+    [
+        ("loss 5% mansd 4", "loss random 5%", [CAP]),
+        ("mansd 4 first", "", [CAP, FIRST]),
+        ("loss 5% loss 6% delay 1ms", "loss random 5% delay 1ms", ["loss 6% (a second loss)"]),
+        ("loss worst loss 5%", "loss random 5%", ["loss worst (a worst case)"]),
+        ("delay 1ms loss periodic 1/2", "delay 1ms", [f"loss periodic 1/2 ({NUMBERS})"]),
+        ("delay 1ms loss trace x", "delay 1ms", [f"loss trace x ({NUMBERS})"]),
+        ("delay 1ms blackout 1s-2s", "delay 1ms", ["blackout 1s-2s (blackouts)"]),
+        ("loss 5% delay 1ms 1ms lossrel 50%", "loss random 5% delay 1ms 1ms",
+         ["lossrel 50% (a delay correlated with loss)"]),
+        ("loss 5% delay 0 1ms distribution normal", "loss random 5%",
+         ["delay 0s 1ms distribution normal (a distribution without a delay and a jitter)"]),
+        ("loss 5% delay 0 samples 1ms,2ms reorder 5%", "loss random 5%",
+         ["delay 0s samples 1ms,2ms (such a table of delays)",
+          "reorder 5% (reordering without a delay before it)"]),
+        ("rate 1mbit reorder 5%", "rate 1mbit -14",
+         ["reorder 5% (reordering without a delay before it)"]),
+        (f"loss script {','.join(map(str, range(50)))} delay 1ms", "delay 1ms",
+         [f"loss script 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,1... ({NUMBERS})"]),
+    ],
+)  # fmt: skip
+def test_what_tc_lacks_is_left_out_and_named(
+    tc: Tc, words: str, remains: str, lacks: list[str]
+) -> None:
+    command = tc_command(settings_of(words))
+    assert command.words == f"limit 16384 {remains}".rstrip()
+    assert list(command.lacks) == lacks
+    assert tc.request(command.words) is not None
+
+
+@pytest.mark.parametrize("words", ["loss worst", "loss periodic 1/2 mansd 4", "blackout 1s-2s"])
+def test_where_nothing_remains_there_is_no_command(words: str) -> None:
+    command = tc_command(settings_of(words))
+    assert command.words is None
+    assert command.lacks
+
+
+@example_settings(max_examples=200)
+@given(settings=any_settings.settings)
+def test_nothing_is_left_out_in_silence(settings: imp.LinkSettings) -> None:
+    command = tc_command(settings)
+    wanted = [one for one in settings.impairments if one != imp.LossOf(loss=imp.Lossless())]
+    kept = 0
+    if command.words is not None:
+        kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")
+        kept = sum(command.words.split().count(kind) for kind in kinds)
+    left_out = [
+        lack for lack in command.lacks if not lack.startswith(("lossrel", "mansd", "first"))
+    ]
+    assert kept + len(left_out) == len(wanted)
+    assert (command.words is None) == (kept == 0 < len(wanted))
+
+
+@pytest.mark.parametrize(
+    ("words", "notes"),
+    [
+        ("loss 5% delay 1ms", ()),
+        ("loss none loss 5%", ()),
+        ("loss 5% 10%", ("its correlation changes the probability, or the spread, of what it is "
+                         "given",)),
+        ("delay 1ms 1ms distribution pareto",
+         ("its table of the Pareto distribution ends at four times the jitter",)),
+        ("rate 1mbit",
+         ("its queue is the limit; its overhead is for an Ethernet device, with IPv4",)),
+        ("delay 1ms loss 5%",
+         ("its order is fixed: duplicate, loss, corrupt, delay, reorder, rate",)),
+    ],
+)  # fmt: skip
+def test_what_tc_does_differently_is_said(words: str, notes: tuple[str, ...]) -> None:
+    assert tc_command(settings_of(words)).notes == notes

@@ -1,0 +1,171 @@
+"""Files with several links."""
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import tomli_w
+from hypothesis import given
+
+from netem.engine.api import LinkSpec
+from netem.words.links import LinksFile, json_schema, load_links
+from netem.words.parser import settings_of
+from netem.words.text import text_of
+from noack import toml_file
+from noack.errors import CallerError
+from noack.impairments import Delay, LinkSettings, LossOf, Scripted
+from tests.netem.any_settings import settings, words_can_say
+
+ROOT = Path(__file__).parents[3]
+
+TWO = """
+[[link]]
+name = "uplink"
+listen = "127.0.0.1:9000"
+to = "127.0.0.1:9001"
+words = "delay 10ms loss 5% mansd 4"
+seed = 7
+
+[[link]]
+name = "video"
+listen = "[::1]:0"
+to = ":9003"
+return_path = false
+idle_s = 5
+most_clients = 10
+forward.impairments = [
+    { kind = "loss", loss = { model = "gilbert_elliott", mean_loss = 0.05, mean_burst = 3 } },
+    { kind = "delay", delay_s = 0.02 },
+]
+back = "loss trace lost.txt"
+"""
+
+
+def load(text: str, folder: Path) -> tuple[LinkSpec, ...]:
+    (folder / "lost.txt").write_text("010")
+    path = folder / "links.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_links(path)
+
+
+def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
+    uplink, video = load(TWO, tmp_path)
+    assert uplink == LinkSpec(
+        name="uplink",
+        listen=("127.0.0.1", 9000),
+        to=("127.0.0.1", 9001),
+        forward=settings_of("delay 10ms loss 5% mansd 4"),
+        back=LinkSettings(),
+        seed=7,
+    )
+    assert video == LinkSpec(
+        name="video",
+        listen=("::1", 0),
+        to=("::1", 9003),
+        forward=settings_of("loss burst 5% 3 delay 20ms"),
+        back=LinkSettings(impairments=(LossOf(loss=Scripted(lost=(1,), repeat_every=3)),)),
+        return_path=False,
+        idle_s=5.0,
+        most_clients=10,
+    )
+
+
+@given(settings)
+def test_all_settings_can_be_written_as_a_table_or_in_words(settings: LinkSettings) -> None:
+    table = settings.model_dump(mode="json", exclude_none=True)
+    link: dict[str, Any] = LINK | {"forward": table}
+    links = toml_file.validated(LinksFile, tomllib.loads(tomli_w.dumps({"link": [link]})), "here")
+    assert links.link[0].forward == settings
+    if words_can_say(settings):
+        link["forward"] = text_of(settings)
+        links = toml_file.validated(LinksFile, {"link": [link]}, "here")
+        assert links.link[0].forward == settings
+
+
+LINK = {"name": "a", "listen": ":9000", "to": ":9001"}
+
+
+@pytest.mark.parametrize(
+    ("link", "line"),
+    [
+        ({"words": "delay 10ms losss 5%"}, 'words = "delay 10ms losss 5%": losss: no such word; '
+         "did you mean loss?"),
+        ({"words": "seed 3"}, 'words = "seed 3": seed 3: belongs to the link, not to one of its '),
+        ({"words": "", "forward": ""}, 'words = "": is short for forward; give one of them'),
+        ({"words": 3}, "words = 3: should be a table"),
+        ({"back": {"mandsd": 3}}, "back.mandsd = 3: unknown key; did you mean mansd?"),
+        ({"back": {"impairments": [{"kind": "dely"}]}}, 'back.impairments.0.kind = "dely": must be '
+         "one of loss, duplicate, corrupt, delay, reorder, rate, blackout; did you mean delay?"),
+        ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
+          "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "
+         "or equal to 1"),
+        ({"forward": {"impairments": [{"kind": "delay", "loss_correlation": 0.5}]}},
+         "forward.impairments.0.loss_correlation = 0.5: needs a loss before it, by model "),
+        ({"forward": "loss trace nothing.txt"}, 'forward.impairments.0.loss.file = "nothing.txt": '
+         "cannot be read: No such file or directory"),
+        ({"listn": ":1"}, 'listn = ":1": unknown key; did you mean listen?'),
+        ({"name": "a b"}, 'name = "a b": use letters, digits, _ and -'),
+        ({"listen": "9000"}, "listen: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or "
+         ":9000; found '9000'"),
+        ({"to": "::1:9000"}, "to: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; "
+         "found '::1:9000'; an IPv6 address stands in brackets"),
+        ({"to": ":70000"}, "to: expected HOST:PORT"),
+        ({"to": "no such.host.invalid:1"}, "to: no such.host.invalid: no such host ("),
+        ({"idle_s": 0}, "idle_s = 0: should be greater than 0"),
+        ({"seed": -1}, "seed = -1: should be greater than or equal to 0"),
+    ],
+)  # fmt: skip
+def test_a_mistake_gets_one_line(link: dict[str, Any], line: str, tmp_path: Path) -> None:
+    with pytest.raises(CallerError) as caught:
+        load(tomli_w.dumps({"link": [LINK | link]}), tmp_path)
+    told = str(caught.value)
+    assert told.startswith(f"{tmp_path}/links.toml: link.0.{line}"), told
+    assert "\n" not in told
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ({}, r"link: missing \(the links, \[\[link\]\] each\)"),
+        ({"link": []}, r"link = \[\]: needs at least one entry"),
+        ({"links": [LINK], "link": [LINK]}, "links = .*: unknown key; did you mean link?"),
+        ({"link": LINK}, "link = .*: should be a list"),
+        ({"link": [LINK, LINK]}, 'link.1.name = "a": another link has this name already'),
+        ({"link": [LINK, LINK | {"name": "b"}]}, 'link.1.listen = ":9000": link a listens '),
+    ],
+)  # fmt: skip
+def test_a_mistake_among_links_gets_one_line(
+    content: dict[str, Any], line: str, tmp_path: Path
+) -> None:
+    with pytest.raises(CallerError) as caught:
+        load(tomli_w.dumps(content), tmp_path)
+    assert re.match(f"{tmp_path}/links.toml: {line}", str(caught.value)), caught.value
+    assert "\n" not in str(caught.value)
+
+
+def test_the_published_schema_is_the_codes() -> None:
+    """``noack schema --netem > docs/netem.schema.json`` brings it up to date."""
+    published = json.loads((ROOT / "docs/netem.schema.json").read_text(encoding="utf-8"))
+    assert published == json_schema()
+
+
+def test_the_schema_takes_what_the_code_takes() -> None:
+    jsonschema.Draft202012Validator.check_schema(json_schema())
+    validator = jsonschema.Draft202012Validator(json_schema())
+    assert [error.message for error in validator.iter_errors(tomllib.loads(TWO))] == []
+    for wrong in ({}, {"link": []}, {"link": [LINK | {"back": 3}]}, {"link": [LINK | {"x": 3}]}):
+        assert not validator.is_valid(wrong)
+
+
+def test_a_file_of_delays_is_read_from_beside_the_links(tmp_path: Path) -> None:
+    (tmp_path / "delays.txt").write_text("1ms\n3ms\n")
+    (link,) = load(
+        tomli_w.dumps({"link": [LINK | {"words": "delay 5ms distribution delays.txt"}]}), tmp_path
+    )
+    assert link.forward.impairments == (
+        Delay(delay_s=0.005, distribution="empirical", samples_s=(0.001, 0.003)),
+    )

@@ -1,0 +1,59 @@
+"""What words are said to mean."""
+
+import re
+
+import numpy as np
+import pytest
+
+from netem.link import Link
+from netem.words.meaning import meaning_of, settings_meaning
+from netem.words.parser import settings_of
+
+DRAWS = 20_000
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "delay 10ms 20ms",
+        "delay 10ms 50ms 30%",
+        "delay 0 1ms",
+        "delay 5ms 5ms distribution normal",
+        "delay 1ms 10ms distribution pareto",
+        "delay 1ms 2ms distribution paretonormal",
+        "delay 0 samples -5ms,-1ms,3ms",
+    ],
+)
+def test_a_delay_that_is_cut_at_zero_says_how_often(words: str) -> None:
+    settings = settings_of(words)
+    (delay,) = settings.impairments
+    said = re.search(r"what would be below 0 is 0 \((.*)% of the draws\)", meaning_of(delay))
+    assert said is not None
+    share = float(said[1]) / 100
+    # Each flow has its own draw, so that they are independent under a correlation, too.
+    link = Link(settings, 3, "test")
+    cut = np.mean([link.decide(flow, 1, 0).release_ns == 0 for flow in range(DRAWS)])
+    error = np.sqrt(share * (1 - share) / DRAWS)
+    assert cut == pytest.approx(share, abs=5 * error + 0.05 * share)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "delay 10ms",
+        "delay 10ms 10ms",
+        "delay 40ms 10ms distribution normal",
+        "delay 6ms 10ms distribution pareto",
+        "delay 5ms samples -5ms,3ms",
+    ],
+)
+def test_a_delay_that_is_hardly_cut_says_nothing_of_it(words: str) -> None:
+    (delay,) = settings_of(words).impairments
+    assert "below 0" not in meaning_of(delay)
+
+
+def test_the_first_datagram_is_no_cap() -> None:
+    (first,) = settings_meaning(settings_of("loss 5% first"))
+    assert first[0] == "first"
+    ((word, cap),) = settings_meaning(settings_of("loss 5% mansd 3"))
+    assert (word, cap.partition(":")[0]) == ("mansd 3", "the cap")

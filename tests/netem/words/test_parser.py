@@ -1,0 +1,303 @@
+"""Words in the syntax of tc, and back."""
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from netem.words.parser import parse, settings_of
+from netem.words.quantities import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percent_text, time_text
+from netem.words.text import text_of
+from noack.errors import CallerError
+from noack.impairments import (
+    Bernoulli,
+    Blackout,
+    Corrupt,
+    Delay,
+    Duplicate,
+    FourState,
+    GilbertElliott,
+    Impairment,
+    LinkSettings,
+    Loss,
+    Lossless,
+    LossOf,
+    Periodic,
+    Rate,
+    Reorder,
+    Scripted,
+    Trace,
+    WorstCase,
+)
+from tests.netem.any_settings import settings, words_can_say
+
+
+def loss(model: Loss) -> tuple[Impairment, ...]:
+    return (LossOf(loss=model),)
+
+
+@pytest.mark.parametrize(
+    ("words", "impairments"),
+    [
+        # The manual page of tc-netem, and what it says of what is left out.
+        ("loss 5%", loss(Bernoulli(probability=0.05))),
+        ("loss 5", loss(Bernoulli(probability=0.05))),
+        ("loss 0.3% 25%", loss(Bernoulli(probability=0.003, correlation=0.25))),
+        ("loss random 5%", loss(Bernoulli(probability=0.05))),
+        ("drop 5%", loss(Bernoulli(probability=0.05))),
+        ("loss state 10%", loss(FourState(p13=0.1, p31=0.9))),
+        ("loss state 10% 20%", loss(FourState(p13=0.1, p31=0.2))),
+        ("loss state 10% 20% 3%", loss(FourState(p13=0.1, p31=0.2, p32=0.03))),
+        (
+            "loss state 10% 20% 3% 40% 5%",
+            loss(FourState(p13=0.1, p31=0.2, p32=0.03, p23=0.4, p14=0.05)),
+        ),
+        ("loss gemodel 1%", loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.99))),
+        ("loss gemodel 1% 10%", loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.1))),
+        (
+            "loss gemodel 1% 10% 70%",
+            loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.1, loss_in_bad=0.7)),
+        ),
+        (
+            "loss gemodel 1% 10% 70% 0.1%",
+            loss(
+                GilbertElliott(
+                    good_to_bad=0.01, bad_to_good=0.1, loss_in_bad=0.7, loss_in_good=0.001
+                )
+            ),
+        ),
+        ("delay 10ms", (Delay(delay_s=0.01),)),
+        ("latency 10ms", (Delay(delay_s=0.01),)),
+        ("delay 100 10", (Delay(delay_s=1e-4, jitter_s=1e-5),)),
+        ("delay 100ms 20ms 25%", (Delay(delay_s=0.1, jitter_s=0.02, correlation=0.25),)),
+        (
+            "delay 10ms 2ms distribution normal",
+            (Delay(delay_s=0.01, jitter_s=0.002, distribution="normal"),),
+        ),
+        (
+            "delay 10ms distribution paths/observed.txt",
+            (Delay(delay_s=0.01, distribution="empirical", file="paths/observed.txt"),),
+        ),
+        ("duplicate 1%", (Duplicate(probability=0.01),)),
+        ("corrupt 0.1% 10%", (Corrupt(probability=0.001, correlation=0.1),)),
+        (
+            "delay 10ms reorder 25% 50%",
+            (Delay(delay_s=0.01), Reorder(probability=0.25, correlation=0.5)),
+        ),
+        (
+            "delay 10ms reorder 25% gap 5",
+            (Delay(delay_s=0.01), Reorder(probability=0.25, gap=5)),
+        ),
+        ("delay 10ms gap 5", (Delay(delay_s=0.01), Reorder(gap=5))),
+        ("rate 1mbit", (Rate(rate_bps=1_000_000),)),
+        (
+            "rate 5kbit 20 100 5",
+            (Rate(rate_bps=5000, overhead_bytes=20, cell_bytes=100, cell_overhead_bytes=5),),
+        ),
+        ("rate 1mbit -14", (Rate(rate_bps=1_000_000, overhead_bytes=-14),)),
+        # What tc has no words for.
+        ("loss none", loss(Lossless())),
+        ("loss burst 5% 2.5", loss(GilbertElliott(mean_loss=0.05, mean_burst=2.5))),
+        ("loss periodic 2/100", loss(Periodic(period=100, burst=2))),
+        ("loss periodic 2/100 from 7", loss(Periodic(period=100, burst=2, first=7))),
+        ("loss trace a.txt", loss(Trace(file="a.txt"))),
+        ("loss trace 'a file.txt' once", loss(Trace(file="a file.txt", repeat=False))),
+        ("loss script 3,4,17", loss(Scripted(lost=(3, 4, 17)))),
+        ("loss script 3,4 every 20", loss(Scripted(lost=(3, 4), repeat_every=20))),
+        ("loss script none", loss(Scripted(lost=()))),
+        ("loss worst", loss(WorstCase())),
+        ("rate 1mbit queue 20", (Rate(rate_bps=1_000_000, queue=20),)),
+        ("blackout 2s-3s", (Blackout(intervals_s=((2.0, 3.0),)),)),
+        (
+            "blackout 0-10ms,1s-1.5s every 2s",
+            (Blackout(intervals_s=((0.0, 0.01), (1.0, 1.5)), every_s=2.0),),
+        ),
+        (
+            "delay 1ms samples -0.5ms,0,2ms",
+            (Delay(delay_s=1e-3, distribution="empirical", samples_s=(-5e-4, 0.0, 2e-3)),),
+        ),
+        (
+            "loss 5% delay 10ms 1ms lossrel 80%",
+            (
+                LossOf(loss=Bernoulli(probability=0.05)),
+                Delay(delay_s=0.01, jitter_s=1e-3, loss_correlation=0.8),
+            ),
+        ),
+        # Words may be shortened as long as it is clear which is meant.
+        ("dup 1% lo 5%", (Duplicate(probability=0.01), LossOf(loss=Bernoulli(probability=0.05)))),
+    ],
+)
+def test_what_words_say(words: str, impairments: tuple[Impairment, ...]) -> None:
+    said = parse(words)
+    assert said.settings == LinkSettings(impairments=impairments)
+    assert said.seed is None
+    assert parse(text_of(*said)) == said
+
+
+def test_settings_stand_anywhere_and_impairments_in_their_order() -> None:
+    words = "mansd 4 delay 10ms limit 50 loss 5% seed 7 delay 1ms first"
+    settings, seed = parse(words)
+    assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
+    assert [one.kind for one in settings.impairments] == ["delay", "loss", "delay"]
+    assert text_of(settings, seed) == "delay 10ms loss 5% delay 1ms mansd 4 first limit 50 seed 7"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "loss trace 'my file' mansd 4",
+        ["loss", "trace", "my file", "mansd", "4"],
+        ["loss trace 'my file'", "mansd 4"],
+        ["loss trace", "my file", "mansd 4"],
+    ],
+)
+def test_words_may_be_joined(words: str | list[str]) -> None:
+    assert settings_of(words) == LinkSettings(impairments=loss(Trace(file="my file")), mansd=4)
+
+
+@given(settings, st.none() | st.integers(0, 2**64 - 1))
+def test_all_settings_survive_being_written_and_read(
+    settings: LinkSettings, seed: int | None
+) -> None:
+    assume(words_can_say(settings))  # what is refused is below
+    text = text_of(settings, seed)
+    assert parse(text) == (settings, seed)
+    assert "'" in text or parse(text.split()) == (settings, seed)
+
+
+@given(st.floats(-3600, 3600))
+def test_a_time_is_written_so_that_it_is_read_back(time_s: float) -> None:
+    assert OWN_TIME_S.read(time_text(time_s)) == time_s
+
+
+@given(st.floats(0, 1))
+def test_a_percentage_is_written_so_that_it_is_read_back(share: float) -> None:
+    assert PERCENT.read(percent_text(share)) == share
+
+
+@pytest.mark.parametrize(
+    ("text", "time_s"),
+    [
+        ("1", 1e-6), ("1.5", 1.5e-6), ("1s", 1.0), ("1sec", 1.0), ("2secs", 2.0), ("1MS", 1e-3),
+        ("3msec", 3e-3), ("3msecs", 3e-3), ("3us", 3e-6), ("3usec", 3e-6), ("3usecs", 3e-6),
+        ("3ns", 3e-9), ("3nsecs", 3e-9), (".5ms", 5e-4), ("1e1ms", 1e-2), ("0", 0.0),
+    ],
+)  # fmt: skip
+def test_times_are_read_as_tc_reads_them(text: str, time_s: float) -> None:
+    assert TIME_S.read(text) == time_s
+
+
+@pytest.mark.parametrize(
+    ("text", "rate_bps"),
+    [
+        ("8", 8), ("8bit", 8), ("1kbit", 1000), ("1Kbit", 1000), ("1kibit", 1024),
+        ("1mbit", 10**6), ("1mibit", 2**20), ("1gbit", 10**9), ("1gibit", 2**30), ("1tbit", 10**12),
+        ("1bps", 8), ("1kbps", 8000), ("1KiBps", 8192), ("1mbps", 8 * 10**6), ("1.5mbit", 1500000),
+        ("1gbps", 8 * 10**9),
+    ],
+)  # fmt: skip
+def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
+    assert RATE_BPS.read(text) == rate_bps
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ("lsos 5%", "lsos: no such word; did you mean loss?"),
+        ("jitter 5ms", "jitter: no such word; expected one of loss, delay, "),
+        ("d 5ms", "d: may be delay or drop or duplicate"),
+        ("loss gemodle 1%", "loss gemodle: no such word; did you mean gemodel?"),
+        ("loss", "loss: expected after it: a percentage, e.g. 5%, or one of random, state,"),
+        ("loss 5 %", "%: no such word; expected one of"),
+        ("loss 101%", "loss 101%: expected a percentage from 0% to 100%, e.g. 5%"),
+        ("loss -1%", "loss -1%: no such word; expected one of"),
+        ("loss nan%", "loss nan%: no such word; did you mean none?"),
+        ("loss 5% 100%", "loss 5% 100%: expected a correlation from 0% to below 100%, e.g. 25%"),
+        ("loss random", "loss random: expected after it: a percentage from 0% to 100%"),
+        ("loss state 90% 20% 81%", "loss state 90% 20% 81%: p31: p31 + p32 must not exceed 1"),
+        ("loss burst 90% 2", "loss burst 90% 2: mean_burst: so much loss needs longer bursts"),
+        ("loss periodic 2", "loss periodic 2: expected losses per datagrams, e.g. 2/100"),
+        ("loss periodic 3/2", "loss periodic 3/2: burst: must not exceed the period, 2"),
+        ("loss script 3,2", "loss script 3,2: lost: the numbers must ascend"),
+        ("loss script 3,x", "loss script 3,x: expected the numbers of the lost datagrams"),
+        ("loss trace", "loss trace: expected after it: a file of zeros and ones"),
+        ("delay", "delay: expected after it: a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 10mm", "delay 10mm: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay -1ms", "delay -1ms: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 2h", "delay 2h: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 4000s", "delay 4000s: delay_s should be less than or equal to 3600"),
+        ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 1e99999999999999999999ms", "ms: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 1ms distribution", "expected after it: one of uniform, normal, pareto, paretono"),
+        ("delay 1ms distribution normal", "distribution normal: says nothing without jitter"),
+        ("delay 1ms 1ms dist normal dist pareto", "dist: this delay has one already"),
+        ("delay 1ms lossrel 5%", "lossrel: needs a loss before it"),
+        ("delay 1ms loss 5% lossrel 5%", "lossrel: goes right after delay TIME"),
+        ("delay 1ms samples 1,2", "delay 1ms samples 1,2: expected delays with their units"),
+        ("delay 1ms samples 1ms", "samples 1ms: samples_s should have at least 2 items"),
+        ("delay 1ms reorder", "reorder: expected after it: a percentage"),
+        ("reorder 25%", "reorder 25%: nothing before it delays a datagram; it goes after delay"),
+        (
+            "delay 1ms gap 5 reorder 25%",
+            "reorder 25%: there is a reorder, or a gap, before it; wri",
+        ),
+        ("delay 1ms reorder 25% gap x", "gap x: expected a whole number, e.g. 5"),
+        ("rate 1mb", "rate 1mb: expected a rate in bit, kbit, mbit, gbit, kbps (bytes!)"),
+        ("rate 0", "rate 0: rate_bps should be greater than or equal to 1"),
+        ("rate 10%", "rate 10%: expected a rate in bit"),
+        ("rate 1mbit 0 48 -5", "rate 1mbit 0 48 -5: cell_overhead_bytes should be greater than"),
+        ("rate 1mbit queue 0", "rate 1mbit queue 0: queue should be greater than or equal to 1"),
+        ("queue 5", "queue: goes right after rate RATE"),
+        ("blackout 2-3", "blackout 2-3: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("blackout 2s", "blackout 2s: expected intervals of time, e.g. 2s-3s,5s-5500ms"),
+        ("blackout 3s-2s", "blackout 3s-2s: intervals_s: each must end after it begins"),
+        ("blackout 1s-3s every 2s", "every_s: the intervals last longer, until 3 s"),
+        ("mansd", "mansd: expected after it: a whole number, e.g. 5"),
+        ("mansd -1", "mansd -1: expected a whole number, e.g. 5"),
+        ("mansd 1000001", "mansd 1000001: mansd should be less than or equal to 1000000"),
+        ("mansd 4 mansd 4", "mansd: given twice"),
+        ("seed 18446744073709551616", "seed 18446744073709551616: should be less than 1844674"),
+        ("limit 0", "limit 0: limit should be greater than or equal to 1"),
+        ("slot 800us", "slot: this emulator does not gather datagrams into slots"),
+        ("loss 5% ecn", "loss 5% ecn: this emulator cannot mark datagrams"),
+        ("loss 5% delay 1ms ecn", "ecn: this emulator cannot mark datagrams"),
+        ("loss trace 'a", "loss trace 'a: a quotation is not closed"),
+    ],
+)
+def test_a_mistake_gets_one_line_that_names_the_word(words: str, says: str) -> None:
+    with pytest.raises(CallerError) as caught:
+        parse(words)
+    line = str(caught.value)
+    assert says in line
+    assert "\n" not in line
+
+
+def test_a_direction_has_no_seed_of_its_own() -> None:
+    with pytest.raises(CallerError, match="seed 7: belongs to the link"):
+        settings_of("loss 5% seed 7")
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_read_or_refused_in_one_line(text: str) -> None:
+    with suppress(CallerError):
+        said = parse(text)
+        assert parse(text_of(*said)) == said
+
+
+_TOKENS = st.sampled_from(
+    [
+        "loss", "delay", "gemodel", "state", "burst", "normal", "distribution", "reorder", "gap",
+        "rate", "queue", "blackout", "5%", "10ms", "2", "1mbit", "1s-2s", "every", "mansd", "first",
+        "limit", "seed", "once", "from", "trace", "samples", "-", "'",
+    ]
+)  # fmt: skip
+
+
+@given(st.lists(_TOKENS, max_size=8))
+def test_any_words_are_read_or_refused(words: list[str]) -> None:
+    try:
+        said = parse(words)
+    except CallerError:
+        return
+    assert parse(text_of(*said)) == said

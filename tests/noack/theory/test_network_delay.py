@@ -1,0 +1,44 @@
+"""What the network's delays mean for the conditions that certificates presuppose."""
+
+from typing import Any
+
+import pytest
+
+from noack.impairments import Delay, LinkSettings, Rate
+from noack.resolve import resolve
+from noack.scenario_file import validate
+from noack.theory.assumptions import assumptions
+from noack.theory.schedule import nominal_conditions
+
+
+@pytest.mark.parametrize(
+    ("impairments", "longest_s", "bounded"),
+    [
+        ((), 0.0, True),
+        ((Delay(delay_s=0.01, jitter_s=0.002),), 0.012, True),
+        ((Delay(delay_s=0.01), Delay(delay_s=0.02)), 0.03, True),
+        ((Delay(delay_s=0.01, jitter_s=0.002, distribution="normal"),), 0.018, False),
+        ((Delay(distribution="empirical", samples_s=(0.001, 0.005)),), 0.005, True),
+        ((Rate(rate_bps=1_200_000, queue=10),), 0.1, False),
+    ],
+)
+def test_the_longest_delay(impairments: tuple[Any, ...], longest_s: float, bounded: bool) -> None:
+    settings = LinkSettings(impairments=impairments)
+    assert settings.longest_delay_s == pytest.approx(longest_s, rel=1e-12)
+    assert settings.delay_is_bounded is bounded
+
+
+@pytest.mark.parametrize("late_periods", [0, 2])
+def test_updates_are_felt_later_by_the_networks_delay(
+    content: dict[str, Any], late_periods: int
+) -> None:
+    at_once = nominal_conditions(resolve(validate(content, "here")), late_periods)
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02, "jitter_s": 0.01}]
+    resolved = resolve(validate(content, "here"))
+    delayed = nominal_conditions(resolved, late_periods)
+    step_s, tick_s = resolved.plant_period_ns * 1e-9, resolved.controller_period_ns * 1e-9
+    assert delayed.delay_s - at_once.delay_s == pytest.approx(0.03, abs=step_s + tick_s)
+    assert delayed.delay_s >= 0.03 + late_periods * step_s
+    # The input's way does not lead through this network.
+    assert delayed.hold_s == at_once.hold_s
+    assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))
