@@ -1,10 +1,26 @@
-"""All benchmarks, one table each: ``python -m benchmarks [--json FILE] [--install]``."""
+"""Benchmarks, one table each: ``python -m benchmarks [NAME ...] [--json FILE] [--install]``."""
 
 import sys
 
-from benchmarks import demo_run, latency, lateness, machines, simulation, startup
+from benchmarks import (
+    batch,
+    demo_run,
+    latency,
+    lateness,
+    machines,
+    relay_delay,
+    relay_flows,
+    relay_soak,
+    relays,
+    simulation,
+    startup,
+)
 from benchmarks._report import run
 
+MODULES = (
+    demo_run, latency, lateness, startup, machines, simulation, batch,
+    relays, relay_delay, relay_flows, relay_soak,
+)  # fmt: skip
+
 if __name__ == "__main__":
-    modules = (demo_run, latency, lateness, startup, machines, simulation)
-    sys.exit(run([module.BENCHMARK for module in modules]))
+    sys.exit(run([module.BENCHMARK for module in MODULES]))

@@ -68,6 +68,8 @@ class Row:
         goal: what the ratio to the peer has to satisfy; without a peer, the value itself.
         note: anything a reader has to know.
         unjudged: why the goal cannot be judged although there is a figure.
+        paired_ratio: median over rounds of the ratio to the peer within a round, where both were
+            measured in alternating rounds; it takes the place of the ratio of the two figures.
     """
 
     name: str
@@ -77,10 +79,13 @@ class Row:
     goal: Goal | None = None
     note: str | None = None
     unjudged: str | None = None
+    paired_ratio: float | None = None
 
     @property
     def ratio(self) -> float | None:
         """Our value per the peer's."""
+        if self.paired_ratio is not None:
+            return self.paired_ratio
         if self.value is None or self.peer is None or not self.peer.value:
             return None
         return self.value / self.peer.value
@@ -204,7 +209,9 @@ def table_of(title: str, rows: Sequence[Row]) -> Table:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if abs(value) >= 1e4 else f"{value:.4g}"
 
 
 def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
@@ -213,9 +220,16 @@ def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None)
         description="Measure " + ", ".join(benchmark.title for benchmark in benchmarks) + "."
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
+    names = [benchmark.name for benchmark in benchmarks]
+    if len(benchmarks) > 1:
+        parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}")
     for benchmark in benchmarks:
         benchmark.add_arguments(parser)
     options = parser.parse_args(arguments)
+    chosen = getattr(options, "names", ()) or names
+    if unknown := [name for name in chosen if name not in names]:
+        parser.error(f"no benchmark is called {unknown[0]!r}; there are {', '.join(names)}")
+    benchmarks = [benchmark for benchmark in benchmarks if benchmark.name in chosen]
     console = Console()
     if not console.is_terminal:
         console.width = _TABLE_WIDTH

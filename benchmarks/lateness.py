@@ -45,16 +45,25 @@ class Kernel(NamedTuple):
     max_us: float
 
 
-def cyclictest() -> Kernel | str:
-    """Lateness in a round of cyclictest, or why there is none."""
+def cyclictest(
+    seconds: int = ROUND_S, priority: int = FIFO_PRIORITY, core: int | None = None
+) -> Kernel | str:
+    """Lateness in a round of cyclictest, or why there is none.
+
+    Args:
+        seconds: how long the round takes.
+        priority: SCHED_FIFO priority.
+        core: where it runs; None leaves that to the system.
+    """
     program = shutil.which("cyclictest")
     if program is None:
         return "cyclictest is not installed (Debian: apt-get install rt-tests)"
     with tempfile.TemporaryDirectory() as folder:
         found = Path(folder) / "cyclictest.json"
         command = [
-            program, "-m", "-q", "-p", str(FIFO_PRIORITY), "-i", str(PERIOD_US),
-            "-D", str(ROUND_S), "-h", str(_HISTOGRAM_US), f"--json={found}",
+            program, "-m", "-q", "-p", str(priority), "-i", str(PERIOD_US),
+            "-D", str(seconds), "-h", str(_HISTOGRAM_US), f"--json={found}",
+            *(() if core is None else ("-a", str(core))),
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0 or not found.is_file():

@@ -13,7 +13,10 @@ from benchmarks._ticks import LOOPS, Ticks
 from benchmarks.latency import Sample
 from benchmarks.lateness import Kernel
 
-NAMES = ("demo_run", "latency", "lateness", "startup", "machines", "simulation")
+NAMES = (
+    "demo_run", "latency", "lateness", "startup", "machines", "simulation", "batch",
+    "relays", "relay_delay", "relay_flows", "relay_soak",
+)  # fmt: skip
 KERNEL = Kernel(12.0, 20.0, 60.0)
 ROOT = Path(__file__).parents[2]
 

@@ -140,3 +140,29 @@ def test_options_of_a_benchmark_reach_it(capsys: pytest.CaptureFixture[str]) -> 
     run([Benchmark("example", "An example", measure, declare)], ["--install"])
     assert seen == [True]
     assert capsys.readouterr().out
+
+
+def test_benchmarks_are_chosen_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    done: list[str] = []
+
+    def named(name: str) -> Benchmark:
+        def measure(options: argparse.Namespace) -> list[Row]:
+            done.append(name)
+            return []
+
+        return Benchmark(name, name, measure)
+
+    benchmarks = [named("a"), named("b"), named("c")]
+    assert run(benchmarks, ["c", "a"]) == 0
+    assert done == ["a", "c"]
+    assert run(benchmarks, []) == 0
+    assert done == ["a", "c", "a", "b", "c"]
+    with pytest.raises(SystemExit):
+        run(benchmarks, ["d"])
+    assert "no benchmark is called 'd'; there are a, b, c" in capsys.readouterr().err
+
+
+def test_a_ratio_of_rounds_takes_the_place_of_the_ratio_of_the_figures() -> None:
+    row = Row("rate", 3.0, "/s", Peer("b", 8.0), Goal(">=", 0.5), paired_ratio=0.5)
+    assert row.ratio == 0.5
+    assert row.holds is True

@@ -1,0 +1,229 @@
+"""The load of the relay benchmarks: ``load.c``, built with ``cc`` and called through ctypes.
+
+The calling process is sender and sink of every relay. Arrivals carry the kernel's receive stamps,
+so that they do not depend on when the sink is read.
+"""
+
+import ctypes
+import os
+import shutil
+import socket
+import struct
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks._report import MeasurementError
+
+DATAGRAM_BYTES = 72
+LOOPBACK = "127.0.0.1"
+_SO_RCVBUFFORCE = 33
+_SO_TIMESTAMPNS = 35
+_SINK_BUFFER_BYTES = 64 * 1024 * 1024
+_KERNEL_BYTES = 1024
+"""More than a small datagram takes in a receive buffer."""
+_PATIENCE_NS = 300_000_000
+"""After so long without an arrival the rest of a burst is taken for lost."""
+_PING_TIMEOUT_S = 0.2
+
+_INT, _LONG, _AT = ctypes.c_int, ctypes.c_int64, ctypes.c_void_p
+_SIGNATURES = {
+    "load_burst": (_INT, _INT, _INT, _LONG, _LONG, _LONG, _AT, _LONG, _LONG, _LONG, _AT),
+    "load_direct": (_INT, _INT, _LONG, _LONG, _LONG, _LONG, _AT, _AT),
+    "load_ping": (_INT, _INT, _LONG, _LONG, _LONG, _AT),
+    "load_pace": (_INT, _LONG, _LONG, _LONG, _LONG, _AT),
+    "load_collect": (_INT, _LONG, _LONG, _LONG, _AT),
+    "load_soak": (_INT, _INT, _LONG, _LONG, _LONG, _LONG, _AT),
+}
+
+Nanoseconds = npt.NDArray[np.int64]
+
+
+class Burst(NamedTuple):
+    """What became of a burst."""
+
+    wall_s: float
+    """From the relay's going on to the last arrival."""
+    decided: int
+    """Datagrams up to the last one that arrived: so many the relay has taken in and decided."""
+    received: int
+    """Datagrams that arrived."""
+
+
+class _Burst(ctypes.Structure):
+    _fields_ = (
+        ("wall_ns", ctypes.c_int64),
+        ("last", ctypes.c_int64),
+        ("received", ctypes.c_int64),
+    )
+
+    def result(self) -> Burst:
+        return Burst(self.wall_ns * 1e-9, self.last + 1, self.received)
+
+
+class Soak(ctypes.Structure):
+    """Counts of a steady load, carried from one call to the next."""
+
+    _fields_ = (
+        ("sent", ctypes.c_int64),
+        ("received", ctypes.c_int64),
+        ("next", ctypes.c_int64),
+        ("longest_gap", ctypes.c_int64),
+        ("disordered", ctypes.c_int64),
+    )
+    sent: int
+    received: int
+    next: int
+    """The number that would follow without a loss."""
+    longest_gap: int
+    """Most successive datagrams that did not arrive."""
+    disordered: int
+    """Arrivals behind a later one."""
+
+
+class Built(NamedTuple):
+    """What was compiled for a benchmark."""
+
+    load: ctypes.CDLL
+    relay: Path
+
+
+@contextmanager
+def built() -> Iterator[Built]:
+    """Compile the load and the C relay, for as long as the context lasts.
+
+    Raises:
+        MeasurementError: there is no C compiler, or it fails.
+    """
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise MeasurementError("the load is written in C and cc is not installed")
+    here = Path(__file__).parent
+    with tempfile.TemporaryDirectory(prefix="noack-bench-") as folder:
+        load, relay = Path(folder) / "load.so", Path(folder) / "relay"
+        for target, options in ((load, ("-shared", "-fPIC")), (relay, ())):
+            source = here / f"{target.stem}.c"
+            command = [compiler, "-O2", *options, "-o", str(target), str(source)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                raise MeasurementError(f"cc {source.name}: {done.stderr.strip()[:200]}")
+        library = ctypes.CDLL(str(load))
+        for name, types in _SIGNATURES.items():
+            getattr(library, name).argtypes = types
+        yield Built(library, relay)
+
+
+def sources(count: int) -> npt.NDArray[np.uint32]:
+    """``count`` loopback addresses (127.1.0.0 and on) as the C side takes them: network order."""
+    return (np.uint32(0x7F010000) + np.arange(count, dtype=np.uint32)).astype(">u4").view(np.uint32)
+
+
+class Ends:
+    """Both ends of a path through a relay: a sender connected to it, and the sink behind it.
+
+    Datagrams are numbered from 0 on over all that is sent.
+
+    Args:
+        load: the compiled load.
+    """
+
+    def __init__(self, load: ctypes.CDLL) -> None:
+        self._load = load
+        self.sent = 0
+        self.sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sink.bind((LOOPBACK, 0))
+        try:
+            self.sink.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _SINK_BUFFER_BYTES)
+        except PermissionError:
+            self.sink.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SINK_BUFFER_BYTES)
+        buffer_bytes = self.sink.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        self.sink_holds = buffer_bytes // _KERNEL_BYTES
+        """So many datagrams can wait at the sink."""
+        self.sink.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        timeout = struct.pack("@ll", 0, round(_PING_TIMEOUT_S * 1e6))
+        self.sink.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
+        self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    @property
+    def sink_port(self) -> int:
+        """Where the relay sends to, on loopback."""
+        return int(self.sink.getsockname()[1])
+
+    def connect(self, port: int) -> None:
+        """Send to this port of loopback from now on."""
+        self.out.connect((LOOPBACK, port))
+
+    def close(self) -> None:
+        """Close both sockets."""
+        self.out.close()
+        self.sink.close()
+
+    def burst(
+        self,
+        relay: int,
+        count: int,
+        slack: int = 0,
+        addresses: npt.NDArray[np.uint32] | None = None,
+    ) -> Burst:
+        """Stop the relay, fill its receive buffer, let it go on, and see it empty the buffer.
+
+        Args:
+            relay: process id of the relay, a child of this process.
+            count: datagrams to send.
+            slack: the burst may be over although so many of the last datagrams have not come.
+            addresses: send from these in turn, see :func:`sources`.
+        """
+        found = _Burst()
+        senders = (None, 0) if addresses is None else (addresses.ctypes.data, len(addresses))
+        first = self._first(count)
+        self._call(
+            "burst", self.sink.fileno(), relay, first, count, DATAGRAM_BYTES, *senders,
+            slack, _PATIENCE_NS, ctypes.byref(found),
+        )  # fmt: skip
+        return found.result()
+
+    def direct(self, count: int) -> tuple[Burst, float]:
+        """Send straight to the sink; also the CPU seconds that it took."""
+        found, cpu_ns = _Burst(), ctypes.c_int64()
+        self._call(
+            "direct", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES, _PATIENCE_NS,
+            ctypes.byref(found), ctypes.byref(cpu_ns),
+        )  # fmt: skip
+        return found.result(), cpu_ns.value * 1e-9
+
+    def ping(self, count: int) -> Nanoseconds:
+        """One-way delays of datagrams sent one by one, ns; -1 for what did not come."""
+        delays_ns = np.empty(count, np.int64)
+        first = self._first(count)
+        out = delays_ns.ctypes.data
+        self._call("ping", self.sink.fileno(), first, count, DATAGRAM_BYTES, out)
+        return delays_ns
+
+    def pace(self, count: int, period_ns: int) -> Nanoseconds:
+        """One-way delays of datagrams sent every ``period_ns``, ns; -1 for what did not come."""
+        departures_ns, arrivals_ns = np.empty(count, np.int64), np.full(count, -1, np.int64)
+        first = self._first(count)
+        self._call("pace", first, count, DATAGRAM_BYTES, period_ns, departures_ns.ctypes.data)
+        sink, out = self.sink.fileno(), arrivals_ns.ctypes.data
+        self._load.load_collect(sink, first, count, _PATIENCE_NS, out)
+        return np.where(arrivals_ns < 0, -1, arrivals_ns - departures_ns)
+
+    def soak(self, state: Soak, groups: int, group: int, period_ns: int) -> None:
+        """Send ``groups`` groups of ``group`` datagrams, one group every ``period_ns``."""
+        sink = self.sink.fileno()
+        self._call("soak", sink, groups, group, DATAGRAM_BYTES, period_ns, ctypes.byref(state))
+
+    def _first(self, count: int) -> int:
+        first, self.sent = self.sent, self.sent + count
+        return first
+
+    def _call(self, function: str, *arguments: object) -> None:
+        number = getattr(self._load, f"load_{function}")(self.out.fileno(), *arguments)
+        if number != 0:
+            raise MeasurementError(f"{function}: {os.strerror(number)}")

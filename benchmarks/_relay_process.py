@@ -1,0 +1,247 @@
+"""The relays of the benchmarks, ours and the peers, as processes that a load can be put on."""
+
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks._relay_cores import RELAY_CORE, on_core
+from benchmarks._relay_load import LOOPBACK, Built, Burst, Ends
+from benchmarks._relay_ours import READY, Ours, Totals, command_of, totals_of
+from benchmarks._report import MeasurementError
+
+Figures = TypeVar("Figures")
+
+BURST = 8000
+"""Datagrams in a burst, where the relay's receive buffer holds as many."""
+_PROBE = 20_000
+_LOSSY_SLACK = 16
+"""Successive datagrams that a relay that loses 5 % does not lose in a benchmark's time."""
+_READY_S = 120.0
+"""Longest wait for a relay; ours may have to compile its engine first."""
+_END_S = 30.0
+_PORT = re.compile(r"^(\d+)$")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of relay.
+
+    Args:
+        name: as in the tables.
+        command: from the sink's port and a free port to listen on, its command line.
+        says: where it says on which port it listens, and how; None if on the free one.
+        lossy: whether it may lose datagrams.
+    """
+
+    name: str
+    command: Callable[[int, int], list[str]]
+    says: tuple[str, re.Pattern[str]] | None = ("stdout", _PORT)
+    lossy: bool = False
+
+
+def c_relay(built: Built, *, segment: bool = False) -> Kind:
+    """``relay.c``."""
+    name, words = ("C relay, segments", ["segment"]) if segment else ("C relay", [])
+    return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
+
+
+def socat(*, connected: bool = False) -> Kind | str:
+    """Socat one way, without a connected socket or with one; or why there is none."""
+    program = shutil.which("socat")
+    if program is None:
+        return "socat is not installed (Debian: apt-get install socat)"
+    name, sends = ("socat, connected", "CONNECT") if connected else ("socat", "SENDTO")
+    return Kind(
+        name,
+        lambda to, port: [
+            program, "-u", "-b", "2048", f"UDP4-RECV:{port},rcvbuf=4194304",
+            f"UDP4-{sends}:{LOOPBACK}:{to}",
+        ],
+        says=None,
+    )  # fmt: skip
+
+
+def asyncio_relay(delay_ms: float = 0.0) -> Kind:
+    """The relay of :mod:`benchmarks._relay_asyncio`."""
+    command = [sys.executable, "-m", "benchmarks._relay_asyncio", "--delay-ms", str(delay_ms)]
+    return Kind("asyncio relay", lambda to, _: [*command, str(to)])
+
+
+def our_relay(name: str, ours: Ours, *, lossy: bool = True) -> Kind:
+    """``python -m netem``."""
+    return Kind(name, lambda to, _: command_of(ours, to), ("stderr", READY), lossy)
+
+
+class Sample(NamedTuple):
+    """What a burst cost a relay."""
+
+    per_s: float
+    """Datagrams taken in and decided per second of wall time."""
+    cpu_us: float
+    """CPU time of the relay per datagram taken in."""
+
+
+def sample_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> Sample:
+    """Rate and cost of a burst that came through.
+
+    Raises:
+        MeasurementError: more is missing than the relay can have dropped.
+    """
+    if burst.decided < sent - slack or (slack == 0 and burst.received != sent):
+        raise MeasurementError(f"{name}: of a burst of {sent} only {burst.received} arrived")
+    return Sample(burst.decided / burst.wall_s, cpu_s / sent * 1e6)
+
+
+class Relay:
+    """A running relay with its ends."""
+
+    def __init__(self, kind: Kind, process: subprocess.Popen[str], ends: Ends) -> None:
+        self.name = kind.name
+        self.ends = ends
+        self.pid = process.pid
+        self._process = process
+        self._slack = _LOSSY_SLACK if kind.lossy else 0
+        self._burst = 0
+
+    def cpu_s(self) -> float:
+        """CPU time of all its threads so far, the kernel's work for it included."""
+        return self._scheduled_s(0)
+
+    def waited_s(self) -> float:
+        """Time for which its threads could have worked so far, but others had their core."""
+        return self._scheduled_s(1)
+
+    def _scheduled_s(self, field: int) -> float:
+        tasks = Path(f"/proc/{self.pid}/task").glob("*/schedstat")
+        return sum(int(task.read_text().split()[field]) for task in tasks) * 1e-9
+
+    def burst(self, addresses: npt.NDArray[np.uint32] | None = None) -> Sample:
+        """Let it work off one burst; the first time also find out how many its buffer holds.
+
+        Args:
+            addresses: send from these in turn; None for one sender.
+        """
+        if not self._burst:
+            held = self.ends.burst(self.pid, _PROBE, addresses=addresses).decided
+            self._burst = min(BURST, held * 9 // 10)
+            if not self._burst:
+                raise MeasurementError(f"{self.name} forwards nothing")
+        before_s = self.cpu_s()
+        found = self.ends.burst(self.pid, self._burst, self._slack, addresses)
+        return sample_of(self.name, found, self._burst, self._slack, self.cpu_s() - before_s)
+
+    def totals(self) -> Totals:
+        """End our relay as Ctrl-C does; what it counted."""
+        self._process.send_signal(signal.SIGINT)
+        try:
+            stdout, _ = self._process.communicate(timeout=_END_S)
+        except subprocess.TimeoutExpired:
+            raise MeasurementError(f"{self.name} does not end") from None
+        return totals_of(stdout)
+
+
+@contextmanager
+def running(kind: Kind, built: Built) -> Iterator[Relay]:
+    """Run a relay on its core, between two ends.
+
+    Raises:
+        MeasurementError: it does not begin to listen.
+    """
+    ends = Ends(built.load)
+    chosen = _free_port()
+    with on_core(RELAY_CORE):
+        process = subprocess.Popen(
+            kind.command(ends.sink_port, chosen),
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+    try:
+        ends.connect(_listening_on(kind, process, chosen))
+        yield Relay(kind, process, ends)
+    finally:
+        process.kill()
+        process.communicate()
+        ends.close()
+
+
+def start_all(
+    kinds: Mapping[str, Kind | str], built: Built, stack: ExitStack
+) -> tuple[list[Relay], dict[str, str]]:
+    """Run relays until the stack ends; return them, and by name why others do not run.
+
+    Args:
+        kinds: by name a kind of relay, or why there is none.
+        built: the compiled load.
+        stack: ends the relays.
+    """
+    relays: list[Relay] = []
+    missing: dict[str, str] = {}
+    for name, kind in kinds.items():
+        if isinstance(kind, str):
+            missing[name] = kind
+            continue
+        try:
+            relays.append(stack.enter_context(running(kind, built)))
+        except MeasurementError as error:
+            missing[name] = str(error)
+    return relays, missing
+
+
+def in_turn(
+    relays: list[Relay],
+    missing: dict[str, str],
+    rounds: dict[str, list[Figures]],
+    measure: Callable[[Relay], Figures],
+) -> None:
+    """Measure a round of each relay. What fails is said in ``missing`` and measured no more."""
+    for relay in list(relays):
+        try:
+            rounds.setdefault(relay.name, []).append(measure(relay))
+        except MeasurementError as error:
+            missing[relay.name] = str(error)
+            relays.remove(relay)
+
+
+def _listening_on(kind: Kind, process: subprocess.Popen[str], chosen: int) -> int:
+    deadline = threading.Timer(_READY_S, process.kill)
+    deadline.start()
+    try:
+        if kind.says is None:
+            while process.poll() is None:
+                if _is_bound(chosen):
+                    return chosen
+                time.sleep(0.01)
+        else:
+            stream, port = kind.says
+            said: IO[str] = getattr(process, stream)
+            for line in said:
+                if (found := port.search(line)) is not None:
+                    return int(found[1])
+    finally:
+        deadline.cancel()
+    _, stderr = process.communicate()
+    why = (stderr.strip() or "nothing").splitlines()[-1]
+    raise MeasurementError(f"{kind.name} does not begin to listen, said {why!r}")
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _is_bound(port: int) -> bool:
+    lines = Path("/proc/net/udp").read_text().splitlines()[1:]
+    return any(int(line.split()[1].rpartition(":")[2], 16) == port for line in lines)

@@ -1,0 +1,229 @@
+"""The batch engine against what a user would write, in runs per second on one core.
+
+Three sides take the same draws of the lane example, with the same packet fates: the engine; scipy's
+integrator with an event function, at rtol 1e-8; and numpy loops with exact steps of 1 ms. The
+engine also measures each run (cost, settling time, supremum of the error); the others only find the
+events.
+"""
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal
+
+# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from cosim.batch.api import Population, Setting, run_batch, run_events, setting_of
+from cosim.cli import find_scenario
+from cosim.exact.fates import network_fates
+from noack.linear import Vector
+from noack.resolve import loop_of, resolve
+from noack.scenario import Scenario, Seeds
+from noack.scenario_file import load
+
+Mode = Literal["model", "zoh"]
+Method = Literal["RK45", "DOP853"]
+METHODS: tuple[Method, ...] = ("RK45", "DOP853")
+"""Of the integrator: its own choice, and its best at this accuracy, which few users choose."""
+
+ROUNDS = 5
+DRAWS = 200
+"""Different plants and losses; a batch repeats them."""
+_REPEATED = {"model": 40, "zoh": 8}
+_INTEGRATED = {"model": 20, "zoh": 3}
+"""Runs of the integrator in a round."""
+_STEP_S = 1e-3
+_FATES = 1000
+_AGREEMENT_S = 1e-4
+"""What the integrator's errors of 1e-8 add up to over hundreds of events."""
+_GOALS = {"model": 20_000.0, "zoh": 3_000.0}
+
+
+def drawn(mode: Mode) -> tuple[Setting, Population, NDArray[np.bool_]]:
+    """The draws, and the fates of their first updates."""
+    scenario = load(find_scenario("lane_following"), ()).model_copy(update={"mode": mode})
+
+    def draw(i: int) -> Scenario:
+        return resolve(scenario.model_copy(update={"seeds": Seeds(plant=i, loss=i)}))
+
+    resolved = [draw(i) for i in range(DRAWS)]
+    loops = [loop_of(one) for one in resolved]
+    population = Population(
+        np.array([loop.A for loop in loops]),
+        np.array([loop.B for loop in loops]),
+        np.array([loop.x0 for loop in loops]),
+        np.arange(DRAWS, dtype=np.uint64),
+    )
+    fates = [[fate(k) for k in range(_FATES)] for fate in map(network_fates, resolved)]
+    return setting_of(resolved[0]), population, np.array(fates)
+
+
+def integrated(
+    setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: Method
+) -> list[float]:
+    """Event times by ``solve_ivp``: plant and both models, from one crossing to the next."""
+    A, B, x = draw.A[0], draw.B[0], draw.x0[0]
+    n, trigger = len(x), setting.trigger
+    field = np.zeros((3 * n, 3 * n))
+    field[:n, :n], field[:n, 2 * n :] = A, B @ setting.K
+    field[n : 2 * n, n : 2 * n] = field[2 * n :, 2 * n :] = setting.H
+
+    def excess(t_s: float, z: Vector) -> float:
+        error = float(np.linalg.norm(z[n : 2 * n] - z[:n]))
+        return error - trigger.beta * float(np.exp(-trigger.alpha_per_s * t_s))
+
+    excess.terminal, excess.direction = True, 1.0  # type: ignore[attr-defined]
+    t_s, z, found = 0.0, np.concatenate([x, x, x]), [0.0]
+    while True:
+        solution = solve_ivp(
+            lambda _, z: field @ z, (t_s, setting.horizon_s), z,
+            method=method, events=excess, rtol=1e-8, atol=1e-10,
+        )  # fmt: skip
+        if not len(solution.t_events[0]):
+            return found
+        t_s, z = float(solution.t_events[0][0]), solution.y_events[0][0].copy()
+        z[n : 2 * n] = z[:n]
+        if delivered[len(found)]:
+            z[2 * n :] = z[:n]
+        found.append(t_s)
+
+
+def stepped(
+    setting: Setting,
+    transitions: NDArray[np.float64],
+    x0: NDArray[np.float64],
+    fates: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """Events of k runs at once by steps of 1 ms, each exact; the trigger is looked at after each.
+
+    Args:
+        setting: what they share.
+        transitions: of one step, (k, 3n, 3n).
+        x0: (k, n).
+        fates: of each run's updates, (k, most).
+    """
+    n, trigger = x0.shape[1], setting.trigger
+    steps = round(setting.horizon_s / _STEP_S)
+    squares = (trigger.beta * np.exp(-trigger.alpha_per_s * _STEP_S * np.arange(steps + 1))) ** 2
+    z, events = np.concatenate([x0, x0, x0], axis=1), np.ones(len(x0), np.int64)
+    for step in range(1, steps + 1):
+        z = np.matmul(transitions, z[:, :, None])[:, :, 0]
+        error = z[:, n : 2 * n] - z[:, :n]
+        for i in np.flatnonzero(np.einsum("ki,ki->k", error, error) > squares[step]):
+            z[i, n : 2 * n] = z[i, :n]
+            if fates[i, events[i]]:
+                z[i, 2 * n :] = z[i, :n]
+            events[i] += 1
+    return events
+
+
+def stepped_alone(
+    setting: Setting, transition: NDArray[np.float64], x0: Vector, fates: NDArray[np.bool_]
+) -> int:
+    """The same for one run, as it is usually written."""
+    n, trigger = len(x0), setting.trigger
+    z, events = np.concatenate([x0, x0, x0]), 1
+    for step in range(1, round(setting.horizon_s / _STEP_S) + 1):
+        z = transition @ z
+        error = z[n : 2 * n] - z[:n]
+        threshold = trigger.beta * math.exp(-trigger.alpha_per_s * step * _STEP_S)
+        if error @ error > threshold * threshold:
+            z[n : 2 * n] = z[:n]
+            if fates[events]:
+                z[2 * n :] = z[:n]
+            events += 1
+    return events
+
+
+def transition(setting: Setting, draw: Population) -> NDArray[np.float64]:
+    """The matrix of one step of 1 ms of plant and both models."""
+    n = len(setting.H)
+    field = np.zeros((3 * n, 3 * n))
+    field[:n, :n], field[:n, 2 * n :] = draw.A[0], draw.B[0] @ setting.K
+    field[n : 2 * n, n : 2 * n] = field[2 * n :, 2 * n :] = setting.H
+    return np.ascontiguousarray(expm(field * _STEP_S))
+
+
+def per_s(runs: int, call: Callable[[], object]) -> float:
+    """Runs per second of CPU time of this thread, which nobody else's load lengthens much."""
+    begun_ns = time.thread_time_ns()
+    call()
+    return runs / ((time.thread_time_ns() - begun_ns) * 1e-9)
+
+
+def rows_of(mode: Mode) -> list[Row]:
+    """The rows of a mode, all sides in turn."""
+    setting, population, fates = drawn(mode)
+    draws = [Population(*(part[i : i + 1] for part in population)) for i in range(DRAWS)]
+    batch = Population(*(np.concatenate([part] * _REPEATED[mode]) for part in population))
+    few = range(_INTEGRATED[mode])
+    run_batch(setting, population)
+    apart_s = dict.fromkeys(METHODS, 0.0)
+    for method in METHODS:
+        for i in few:
+            found = run_events(setting, draws[i]).event_s
+            expected = integrated(setting, draws[i], fates[i], method)
+            same = len(found) == len(expected)
+            difference_s = float(np.abs(found - expected).max()) if same else np.inf
+            apart_s[method] = max(apart_s[method], difference_s)
+    steps = np.array([transition(setting, one) for one in draws])
+    ours, alone, together = [], [], []
+    scipys: dict[Method, list[float]] = {method: [] for method in METHODS}
+
+    def integrate(method: Method) -> list[list[float]]:
+        return [integrated(setting, draws[i], fates[i], method) for i in few]
+
+    for _ in range(ROUNDS):
+        ours.append(per_s(len(batch.A), lambda: run_batch(setting, batch)))
+        for method, figures in scipys.items():
+            figures.append(per_s(len(few), partial(integrate, method)))
+        alone.append(per_s(1, lambda: stepped_alone(setting, steps[0], population.x0[0], fates[0])))
+        together.append(per_s(DRAWS, lambda: stepped(setting, steps, population.x0, fates)))
+    events = float(run_batch(setting, population)["transmissions"].mean())
+    name = f"lane_following, {setting.horizon_s:g} s, {mode}"
+
+    def ratio(peer: Sequence[float]) -> float:
+        return median(a / b for a, b in zip(ours, peer, strict=True))
+
+    value, note = median(ours), f"{events:.0f} events a run"
+    return [
+        Row(name, value, "runs/s", goal=Goal(">=", _GOALS[mode]), note=note),
+        *(
+            Row(name, value, "runs/s", Peer(f"solve_ivp, {method}, rtol 1e-8", median(figures)),
+                Goal(">=", 400) if method == METHODS[0] else None,
+                f"event times differ from those of {method} by {apart_s[method]:.1g} s",
+                None if apart_s[method] <= _AGREEMENT_S else "the two do not agree",
+                ratio(figures))
+            for method, figures in scipys.items()
+        ),
+        Row(name, value, "runs/s", Peer("numpy loop, 1 ms steps", median(alone)),
+            Goal(">=", 20), paired_ratio=ratio(alone)),
+        Row(name, value, "runs/s", Peer(f"the same, {DRAWS} runs at once", median(together)),
+            paired_ratio=ratio(together)),
+    ]  # fmt: skip
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Both modes."""
+    rows: list[Row] = []
+    for mode in ("model", "zoh"):
+        say(mode)
+        rows += rows_of(mode)  # type: ignore[arg-type]
+    return rows
+
+
+BENCHMARK = Benchmark("batch", "Exact runs of a batch, one core", measure)
+
+if __name__ == "__main__":
+    sys.exit(run([BENCHMARK]))

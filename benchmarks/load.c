@@ -1,0 +1,282 @@
+/* The load of the relay benchmarks, a shared library that _relay_load.py calls.
+ *
+ * Every datagram begins with its number, a 64-bit integer. Arrivals are the kernel's receive stamps
+ * (SO_TIMESTAMPNS, CLOCK_REALTIME), so that they do not depend on when the sink is read.
+ * Functions return 0 or an errno.
+ */
+#define _GNU_SOURCE
+#include <errno.h>
+#include <linux/sock_diag.h>
+#include <netinet/in.h>
+#include <signal.h>
+#include <stdint.h>
+#include <string.h>
+#include <sys/socket.h>
+#include <sys/wait.h>
+#include <time.h>
+
+enum { BATCH = 64, MAX_BYTES = 2048, CONTROL_BYTES = 128 };
+static const int64_t SECOND_NS = 1000000000;
+static const int64_t QUIET_NS = 3000000;
+static const int64_t POLL_NS = 500000;
+
+static int64_t now_ns(clockid_t clock)
+{
+    struct timespec t;
+    clock_gettime(clock, &t);
+    return t.tv_sec * SECOND_NS + t.tv_nsec;
+}
+
+static void sleep_until(int64_t due_ns)
+{
+    struct timespec t = {due_ns / SECOND_NS, due_ns % SECOND_NS};
+    while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &t, NULL) == EINTR)
+        ;
+}
+
+struct arrival {
+    int64_t number;
+    int64_t stamp_ns;
+};
+
+/* Take what is queued at the sink, at most BATCH datagrams, without waiting; -1 if nothing is. */
+static int take(int sink, struct arrival arrivals[BATCH])
+{
+    static char data[BATCH][MAX_BYTES];
+    static char control[BATCH][CONTROL_BYTES] __attribute__((aligned(16)));
+    struct iovec parts[BATCH];
+    struct mmsghdr batch[BATCH] = {0};
+
+    for (int k = 0; k < BATCH; k++) {
+        parts[k] = (struct iovec){data[k], MAX_BYTES};
+        batch[k].msg_hdr.msg_iov = &parts[k];
+        batch[k].msg_hdr.msg_iovlen = 1;
+        batch[k].msg_hdr.msg_control = control[k];
+        batch[k].msg_hdr.msg_controllen = CONTROL_BYTES;
+    }
+    int taken = recvmmsg(sink, batch, BATCH, MSG_DONTWAIT, NULL);
+    for (int k = 0; k < taken; k++) {
+        struct msghdr *head = &batch[k].msg_hdr;
+        memcpy(&arrivals[k].number, data[k], sizeof arrivals[k].number);
+        arrivals[k].stamp_ns = 0;
+        for (struct cmsghdr *c = CMSG_FIRSTHDR(head); c != NULL; c = CMSG_NXTHDR(head, c))
+            if (c->cmsg_level == SOL_SOCKET && c->cmsg_type == SCM_TIMESTAMPNS) {
+                struct timespec t;
+                memcpy(&t, CMSG_DATA(c), sizeof t);
+                arrivals[k].stamp_ns = t.tv_sec * SECOND_NS + t.tv_nsec;
+            }
+    }
+    return taken;
+}
+
+/* Send datagrams number first to first + count - 1 as fast as possible; from sources[number %
+ * n_sources], IPv4 addresses in network order, if there are any. */
+static int send_all(int out, int64_t first, int64_t count, size_t size, const uint32_t *sources,
+                    int64_t n_sources)
+{
+    static char data[BATCH][MAX_BYTES];
+    static char control[BATCH][CMSG_SPACE(sizeof(struct in_pktinfo))] __attribute__((aligned(16)));
+    struct iovec parts[BATCH];
+    struct mmsghdr batch[BATCH] = {0};
+
+    for (int64_t done = 0; done < count;) {
+        int wanted = count - done < BATCH ? (int)(count - done) : BATCH;
+        for (int k = 0; k < wanted; k++) {
+            int64_t number = first + done + k;
+            memcpy(data[k], &number, sizeof number);
+            parts[k] = (struct iovec){data[k], size};
+            batch[k].msg_hdr.msg_iov = &parts[k];
+            batch[k].msg_hdr.msg_iovlen = 1;
+            if (n_sources > 0) {
+                struct in_pktinfo from = {.ipi_spec_dst.s_addr = sources[number % n_sources]};
+                struct cmsghdr *c = (struct cmsghdr *)control[k];
+                c->cmsg_level = IPPROTO_IP;
+                c->cmsg_type = IP_PKTINFO;
+                c->cmsg_len = CMSG_LEN(sizeof from);
+                memcpy(CMSG_DATA(c), &from, sizeof from);
+                batch[k].msg_hdr.msg_control = control[k];
+                batch[k].msg_hdr.msg_controllen = sizeof control[k];
+            }
+        }
+        int sent = sendmmsg(out, batch, (unsigned)wanted, 0);
+        if (sent < 0 && errno != EINTR)
+            return errno;
+        done += sent > 0 ? sent : 0;
+    }
+    return 0;
+}
+
+struct burst {
+    int64_t wall_ns;  /* from the relay's going on to the last arrival */
+    int64_t last;     /* highest number that arrived, -1 if none */
+    int64_t received; /* how many arrived */
+};
+
+/* Bytes that wait at the sink, and how many can. */
+static int64_t waiting(int sink, int64_t *most)
+{
+    uint32_t memory[SK_MEMINFO_VARS] = {0};
+    socklen_t length = sizeof memory;
+    getsockopt(sink, SOL_SOCKET, SO_MEMINFO, memory, &length);
+    *most = memory[SK_MEMINFO_RCVBUF];
+    return memory[SK_MEMINFO_RMEM_ALLOC];
+}
+
+/* Take arrivals of datagrams number first and above until the last but `slack` of `count` has come
+ * and nothing follows, or nothing has come for patience_ns. The sink is read when it does not grow
+ * or gets full: reading it while the relay writes to it would slow the relay down. */
+static void gather(int sink, int64_t first, int64_t count, int64_t slack, int64_t begun_ns,
+                   int64_t patience_ns, struct burst *found)
+{
+    struct arrival arrivals[BATCH];
+    int64_t changed_ns = now_ns(CLOCK_MONOTONIC), held_before = 0, most;
+
+    *found = (struct burst){0, -1, 0};
+    for (;;) {
+        int64_t held = waiting(sink, &most), now = now_ns(CLOCK_MONOTONIC);
+        if (held != held_before)
+            changed_ns = now;
+        if (held == held_before || held > most / 2)
+            for (int taken; (taken = take(sink, arrivals)) > 0; held = 0)
+                for (int k = 0; k < taken; k++) {
+                    int64_t number = arrivals[k].number - first;
+                    if (number < 0 || number >= count)
+                        continue;
+                    found->received++;
+                    if (number > found->last) {
+                        found->last = number;
+                        found->wall_ns = arrivals[k].stamp_ns - begun_ns;
+                    }
+                }
+        held_before = held;
+        if (now - changed_ns > (found->last >= count - 1 - slack ? QUIET_NS : patience_ns))
+            return;
+        sleep_until(now + POLL_NS);
+    }
+}
+
+/* Stop a child process, fill its receive buffer, let it go on, and see it empty the buffer. */
+int load_burst(int out, int sink, int relay, int64_t first, int64_t count, int64_t size,
+               const uint32_t *sources, int64_t n_sources, int64_t slack, int64_t patience_ns,
+               struct burst *found)
+{
+    siginfo_t info;
+    if (kill(relay, SIGSTOP) != 0 || waitid(P_PID, (id_t)relay, &info, WSTOPPED) != 0)
+        return errno;
+    int failed = send_all(out, first, count, (size_t)size, sources, n_sources);
+    int64_t begun_ns = now_ns(CLOCK_REALTIME);
+    if (kill(relay, SIGCONT) != 0)
+        return errno;
+    gather(sink, first, count, slack, begun_ns, patience_ns, found);
+    return failed;
+}
+
+/* The same without a relay: send straight to the sink; cpu_ns is the calling thread's. */
+int load_direct(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t patience_ns,
+                struct burst *found, int64_t *cpu_ns)
+{
+    int64_t begun_ns = now_ns(CLOCK_REALTIME), begun_cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID);
+    int failed = send_all(out, first, count, (size_t)size, NULL, 0);
+    *cpu_ns = now_ns(CLOCK_THREAD_CPUTIME_ID) - begun_cpu_ns;
+    gather(sink, first, count, 0, begun_ns, patience_ns, found);
+    return failed;
+}
+
+/* Send datagrams one by one, each when the one before has come back or was given up (the sink's
+ * SO_RCVTIMEO); delay_ns[k] is -1 for those. */
+int load_ping(int out, int sink, int64_t first, int64_t count, int64_t size, int64_t *delay_ns)
+{
+    char data[MAX_BYTES] = {0};
+    for (int64_t k = 0; k < count; k++) {
+        int64_t number = first + k, found = -1;
+        memcpy(data, &number, sizeof number);
+        int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
+        if (send(out, data, (size_t)size, 0) < 0)
+            return errno;
+        ssize_t taken;
+        while (found != number && (taken = recv(sink, data, sizeof data, 0)) >= 0)
+            memcpy(&found, data, sizeof found);
+        delay_ns[k] = found == number ? now_ns(CLOCK_MONOTONIC) - begun_ns : -1;
+    }
+    return 0;
+}
+
+/* Send a datagram every period_ns and note when (CLOCK_REALTIME). */
+int load_pace(int out, int64_t first, int64_t count, int64_t size, int64_t period_ns,
+              int64_t *departure_ns)
+{
+    char data[MAX_BYTES] = {0};
+    int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
+    for (int64_t k = 0; k < count; k++) {
+        int64_t number = first + k;
+        memcpy(data, &number, sizeof number);
+        sleep_until(begun_ns + (k + 1) * period_ns);
+        departure_ns[k] = now_ns(CLOCK_REALTIME);
+        if (send(out, data, (size_t)size, 0) < 0)
+            return errno;
+    }
+    return 0;
+}
+
+/* Arrival stamps of datagrams number first and above, until all have come or nothing has for
+ * patience_ns; of those that have not, arrival_ns is left as it is. */
+int load_collect(int sink, int64_t first, int64_t count, int64_t patience_ns, int64_t *arrival_ns)
+{
+    struct arrival arrivals[BATCH];
+    int64_t missing = count, quiet_since_ns = now_ns(CLOCK_MONOTONIC);
+    while (missing > 0 && now_ns(CLOCK_MONOTONIC) - quiet_since_ns < patience_ns) {
+        for (int taken; (taken = take(sink, arrivals)) > 0;) {
+            for (int k = 0; k < taken; k++) {
+                int64_t number = arrivals[k].number - first;
+                if (number >= 0 && number < count) {
+                    arrival_ns[number] = arrivals[k].stamp_ns;
+                    missing--;
+                }
+            }
+            quiet_since_ns = now_ns(CLOCK_MONOTONIC);
+        }
+        sleep_until(now_ns(CLOCK_MONOTONIC) + POLL_NS);
+    }
+    return 0;
+}
+
+struct soak {
+    int64_t sent;
+    int64_t received;
+    int64_t next;        /* the number that would follow without a loss */
+    int64_t longest_gap; /* most successive numbers that did not arrive */
+    int64_t disordered;  /* arrivals with a lower number than one before: none through a FIFO */
+};
+
+static void count_arrivals(int sink, struct soak *state)
+{
+    struct arrival arrivals[BATCH];
+    for (int taken; (taken = take(sink, arrivals)) > 0;)
+        for (int k = 0; k < taken; k++) {
+            int64_t gap = arrivals[k].number - state->next;
+            state->received++;
+            if (gap < 0) {
+                state->disordered++;
+                continue;
+            }
+            state->longest_gap = gap > state->longest_gap ? gap : state->longest_gap;
+            state->next = arrivals[k].number + 1;
+        }
+}
+
+/* Send `groups` groups of `size_of_group` datagrams, one group every period_ns, taking what
+ * arrives in between; go on where the state says that it ended. */
+int load_soak(int out, int sink, int64_t groups, int64_t group, int64_t size, int64_t period_ns,
+              struct soak *state)
+{
+    int64_t begun_ns = now_ns(CLOCK_MONOTONIC);
+    for (int64_t k = 0; k < groups; k++) {
+        sleep_until(begun_ns + (k + 1) * period_ns);
+        int failed = send_all(out, state->sent, group, (size_t)size, NULL, 0);
+        if (failed)
+            return failed;
+        state->sent += group;
+        count_arrivals(sink, state);
+    }
+    return 0;
+}

@@ -1,0 +1,104 @@
+/* A peer of the relay benchmarks: what a relay costs that does nothing but forward.
+ *
+ * Takes up to 64 datagrams with one recvmmsg and sends them with one sendmmsg through a connected
+ * socket, to one destination on loopback. With "segment" neighbours of equal size leave as one
+ * message that the kernel cuts (UDP_SEGMENT). Prints the port that it listens on.
+ */
+#define _GNU_SOURCE
+#include <arpa/inet.h>
+#include <errno.h>
+#include <netinet/in.h>
+#include <netinet/udp.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/socket.h>
+
+enum { BATCH = 64, MAX_BYTES = 2048, BUFFER_BYTES = 4 * 1024 * 1024 };
+
+static void fail(const char *what)
+{
+    perror(what);
+    exit(1);
+}
+
+static char data[BATCH][MAX_BYTES];
+static struct iovec parts[BATCH];
+static struct mmsghdr batch[BATCH];
+
+static void forward(int out, int count)
+{
+    for (int sent = 0; sent < count;) {
+        int n = sendmmsg(out, batch + sent, (unsigned)(count - sent), 0);
+        sent += n > 0 ? n : 1; /* what met a refusal (nobody listens there) is lost */
+    }
+}
+
+static void forward_segments(int out, int count)
+{
+    for (int first = 0, next; first < count; first = next) {
+        uint16_t size = (uint16_t)parts[first].iov_len;
+        for (next = first + 1; next < count && parts[next].iov_len == size;)
+            next++;
+        char control[CMSG_SPACE(sizeof size)] __attribute__((aligned(8))) = {0};
+        struct msghdr run = {.msg_iov = &parts[first], .msg_iovlen = (size_t)(next - first),
+                             .msg_control = control, .msg_controllen = sizeof control};
+        struct cmsghdr *c = CMSG_FIRSTHDR(&run);
+        c->cmsg_level = IPPROTO_UDP;
+        c->cmsg_type = UDP_SEGMENT;
+        c->cmsg_len = CMSG_LEN(sizeof size);
+        memcpy(CMSG_DATA(c), &size, sizeof size);
+        if (sendmsg(out, &run, 0) < 0 && errno != ECONNREFUSED)
+            fail("sendmsg");
+    }
+}
+
+int main(int argc, char **argv)
+{
+    struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
+    struct sockaddr_in there = here;
+    socklen_t length = sizeof here;
+    int in = socket(AF_INET, SOCK_DGRAM, 0), out = socket(AF_INET, SOCK_DGRAM, 0);
+    int bytes = BUFFER_BYTES;
+    bool segment = argc == 3 && strcmp(argv[2], "segment") == 0;
+
+    if (argc != 2 && !segment) {
+        fprintf(stderr, "usage: %s PORT [segment]\n", argv[0]);
+        return 2;
+    }
+    there.sin_port = htons((uint16_t)atoi(argv[1]));
+    if (setsockopt(in, SOL_SOCKET, SO_RCVBUFFORCE, &bytes, sizeof bytes) != 0)
+        setsockopt(in, SOL_SOCKET, SO_RCVBUF, &bytes, sizeof bytes);
+    if (bind(in, (struct sockaddr *)&here, sizeof here) != 0)
+        fail("bind");
+    if (connect(out, (struct sockaddr *)&there, sizeof there) != 0)
+        fail("connect");
+    if (getsockname(in, (struct sockaddr *)&here, &length) != 0)
+        fail("getsockname");
+    printf("%d\n", ntohs(here.sin_port));
+    fflush(stdout);
+
+    for (int k = 0; k < BATCH; k++) {
+        parts[k].iov_base = data[k];
+        batch[k].msg_hdr.msg_iov = &parts[k];
+        batch[k].msg_hdr.msg_iovlen = 1;
+    }
+    for (;;) {
+        for (int k = 0; k < BATCH; k++)
+            parts[k].iov_len = MAX_BYTES;
+        int taken = recvmmsg(in, batch, BATCH, MSG_WAITFORONE, NULL);
+        if (taken < 0) {
+            if (errno == EINTR)
+                continue;
+            fail("recvmmsg");
+        }
+        for (int k = 0; k < taken; k++)
+            parts[k].iov_len = batch[k].msg_len;
+        if (segment)
+            forward_segments(out, taken);
+        else
+            forward(out, taken);
+    }
+}

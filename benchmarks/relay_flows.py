@@ -1,0 +1,142 @@
+"""What ten thousand flows cost a relay, and how fast the pure link decides.
+
+Flows differ in the sender's address (127.1.0.0 and on), datagrams come from them in turn. Cost is
+the relay's CPU time per datagram while it works off a full receive buffer, as in
+:mod:`benchmarks.relays`; the C relay, which looks at no address, shows what of it is the kernel's.
+The decisions' runs of losses are counted from the fates alone.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from typing import NamedTuple
+
+from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, on_core, scheduled
+from benchmarks._relay_decisions import (
+    LOSS,
+    MANSD,
+    Decide,
+    LossRuns,
+    compiled,
+    plain,
+    predicted_loss,
+)
+from benchmarks._relay_load import built, sources
+from benchmarks._relay_ours import Ours
+from benchmarks._relay_process import Relay, c_relay, in_turn, our_relay, start_all
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, run, say
+from benchmarks._rounds import Comparison, paired
+
+ROUNDS = 30
+FLOWS = 10_000
+WORDS = "loss 5% mansd 4 seed 7"
+COST_GOAL = Goal("<=", 1.3)
+KINDS = {
+    "ours": Ours(WORDS),
+    "ours, with a way back": Ours(WORDS, way_back=True),
+}
+_PACKETS = 10
+"""Of each flow in a call."""
+
+
+class Costs(NamedTuple):
+    """CPU time per datagram in a round, µs."""
+
+    one_us: float
+    many_us: float
+
+
+def flow_rows(rounds: Mapping[str, Sequence[Costs]], missing: Mapping[str, str]) -> list[Row]:
+    """Return the rows of the relays.
+
+    Args:
+        rounds: by relay, its rounds.
+        missing: by relay that was not measured, why.
+    """
+    rows = []
+    for name in (*KINDS, "C relay"):
+        many, one = f"{name}, {FLOWS:,} flows", f"{name}, one flow"
+        found = rounds.get(name, ())
+        figures = {many: [f.many_us for f in found], one: [f.one_us for f in found]}
+        reasons = {many: missing[name]} if name in missing else {}
+        goal = COST_GOAL if name in KINDS else None
+        rows.append(paired("cost", "µs CPU each", Comparison(many, one, goal), figures, reasons))
+    return rows
+
+
+class Decided(NamedTuple):
+    """What the link decided."""
+
+    per_s: float
+    runs: LossRuns
+
+
+def decide_all(decide: Decide, decisions: int, flows: int) -> Decided:
+    """Let the link decide batch by batch, at least so many; only its own time counts."""
+    runs, seconds = LossRuns(flows), 0.0
+    runs.add(decide(1))  # makes the flows' states, and the compiled code
+    unmeasured = runs.decisions
+    while runs.decisions < decisions:
+        begun_s = time.perf_counter()
+        fates = decide(_PACKETS)
+        seconds += time.perf_counter() - begun_s
+        runs.add(fates)
+    return Decided((runs.decisions - unmeasured) / seconds, runs)
+
+
+def decision_rows(name: str, found: Decided | str) -> list[Row]:
+    """Return the rows of one way to run the link: what was found, or why nothing was."""
+    if isinstance(found, str):
+        return [Row(f"{name}: decisions", None, "/s", unjudged=found)]
+    runs = found.runs
+    note = f"{runs.decisions:,} decisions, loss {LOSS:.0%}, mansd {MANSD}, {FLOWS:,} flows"
+    return [
+        Row(f"{name}: decisions", found.per_s, "/s", note=note),
+        Row(f"{name}: longest run of losses", runs.longest, "", goal=Goal("<=", MANSD)),
+        Row(f"{name}: loss", 100 * runs.lost / runs.decisions, "%",
+            Peer("predicted", 100 * predicted_loss(LOSS, MANSD))),
+    ]  # fmt: skip
+
+
+def _decisions(name: str, make: Callable[[int], Decide], count: int) -> list[Row]:
+    say(f"{count:,} decisions, {name}")
+    try:
+        return decision_rows(name, decide_all(make(FLOWS), count, FLOWS))
+    except MeasurementError as error:
+        return decision_rows(name, str(error))
+
+
+def _measure_flows() -> list[Row]:
+    rounds: dict[str, list[Costs]] = {}
+    with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
+        kinds = {"C relay": c_relay(tools)} | {
+            name: our_relay(name, ours) for name, ours in KINDS.items()
+        }
+        relays, missing = start_all(kinds, tools, stack)
+        one, many = sources(1), sources(FLOWS)
+
+        def costs(relay: Relay) -> Costs:
+            return Costs(relay.burst(one).cpu_us, relay.burst(many).cpu_us)
+
+        for number in range(-1, ROUNDS):  # the first makes the flows' states and does not count
+            if number % 10 == 0:
+                say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
+            in_turn(relays, missing, rounds if number >= 0 else {}, costs)
+    return flow_rows(rounds, missing)
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Measure the flows, then the decisions."""
+    return [
+        *_measure_flows(),
+        *_decisions("compiled", compiled, 100_000_000),
+        *_decisions("plain Python", plain, 500_000),
+    ]
+
+
+BENCHMARK = Benchmark("relay_flows", "Relays: flows and decisions", measure)
+
+if __name__ == "__main__":
+    sys.exit(run([BENCHMARK]))

@@ -1,0 +1,184 @@
+"""The load and the relays themselves: counts only, no rates."""
+
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import pairwise
+
+import pytest
+
+from benchmarks import _relay_load
+from benchmarks._relay_load import Built, Ends, Soak, built, sources
+from benchmarks._relay_ours import Ours
+from benchmarks._relay_process import (
+    Kind,
+    asyncio_relay,
+    c_relay,
+    in_turn,
+    our_relay,
+    running,
+    socat,
+    start_all,
+)
+from benchmarks._report import MeasurementError
+
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux", reason="the load is Linux's"),
+    pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler"),
+]
+
+
+@pytest.fixture(scope="module")
+def tools() -> Iterator[Built]:
+    with built() as found:
+        yield found
+
+
+@pytest.fixture
+def ends(tools: Built) -> Iterator[Ends]:
+    pair = Ends(tools.load)
+    pair.connect(pair.sink_port)
+    yield pair
+    pair.close()
+
+
+@pytest.fixture
+def stopped() -> Iterator[int]:
+    """A child process that a burst can stop and let go on, and that forwards nothing."""
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        yield process.pid
+        process.kill()
+
+
+def test_a_burst_straight_to_the_sink_arrives_whole(ends: Ends, stopped: int) -> None:
+    for _ in range(2):
+        found = ends.burst(stopped, 100)
+        assert (found.decided, found.received) == (100, 100)
+    assert ends.sent == 200
+
+
+def test_a_burst_comes_from_all_addresses_in_turn_numbered(ends: Ends, stopped: int) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        mine.bind(("127.0.0.1", 0))
+        mine.setblocking(False)
+        ends.connect(mine.getsockname()[1])
+        found = ends.burst(stopped, 130, addresses=sources(100))
+        assert (found.decided, found.received) == (0, 0)
+        taken = [mine.recvfrom(2048) for _ in range(130)]
+    assert [int.from_bytes(data[:8], sys.byteorder) for data, _ in taken] == list(range(130))
+    assert {len(data) for data, _ in taken} == {72}
+    hosts = [host for _, (host, _) in taken]
+    assert hosts == [f"127.1.0.{k % 100}" for k in range(130)]
+
+
+def test_each_way_to_send_is_numbered_on_and_arrives(ends: Ends) -> None:
+    found, cpu_s = ends.direct(150)
+    assert (found.decided, found.received) == (150, 150)
+    assert cpu_s > 0
+    assert (ends.ping(20) > 0).all()
+    assert (ends.pace(20, 10_000) > 0).all()
+    assert ends.sent == 190
+
+
+def test_what_nobody_returns_is_marked(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_relay_load, "_PATIENCE_NS", 1_000_000)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        mine.bind(("127.0.0.1", 0))
+        ends.connect(mine.getsockname()[1])
+        assert (ends.ping(2) == -1).all()
+        assert (ends.pace(2, 10_000) == -1).all()
+
+
+def test_gaps_and_disorder_of_a_steady_load_are_counted(tools: Built) -> None:
+    ends, state = Ends(tools.load), Soak()
+    numbers = [0, 1, 5, 6, 4, 9]  # 2 and 3 missing at first, then 4, late, then 7 and 8
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mine:
+        for number in numbers:
+            mine.sendto(number.to_bytes(8, sys.byteorder), ("127.0.0.1", ends.sink_port))
+    ends.connect(ends.sink_port)
+    ends.soak(state, 1, 0, 1000)
+    ends.close()
+    steps = [b - a - 1 for a, b in pairwise([0, 1, 5, 6, 9])]
+    assert (state.received, state.disordered) == (6, 1)
+    assert state.longest_gap == max(steps) == 3
+    assert (state.next, state.sent) == (10, 0)
+
+
+def test_a_steady_load_goes_on_where_it_was(ends: Ends) -> None:
+    state = Soak()
+    for _ in range(3):
+        ends.soak(state, 5, 70, 1000)
+    ends.soak(state, 5, 0, 1000)
+    assert (state.sent, state.received, state.longest_gap) == (1050, 1050, 0)
+
+
+PEERS: dict[str, Callable[[Built], Kind | str]] = {
+    "C relay": c_relay,
+    "C relay, segments": lambda tools: c_relay(tools, segment=True),
+    "socat": lambda tools: socat(),
+    "socat, connected": lambda tools: socat(connected=True),
+    "asyncio relay": lambda tools: asyncio_relay(),
+}
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
+    kind = PEERS[name](tools)
+    if isinstance(kind, str):
+        pytest.skip(kind)
+    assert kind.name == name
+    with running(kind, tools) as relay:
+        assert relay.burst().cpu_us > 0  # a burst of which anything is missing raises
+        state = Soak()
+        relay.ends.soak(state, 1, 0, 1000)
+        assert state.received == 0
+        assert (relay.ends.ping(20) > 0).all()
+
+
+def test_the_asyncio_relay_delays(tools: Built) -> None:
+    with running(asyncio_relay(delay_ms=5.0), tools) as relay:
+        # asyncio takes what is due within the clock's resolution for due
+        assert (relay.ends.pace(20, 100_000) > 4_900_000).all()
+
+
+def test_our_relays_counts_are_what_sender_and_sink_saw(tools: Built) -> None:
+    with running(our_relay("ours", Ours("loss 30% mansd 2 seed 3")), tools) as relay:
+        found = relay.ends.burst(relay.pid, 200, slack=2)
+        totals = relay.totals()
+    assert totals.arrived == 200
+    assert totals.forwarded == found.received < 200
+    assert totals.longest_drop_run <= 2
+    assert totals.lost_in_kernel == 0
+    assert 198 <= found.decided <= 200
+
+
+def test_a_relay_that_does_not_start_or_fails_is_said_and_left_out(tools: Built) -> None:
+    kinds: dict[str, Kind | str] = {
+        "absent": "not installed",
+        "broken": Kind("broken", lambda to, port: [sys.executable, "-c", "exit('no reason')"]),
+        "C relay": c_relay(tools),
+    }
+    rounds: dict[str, list[int]] = {}
+    with ExitStack() as stack:
+        relays, missing = start_all(kinds, tools, stack)
+        assert missing["absent"] == "not installed"
+        assert "said 'no reason'" in missing["broken"]
+        in_turn(relays, missing, rounds, lambda relay: relay.pid)
+
+        def fail(relay: object) -> int:
+            raise MeasurementError("lost")
+
+        in_turn(relays, missing, rounds, fail)
+        assert relays == []
+    assert missing["C relay"] == "lost"
+    assert len(rounds["C relay"]) == 1
+
+
+def test_without_a_compiler_there_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda program: None)
+    with pytest.raises(MeasurementError, match="cc is not installed"), built():
+        pass
+    assert isinstance(socat(), str)

@@ -1,0 +1,286 @@
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import relay_delay, relay_flows, relay_soak, relays
+from benchmarks._relay_decisions import Decide, LossRuns, compiled, plain, predicted_loss
+from benchmarks._relay_load import Burst, Soak
+from benchmarks._relay_ours import Ours, Totals, command_of, totals_of
+from benchmarks._relay_process import Sample, sample_of
+from benchmarks._report import Goal, MeasurementError, Row
+from benchmarks._rounds import Comparison, paired
+from benchmarks.relay_delay import Quantiles
+from benchmarks.relay_flows import Costs
+from noack.records import Fate
+
+HALF = Comparison("ours", "theirs", Goal("<=", 0.5))
+
+
+def named(rows: Sequence[Row]) -> Mapping[tuple[str, str | None], Row]:
+    return {(row.name, None if row.peer is None else row.peer.name): row for row in rows}
+
+
+def test_a_disturbed_round_disturbs_both_sides_and_leaves_the_ratio_alone() -> None:
+    rounds = {"ours": [1.0, 30.0, 3.0], "theirs": [2.0, 60.0, 8.0]}
+    row = paired("cost", "µs", HALF, rounds, {})
+    assert row.name == "ours: cost"
+    assert row.peer is not None
+    assert (row.value, row.peer.value) == (3.0, 8.0)
+    assert row.ratio == 0.5  # and not 3 / 8
+    assert row.holds is True
+
+
+@pytest.mark.parametrize(
+    ("rounds", "missing"),
+    [
+        ({"ours": [1.0]}, {"theirs": "not installed"}),
+        ({"theirs": [1.0]}, {"ours": "not built"}),
+        ({"ours": [1.0, 2.0], "theirs": [1.0]}, {"theirs": "lost a datagram"}),
+    ],
+)
+def test_a_comparison_with_nobody_is_not_judged_and_says_why(
+    rounds: dict[str, list[float]], missing: dict[str, str]
+) -> None:
+    row = paired("cost", "µs", HALF, rounds, missing)
+    assert row.holds is None
+    ((who, why),) = missing.items()
+    assert f"{who}: {why}" in row.as_json()["note"]
+
+
+def test_what_a_relay_decided_counts_and_not_what_it_forwarded() -> None:
+    sample = sample_of("ours", Burst(wall_s=0.01, decided=998, received=950), 1000, 16, 0.003)
+    assert sample.per_s == pytest.approx(99_800)
+    assert sample.cpu_us == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("burst", "slack"), [(Burst(0.01, 983, 930), 16), (Burst(0.01, 1000, 999), 0)]
+)
+def test_a_burst_that_did_not_come_through_is_no_figure(burst: Burst, slack: int) -> None:
+    with pytest.raises(MeasurementError, match=f"only {burst.received} arrived"):
+        sample_of("relay", burst, 1000, slack, 0.003)
+
+
+def test_the_goals_of_the_rates() -> None:
+    per_s = {
+        relays.PLAIN: 260e3, relays.SEGMENTS: 700e3, relays.SOCKETS: 100e3,
+        "socat": 120e3, "socat, connected": 135e3, "C relay": 330e3, "C relay, segments": 890e3,
+        "asyncio relay": 50e3, relays.DIRECT: 420e3,
+    }  # fmt: skip
+    samples = {name: [Sample(rate, 1e6 / rate)] * 3 for name, rate in per_s.items()}
+    rows = named(relays.rows_of(samples, {}))
+    verdicts = {key: row.holds for key, row in rows.items() if row.goal is not None}
+    assert verdicts == {
+        ("ours: drained", "socat"): True,
+        ("ours: drained", "C relay"): False,
+        ("ours, segments: drained", "socat"): True,
+    }
+    cost = rows["ours: cost", "C relay"]
+    assert cost.ratio == pytest.approx(330 / 260)
+
+
+def test_the_rates_without_socat_say_that_it_is_missing() -> None:
+    names = {row.peer for row in (*relays.RATES, *relays.COSTS)} | set(relays.OURS)
+    samples = {name: [Sample(1e5, 10.0)] for name in names if name != "socat"}
+    for (_, peer), row in named(relays.rows_of(samples, {"socat": "not installed"})).items():
+        assert (row.ratio is None) is (peer == "socat")
+        assert ("not installed" in row.as_json().get("note", "")) is (peer == "socat")
+
+
+def test_delays_are_counted_beyond_the_base() -> None:
+    delays_ns = np.arange(1, 102) * 1000  # 1, 2, ..., 101 µs
+    assert relay_delay.quantiles_of("relay", delays_ns, 3.0) == Quantiles(48.0, 97.0)
+
+
+def test_a_missing_datagram_has_no_delay() -> None:
+    with pytest.raises(MeasurementError, match="relay: 2 of 3 datagrams did not arrive"):
+        relay_delay.quantiles_of("relay", np.array([-1, 5, -1]))
+
+
+def test_only_the_median_of_the_added_delay_is_judged() -> None:
+    rounds = {
+        relay_delay.OURS: [Quantiles(9.0, 30.0)],
+        relay_delay.DIRECT: [Quantiles(3.0, 4.0)],
+        "socat": [Quantiles(12.0, 15.0)],
+        "C relay": [Quantiles(7.0, 8.0)],
+        "asyncio relay": [Quantiles(25.0, 50.0)],
+    }
+    rows = relay_delay.added_rows(rounds, {})
+    assert rows[0].value == 3.0
+    (judged,) = [row for row in rows if row.goal is not None]
+    assert (judged.name, judged.ratio, judged.holds) == ("ours: added one way, p50", 0.75, True)
+
+
+LATE = {
+    relay_delay.OURS: [Quantiles(20.0, 50.0)],
+    relay_delay.KERNEL: [Quantiles(15.0, 30.0)],
+    "asyncio relay": [Quantiles(500.0, 1000.0)],
+}
+
+
+def test_only_the_99th_percentile_of_the_lateness_is_judged() -> None:
+    (judged,) = [row for row in relay_delay.lateness_rows(LATE, {}, None) if row.goal is not None]
+    assert judged.name == "ours: lateness behind 10 ms, p99"
+    assert judged.ratio == pytest.approx(5 / 3)
+    assert judged.holds is True
+
+
+def test_lateness_is_not_judged_where_the_settings_are_refused() -> None:
+    rows = relay_delay.lateness_rows(LATE, {}, "SCHED_FIFO is refused")
+    (judged,) = [row for row in rows if row.goal is not None]
+    assert judged.holds is None
+    assert "SCHED_FIFO is refused" in judged.as_json()["note"]
+    assert judged.value == 50.0
+
+
+def test_the_cost_of_many_flows_is_compared_with_one_flows() -> None:
+    rounds = {"ours": [Costs(3.0, 4.2), Costs(6.0, 7.2)], "C relay": [Costs(2.8, 2.8)] * 2}
+    rows = named(relay_flows.flow_rows(rounds, {"ours, with a way back": "no such option"}))
+    ours = rows["ours, 10,000 flows: cost", "ours, one flow"]
+    assert ours.ratio == pytest.approx(1.3)
+    assert ours.holds is True
+    kernel = rows["C relay, 10,000 flows: cost", "C relay, one flow"]
+    assert (kernel.ratio, kernel.goal) == (1.0, None)
+    back = rows["ours, with a way back, 10,000 flows: cost", "ours, with a way back, one flow"]
+    assert back.holds is None
+    assert "no such option" in back.as_json()["note"]
+
+
+@pytest.mark.parametrize("batch", [1, 3, 7, 50])
+def test_runs_of_losses_are_those_of_the_fates_whatever_the_batches(batch: int) -> None:
+    delivered = (Fate.DELIVERED, Fate.FORCED)
+    fates = np.random.default_rng(batch).integers(0, 4, (50, 3)).astype(np.uint8)
+    runs = LossRuns(3)
+    for first in range(0, 50, batch):
+        runs.add(fates[first : first + batch])
+    expected = [
+        len(list(group))
+        for flow in range(3)
+        for lost, group in itertools.groupby(f not in delivered for f in fates[:, flow])
+        if lost
+    ]
+    assert runs.longest == max(expected)
+    assert runs.lost == sum(expected)
+    assert runs.decisions == 150
+
+
+@pytest.mark.parametrize(("probability", "mansd"), [(0.5, 4), (0.05, 4), (0.9, 1), (0.3, 0)])
+def test_the_predicted_loss_is_the_stationary_one_of_the_chain_of_runs(
+    probability: float, mansd: int
+) -> None:
+    chain = np.zeros((mansd + 1, mansd + 1))  # from a run of k losses to the next
+    for run in range(mansd):
+        chain[run, run + 1] = probability
+        chain[run, 0] = 1 - probability
+    chain[mansd, 0] = 1
+    stationary = np.linalg.matrix_power((chain + np.eye(mansd + 1)) / 2, 4096)[0]
+    expected = float(stationary[1:].sum())
+    assert predicted_loss(probability, mansd) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("way", [plain, compiled])
+def test_the_pure_link_keeps_its_guarantee_and_the_predicted_loss(
+    way: Callable[[int], Decide],
+) -> None:
+    found = relay_flows.decide_all(way(200), 100_000, 200)
+    assert found.runs.longest == 4
+    assert found.runs.decisions >= 100_000
+    # 5 standard errors of independent draws; the cap makes the losses less variable than those.
+    share = found.runs.lost / found.runs.decisions
+    assert share == pytest.approx(predicted_loss(0.5, 4), abs=0.008)
+
+
+def test_both_ways_to_run_the_link_decide_alike() -> None:
+    assert (plain(20)(30) == compiled(20)(30)).all()
+
+
+def test_a_run_of_losses_beyond_the_cap_misses_the_goal() -> None:
+    def decide(count: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+        fates = np.zeros((count, relay_flows.FLOWS), np.uint8)
+        fates[-3:, 7] = Fate.DROPPED  # with the two before, across the batches, five
+        fates[:2, 7] = 99  # whatever is neither delivered nor forced
+        return fates
+
+    found = relay_flows.decide_all(decide, 3_000_000, relay_flows.FLOWS)
+    assert found.runs.longest == 5
+    verdicts = [row.holds for row in relay_flows.decision_rows("link", found) if row.goal]
+    assert verdicts == [False]
+
+
+def test_decisions_that_cannot_be_had_say_why() -> None:
+    (row,) = relay_flows.decision_rows("compiled", "not built")
+    assert row.as_json()["note"] == "not built"
+
+
+def soaked(**changes: int) -> list[Row]:
+    counts = {
+        "sent": 1000, "received": 950, "longest_gap": 4, "disordered": 0,
+        "arrived": 1000, "forwarded": 950, "lost_in_kernel": 0,
+    } | changes  # fmt: skip
+    soak = Soak(counts["sent"], counts["received"], 1000, counts["longest_gap"], 0)
+    totals = Totals(counts["arrived"], counts["forwarded"], 4, counts["lost_in_kernel"])
+    resident_kib = [50e3, 60e3, 60e3, 60e3, 60e3, 61e3]
+    return relay_soak.rows_of(
+        relay_soak.Found(100.0, 20.0, soak, totals, resident_kib, cpu_s=8.0, waited_s=1.0)
+    )
+
+
+def test_a_load_that_came_through_reaches_all_goals() -> None:
+    rows = soaked()
+    assert [row.holds for row in rows if row.goal is not None] == [True] * 6
+    assert rows[0].ratio == 0.5
+    assert (rows[-2].value, rows[-1].value) == (40.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "row"),
+    [
+        ({"arrived": 999}, "sent but not counted as arrived"),
+        ({"received": 949}, "forwarded but not received"),
+        ({"lost_in_kernel": 1}, "lost in the relay's receive buffer"),
+        ({"longest_gap": 5}, "longest run not received"),
+    ],
+)
+def test_each_unintended_loss_misses_its_goal(changes: dict[str, int], row: str) -> None:
+    assert [found.name for found in soaked(**changes) if found.holds is False] == [row]
+
+
+def test_memory_grows_between_the_second_quarter_and_the_last() -> None:
+    start, flat, leak = [100.0, 900.0], [1000.0] * 6, [1000.0 + 7 * k for k in range(8)]
+    assert relay_soak.growth_kib([*start, *flat]) == 0
+    assert relay_soak.growth_kib(leak) == 7 * 4  # from the middle of 2, 3 to that of 6, 7
+    assert relay_soak.growth_kib([5.0] * 4) == 0
+
+
+@pytest.mark.parametrize("per_s", [900.0, 57_321.0, 372_500.0])
+def test_groups_make_the_rate(per_s: float) -> None:
+    size, period_ns = relay_soak.groups(per_s)
+    assert size * 1e9 / period_ns == pytest.approx(per_s, rel=1e-4)
+    assert size >= 1
+
+
+def test_our_command_line() -> None:
+    ours = Ours("loss 5% mansd 4", realtime=True, segment=True, engine="plain")
+    command = command_of(ours, 9001)
+    assert Path(command[0]).name.startswith("python")
+    assert " ".join(command[1:]) == (
+        "-m netem --listen 127.0.0.1:0 --to 127.0.0.1:9001 loss 5% mansd 4 --engine plain "
+        "--realtime --segment --one-way --json"
+    )
+    assert "--one-way" not in command_of(Ours("delay 10ms", way_back=True), 9001)
+
+
+def test_totals_that_are_not_there_are_an_error() -> None:
+    forward = {
+        "arrived": 9, "forwarded": 8, "longest_run": 1, "unintended": {"lost_in_kernel": 0},
+    }  # fmt: skip
+    text = json.dumps({"links": [{"forward": forward}], "more": 1})
+    assert totals_of(text) == Totals(9, 8, 1, 0)
+    with pytest.raises(MeasurementError, match="cannot be read"):
+        totals_of("{}")
+    with pytest.raises(MeasurementError, match="cannot be read"):
+        totals_of("")
