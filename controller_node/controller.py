@@ -14,7 +14,7 @@ from noack.machine import Notice, Output, Record
 from noack.records import CONTROLLER_DELIVERY, CONTROLLER_STEP
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.wire import Flow, Message
+from noack.wire import NO_VECTOR, Flow, Message
 
 
 class Controller:
@@ -28,6 +28,7 @@ class Controller:
         horizon_ns: no tick is due after this time.
         mansd: M − 1; more successive dropouts than this violate the assumption.
         x0: the state that sensor and controller both know at t = 0; None if they do not.
+        acknowledges: whether it acknowledges the updates that it takes, as the baseline does.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Controller:
         horizon_ns: int,
         mansd: int,
         x0: Vector | None = None,
+        acknowledges: bool = False,
     ) -> None:
         self._propagate = Propagator(H, (period_ns, phase_ns, period_ns - phase_ns))
         self._K = K
@@ -48,6 +50,7 @@ class Controller:
         self._horizon_ns = horizon_ns
         self._mansd = mansd
         self._known_start = x0 is not None
+        self._acknowledges = acknowledges
         self._inputs = 0
         self._step = 0
         self._last_sequence = -1
@@ -72,6 +75,9 @@ class Controller:
             message.vector, before, self.x_c, dropouts,
         )  # fmt: skip
         outputs: list[Output] = [Record(CONTROLLER_DELIVERY, row)]
+        if self._acknowledges:
+            answer = Message(Flow.ACKNOWLEDGEMENT, message.sequence, event_ns, NO_VECTOR)
+            outputs.insert(0, answer)
         if dropouts > self._mansd:
             outputs.append(
                 Notice(
@@ -120,4 +126,5 @@ def controller_of(resolved: Scenario) -> Controller:
         horizon_ns=resolved.horizon_ns,
         mansd=resolved.network.mansd,
         x0=loop.x0 if known else None,
+        acknowledges=resolved.is_acknowledged,
     )

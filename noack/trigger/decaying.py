@@ -9,12 +9,11 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 import math
 
 from noack.linear import Matrix, Vector, norm
-from noack.resolve import loop_of
-from noack.scenario import Scenario
+from noack.trigger.guard import Form, Guard, nothing, of_error
 
 
 class DecayingTrigger:
-    """Event function of the paper.
+    """The paper's policy.
 
     Args:
         beta: β > 0, in the units of ‖W x‖.
@@ -22,6 +21,8 @@ class DecayingTrigger:
         floor: ε ≥ 0.
         weight: W, shape (n, n), or None for the identity.
     """
+
+    first_reserve = 0.0
 
     def __init__(
         self, beta: float, alpha_per_s: float, floor: float = 0.0, weight: Matrix | None = None
@@ -31,18 +32,15 @@ class DecayingTrigger:
         self.floor = floor
         self.weight = weight
 
-    def threshold(self, t_ns: int) -> float:
+    def guard(self, t_ns: float, x: Vector) -> Guard:
+        """The same after every event: eq:thre counts from the run's start."""
+        form = Form(of_error(len(x), self.weight), nothing(len(x)))
+        return Guard(form, self.beta, self.alpha_per_s, 0.0, self.floor)
+
+    def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""
         return max(self.beta * math.exp(-self.alpha_per_s * t_ns * 1e-9), self.floor)
 
     def error_norm(self, e_s: Vector) -> float:
         """‖e_s‖_W of a sensor error of shape (n,)."""
         return norm(e_s if self.weight is None else self.weight @ e_s)
-
-
-def trigger_of(resolved: Scenario) -> DecayingTrigger:
-    """Return the trigger of a resolved scenario."""
-    trigger = resolved.trigger
-    return DecayingTrigger(
-        trigger.beta, trigger.alpha_per_s, trigger.floor, loop_of(resolved).weight
-    )

@@ -1,0 +1,46 @@
+"""Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s).
+
+(Heemels, Donkers, Teel: IEEE TAC 58(4), 2013.) The minimum inter-event time is the sampling
+period by construction. A heartbeat transmits after so many periods without an event.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from noack.linear import Matrix, Vector
+from noack.trigger.guard import NEVER_NS, Form, Guard, split
+
+
+@dataclass(frozen=True)
+class QuadraticTrigger:
+    """The quadratic rule on a grid.
+
+    Args:
+        Q: symmetric, shape (2n, 2n), on z = (x, e_s).
+        period_ns: sampling period.
+        epsilon: ε ≥ 0.
+        heartbeat: transmit after so many periods at the latest; 0 for none.
+        weight: only for showing errors.
+    """
+
+    Q: Matrix
+    period_ns: int
+    epsilon: float = 0.0
+    heartbeat: int = 0
+    weight: Matrix | None = None
+    first_reserve = 0.0
+
+    @cached_property
+    def form(self) -> Form:
+        """Q as a difference of squares."""
+        return split(self.Q)
+
+    def guard(self, t_ns: float, x: Vector) -> Guard:
+        """On the grid, later than the event."""
+        latest_ns = t_ns + self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS
+        return Guard(
+            self.form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
+            latest_ns=latest_ns,
+        )  # fmt: skip
