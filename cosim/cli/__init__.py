@@ -1,6 +1,16 @@
 """The command line ``noack``, by the panels of its help."""
 
-from cosim.cli import runs, theory, processes, files  # noqa: I001 - in the order of the help
+from cosim.cli import runs, theory, campaigns, design, processes, files  # noqa: I001 - in the order of the help
 from cosim.cli.app import app, find_scenario, main
 
-__all__ = ["app", "files", "find_scenario", "main", "processes", "runs", "theory"]
+__all__ = [
+    "app",
+    "campaigns",
+    "design",
+    "files",
+    "find_scenario",
+    "main",
+    "processes",
+    "runs",
+    "theory",
+]

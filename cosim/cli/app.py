@@ -2,6 +2,7 @@
 
 import io
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,7 +14,8 @@ from typing import Annotated, Any
 
 import typer
 
-from noack.errors import CallerError, ExitStatus, NoackError
+from cosim.shipped import find_shipped
+from noack.errors import ExitStatus, NoackError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -26,6 +28,7 @@ app = typer.Typer(
 
 RUNS = "Runs"
 THEORY = "Theory"
+CAMPAIGNS = "Campaigns"
 PROCESSES = "One process each, for a person with five terminals"
 FILES = "Scenario files"
 
@@ -88,18 +91,12 @@ def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Calla
 
 def find_scenario(name: str) -> Path:
     """Return the path of a scenario given by path, or by the name of a shipped one."""
-    path = Path(name)
-    if path.exists() or path.suffix == ".toml":
-        return path
-    here = Path(__file__).parents[1]
-    for folder in (here.parent / "scenarios", here / "scenarios"):
-        if (shipped := folder / f"{name}.toml").is_file():
-            inside = shipped.is_relative_to(Path.cwd())
-            return shipped.relative_to(Path.cwd()) if inside else shipped
-        if folder.is_dir() and not path.parent.name:
-            names = ", ".join(sorted(file.stem for file in folder.glob("*.toml")))
-            raise CallerError(f"{name}: no such file, nor a shipped scenario; there are {names}")
-    return path
+    return find_shipped(name, "scenarios")
+
+
+def cores() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def print_json(document: object) -> None:

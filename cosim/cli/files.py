@@ -1,5 +1,8 @@
 """Commands on scenario files."""
 
+from typing import Annotated
+
+import typer
 from rich.console import Console
 
 from cosim.cli.app import (
@@ -34,7 +37,24 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
 
 
 @command(FILES)
-def schema(json: JsonOption = False) -> int:
+def schema(
+    netem: Annotated[
+        bool, typer.Option("--netem", help="Of the emulator's links files instead.")
+    ] = False,
+    campaign: Annotated[
+        bool, typer.Option("--campaign", help="Of campaign files instead.")
+    ] = False,
+    json: JsonOption = False,
+) -> int:
     """Print the JSON Schema of scenario files, for editors."""
-    print_json(json_schema())
+    if campaign:
+        from cosim.campaign.plan import json_schema as campaign_schema
+
+        print_json(campaign_schema())
+    elif netem:
+        from netem.words.links import json_schema as links_schema
+
+        print_json(links_schema())
+    else:
+        print_json(json_schema())
     return ExitStatus.OK

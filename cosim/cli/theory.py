@@ -1,7 +1,5 @@
 """Commands on what is claimed: certificates, the worst losses, the paper reproduced."""
 
-import os
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +14,7 @@ from cosim.cli.app import (
     ScenarioArgument,
     SetOption,
     command,
+    cores,
     find_scenario,
     print_json,
 )
@@ -133,14 +132,10 @@ def paper(
     path = find_scenario("lane_following")
     make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = reproduce(path, draws, _cores(), progress)
+        results = reproduce(path, draws, cores(), progress)
     found = document(results, write_page(path, results, out))
     if json:
         print_json(found)
     else:
         print_claims(Console(), found)
     return ExitStatus.OK
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1

@@ -1,0 +1,128 @@
+"""From a campaign file to the points of its grid, each a scenario and what its runs share."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.batch.api import Setting, run_batch, setting_of
+from cosim.campaign.draws import Box, box_of
+from cosim.campaign.metrics import certified_error
+from cosim.campaign.plan import Campaign, Value
+from cosim.shipped import find_shipped
+from noack import toml_file
+from noack.errors import CallerError
+from noack.linear import Matrix
+from noack.matrices import Rows, require_shape
+from noack.resolve import resolve
+from noack.scenario import Scenario
+from noack.scenario_file import completed, put
+
+SCENARIOS = "scenarios"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the grid."""
+
+    number: int
+    place: tuple[int, ...]
+    """Which value of each axis."""
+    labels: Mapping[str, str]
+    """By axis."""
+    values: Mapping[str, Value]
+    """By axis: numbers where all values of it are numbers, otherwise labels."""
+    scenario: Scenario
+    """Its plant and initial state not yet drawn."""
+    certified_error: float | None
+    """Δβ, or None."""
+    work: "Work"
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a worker needs to know of a point; the same for all its chunks."""
+
+    setting: Setting
+    box: Box
+    seed: int
+
+    def run(self, draws: range) -> NDArray[np.void]:
+        """Run some successive draws; one row each."""
+        return run_batch(self.setting, self.box.population(self.seed, draws))
+
+
+def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
+    """Path and content of the scenario that all runs start from, the common settings made.
+
+    Raises:
+        CallerError: it cannot be read, or a setting does not fit.
+    """
+    beside = path.parent / campaign.scenario
+    scenario = beside if beside.is_file() else find_shipped(campaign.scenario, SCENARIOS)
+    content = toml_file.read(scenario)
+    for key, value in campaign.settings.items():
+        put(content, key, value, f"{path}: settings.{key}")
+    return scenario, content
+
+
+def grid(campaign: Campaign, path: Path) -> list[Point]:
+    """All points of a campaign's grid, in order: the last axis varies fastest.
+
+    Args:
+        campaign: the campaign.
+        path: of its file; the scenario lies beside it, and mistakes name it.
+
+    Raises:
+        CallerError: one line per mistake.
+    """
+    scenario_path, base = base_of(campaign, path)
+    points = []
+    for number, place in enumerate(campaign.selected({})):
+        content, chosen = copy.deepcopy(base), list(zip(campaign.axes, place, strict=True))
+        labels = {axis.name: axis.labels[i] for axis, i in chosen}
+        where = ", ".join(f"{name} = {label}" for name, label in labels.items())
+        source = f"{path}: at {where}"
+        for axis, i in chosen:
+            for key, value in axis.settings[i].items():
+                put(content, key, value, source)
+        scenario = completed(content, scenario_path, source)
+        values = {
+            axis.name: axis.labels[i] if axis.numbers is None else axis.numbers[i]
+            for axis, i in chosen
+        }
+        points.append(_point(campaign, number, place, labels, values, scenario, source))
+    return points
+
+
+def _point(
+    campaign: Campaign,
+    number: int,
+    place: tuple[int, ...],
+    labels: Mapping[str, str],
+    values: Mapping[str, Value],
+    scenario: Scenario,
+    source: str,
+) -> Point:
+    metrics = campaign.metrics
+    n, m = scenario.model.dimensions
+    try:
+        resolved = resolve(scenario)
+        Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
+        R = _weight(metrics.R, "metrics.R", m, "one row per input")
+    except (CallerError, ValueError) as error:
+        raise CallerError(f"{source}: {error}") from None
+    setting = replace(
+        setting_of(resolved), Q=Q, R=R, settle=metrics.settle, most_events=metrics.most_events
+    )
+    work = Work(setting, box_of(scenario), campaign.seed)
+    return Point(number, place, labels, values, scenario, certified_error(resolved), work)
+
+
+def _weight(rows: Rows | None, key: str, size: int, why: str) -> Matrix | None:
+    require_shape(rows, key, (size, size), why)
+    return None if rows is None else np.array(rows)

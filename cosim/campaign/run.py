@@ -1,0 +1,57 @@
+"""Runs a campaign: what is missing in its folder is made; what is there stays."""
+
+from collections.abc import Callable
+
+from cosim.campaign.store import Store
+from cosim.campaign.workers import LostWorkersError, Runner
+from noack.errors import ExitStatus, MachineError, NoackError
+
+Progress = Callable[[int, int], None]
+"""Told how many runs are there, and of how many."""
+
+
+class InterruptedCampaignError(NoackError):
+    """A person wanted it to end; what is written stays."""
+
+    exit_status = ExitStatus.INTERRUPTED
+
+
+def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
+    """Run what is missing; return how many runs that were.
+
+    Args:
+        store: the campaign's folder.
+        runner: who runs the chunks.
+        progress: is told how far the work is.
+
+    Raises:
+        InterruptedCampaignError: by Ctrl-C.
+        LostWorkersError: workers have died.
+        MachineError: the results cannot be written.
+    """
+    missing = list(store.missing())
+    total = len(store.points) * store.draws
+    before = done = total - sum(len(chunk.draws) for chunk in missing)
+    tell = progress or (lambda done, total: None)
+    tell(done, total)
+
+    def told(what: str) -> str:
+        return (
+            f"{what}; {done:,} of {total:,} runs are in {store.folder}, "
+            "the same command goes on from there"
+        )
+
+    try:
+        for chunk, rows in runner(store.points, missing):
+            try:
+                store.write(chunk, rows)
+            except OSError as error:
+                reason = error.strerror or str(error)
+                raise MachineError(told(f"{store.folder}: cannot be written: {reason}")) from None
+            done += len(chunk.draws)
+            tell(done, total)
+    except KeyboardInterrupt:
+        raise InterruptedCampaignError(told("interrupted")) from None
+    except LostWorkersError as error:
+        raise LostWorkersError(told(str(error))) from None
+    return total - before

@@ -1,0 +1,219 @@
+"""Who runs the chunks of a campaign: processes of this machine, or a Dask cluster.
+
+Either way chunks are independent, and their results come back here to be written by one process.
+"""
+
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
+from contextlib import contextmanager, suppress
+from itertools import islice
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.campaign.grid import Point, Work
+from cosim.campaign.store import Chunk
+from noack.errors import CallerError, PeerError
+
+Finished = tuple[Chunk, NDArray[np.void]]
+Runner = Callable[[Sequence[Point], Iterable[Chunk]], Iterator[Finished]]
+"""Runs chunks and gives their results as they come, in any order."""
+
+_AHEAD = 2
+"""Chunks under way for each worker: one that runs, one that waits."""
+_LOOK_EVERY_S = 1.0
+_PATIENCE_S = 30.0
+_CONNECT_S = 10.0
+_CONNECT_TRIES = 3
+_ONE_THREAD = dict.fromkeys(
+    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
+)
+
+
+class LostWorkersError(PeerError):
+    """Workers have died, or cannot be reached any more."""
+
+
+def alone(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    """Run chunks in this process."""
+    for chunk in chunks:
+        yield chunk, points[chunk.point].work.run(chunk.draws)
+
+
+@contextmanager
+def local(workers: int) -> Iterator[Runner]:
+    """Run chunks in so many processes of this machine."""
+    if workers == 1:
+        yield alone
+        return
+    # A fork would inherit whatever threads the libraries have started.
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(_ONE_THREAD)  # for the children, who inherit it
+    pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
+
+    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+        try:
+            yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
+        except BrokenProcessPool:
+            raise LostWorkersError(
+                "a worker process was killed (was there not enough memory?)"
+            ) from None
+
+    try:
+        yield run
+        pool.shutdown()
+    finally:
+        ours.close()  # ends those that are still at work
+        pool.shutdown(cancel_futures=True)
+        theirs.close()
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _depend_on(parent: Connection) -> None:
+    """No worker outlives the parent's end of the pipe."""
+
+    def follow() -> None:
+        parent.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _client(connect: Any, address: str) -> Any:
+    """Connect; Dask gives its thread ten seconds to begin, which a busy machine may not keep."""
+    for _ in range(_CONNECT_TRIES - 1):
+        with suppress(AssertionError):
+            return connect(address, timeout=_CONNECT_S, set_as_default=False)
+    try:
+        return connect(address, timeout=_CONNECT_S, set_as_default=False)
+    except AssertionError:
+        raise PeerError(
+            f"--scheduler {address}: the machine is too busy for Dask's client to begin"
+        ) from None
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Runner]:
+    """Run chunks on the Dask cluster of a scheduler; the workers need this noack, too.
+
+    Raises:
+        CallerError: Dask is not installed, or the address is none.
+        PeerError: the scheduler does not answer.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise CallerError(
+            "--scheduler needs Dask, which is not installed: pip install 'noack[cluster]'"
+        ) from None
+    for name in list(logging.root.manager.loggerDict):
+        if name.startswith("distributed"):  # what is to be said of its troubles is said below
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = _client(distributed.Client, address)
+    except (OSError, TimeoutError):
+        raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
+    except (ValueError, TypeError) as error:
+        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT: {error}") from None
+
+    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+        watch = _Watch(client, address)
+        executor: Executor = client.get_executor(pure=False)
+        try:
+            yield from _windowed(executor, points, chunks, watch)
+        except (ImportError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and "deserializ" not in str(error):
+                raise
+            raise PeerError(
+                f"{address}: scheduler and workers need this noack and its libraries, too"
+            ) from None
+        except CancelledError:
+            raise LostWorkersError(f"{address}: the scheduler is gone") from None
+        except distributed.scheduler.KilledWorker:
+            raise LostWorkersError(
+                f"{address}: several workers died over the same chunk (is there not enough memory?)"
+            ) from None
+
+    with client:
+        yield run
+
+
+class _Watch:
+    """How many chunks may be under way on a cluster, which grows and shrinks.
+
+    Args:
+        client: of the cluster.
+        address: of its scheduler.
+    """
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+        self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
+
+    def __call__(self) -> int:
+        """Look, though not too often.
+
+        Raises:
+            LostWorkersError: the scheduler is gone, or there has been no worker for long.
+        """
+        now_s = time.monotonic()
+        if now_s - self._looked_s > _LOOK_EVERY_S:
+            try:
+                self._cores = sum(self._client.ncores().values())
+            except (OSError, TimeoutError):
+                raise LostWorkersError(f"{self._address}: the scheduler is gone") from None
+            self._looked_s = now_s
+            if self._cores:
+                self._seen_s = now_s
+            elif now_s - self._seen_s > _PATIENCE_S:
+                raise LostWorkersError(
+                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s"
+                )
+        return max(_AHEAD * self._cores, 1)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back: what is started meanwhile never hears of it, only the parent decides."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _windowed(
+    executor: Executor,
+    points: Sequence[Point],
+    chunks: Iterable[Chunk],
+    most: Callable[[], int],
+) -> Iterator[Finished]:
+    """Keep so many chunks under way, so that memory does not grow with the campaign."""
+    rest = iter(chunks)
+    under_way: dict[Future[NDArray[np.void]], Chunk] = {}
+    while True:
+        for chunk in islice(rest, max(most() - len(under_way), 0)):
+            with _interrupts_held():
+                future = executor.submit(Work.run, points[chunk.point].work, chunk.draws)
+            under_way[future] = chunk
+        if not under_way:
+            return
+        done, _ = wait(under_way, _LOOK_EVERY_S, FIRST_COMPLETED)
+        for future in done:
+            yield under_way.pop(future), future.result()

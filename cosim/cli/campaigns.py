@@ -1,0 +1,70 @@
+"""Commands on many runs."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.app import CAMPAIGNS, DEFAULT_RUNS, JsonOption, command, cores, print_json
+from noack.errors import CallerError, ExitStatus
+
+
+@command(CAMPAIGNS)
+def campaign(
+    file: Annotated[
+        str, typer.Argument(help="Campaign file (TOML), or the name of a shipped campaign.")
+    ],
+    draws: Annotated[
+        int | None, typer.Option(help="Runs at each grid point; the file's unless given.", min=1)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes; as many as cores unless given.", min=1)
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="tcp://HOST:PORT", help="Run on the Dask cluster of this scheduler."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The campaign's folder; runs/campaigns/NAME unless given."),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Run a scenario over a grid of settings, many draws at each; say what differs, and how surely.
+
+    Takes up what a run that was cut short left in the same folder.
+    """
+    from cosim.campaign.grid import base_of, grid
+    from cosim.campaign.plan import load
+    from cosim.campaign.report import print_summary, write_report
+    from cosim.campaign.run import run_campaign
+    from cosim.campaign.store import Store, opened
+    from cosim.campaign.summary import summarise
+    from cosim.campaign.workers import cluster, local
+    from cosim.progress import PatientConsole, runs_bar
+    from cosim.shipped import find_shipped
+
+    if scheduler is not None and workers is not None:
+        raise CallerError("--workers: with --scheduler the cluster's workers are taken")
+    path = find_shipped(file, "campaigns")
+    plan = load(path)
+    points = grid(plan, path)
+    _, base = base_of(plan, path)
+    folder = out or DEFAULT_RUNS / "campaigns" / plan.name
+    store = Store(folder, points, draws or plan.draws, plan.chunk)
+    console = PatientConsole(stderr=True)
+    with opened(store.folder, plan, base):
+        runners = local(workers or cores()) if scheduler is None else cluster(scheduler)
+        with runners as runner, runs_bar(console) as progress:
+            made = run_campaign(store, runner, progress)
+        with console.status("summarising"):
+            summary = summarise(plan, store)
+            files = write_report(summary, store, base)
+    if json:
+        print_json(summary.document() | {"made": made, "files": [str(file) for file in files]})
+    else:
+        print_summary(Console(), summary)
+        for written in files:
+            print(written)
+    return ExitStatus.FAILED if summary.breaches else ExitStatus.OK

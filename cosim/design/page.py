@@ -1,0 +1,100 @@
+"""The page of a design: one file of HTML with figure and tables, and the table of a terminal."""
+
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from rich.console import Console
+from rich.table import Table
+
+from cosim import report
+from cosim.design.figure import trade_off
+from cosim.design.found import WORDS, Found, seconds
+from cosim.report.save import inline
+from noack.scenario_file import dumps
+
+_CAPTION = (
+    "Each candidate's mean number of transmissions and the quantile of its settling times, all on "
+    "the same draws; those that settle too rarely to have a quantile are left out. The star is the "
+    "chosen one on fresh draws."
+)
+_MOST_ROWS = 20
+HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
+
+
+def page(found: Found) -> str:
+    """Return the page as HTML; whatever is not the figure is escaped."""
+    limits, bounds = found.limits, found.bounds or {}
+    lines = [
+        f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
+        f"within {limits.settling_s:g} s",
+        *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
+    ]
+    certified = [f"{WORDS[name]} ≤ {value:.4g}" for name, value in bounds.items()]
+    return _templates().get_template("design.html.jinja").render(
+        title=found.scenario.name,
+        subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
+        f"seed {found.seed}",
+        verdict=found.verdict(),
+        tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
+        limits=lines,
+        certified=certified,
+        figure=Markup(inline(trade_off(found), "trade-off", _CAPTION)),
+        caption=_CAPTION,
+        headings=HEADINGS,
+        rows=rows(found),
+        scenario_toml=dumps(found.scenario),
+    )  # fmt: skip
+
+
+def rows(found: Found) -> list[tuple[str, ...]]:
+    """The trade-off curve."""
+    found_rows: list[tuple[str, ...]] = []
+    for trial in found.front:
+        family = found.space.families[trial.candidate.family]
+        found_rows.append(
+            (
+                f"{trial.measured.transmissions:.4g} ± {trial.measured.halfwidth:.2g}",
+                seconds(trial.measured),
+                f"{trial.candidate.alpha_per_s:.4g}",
+                f"{trial.candidate.beta:.4g}",
+                family.weight,
+                family.gain,
+            )
+        )
+    return found_rows
+
+
+def print_found(console: Console, found: Found) -> None:
+    """Print the trade-off curve, thinned if it is long, and the verdict."""
+    table = Table(title=f"{found.scenario.name}: trade-off, no other is smaller in both",
+                  title_justify="left")  # fmt: skip
+    for heading in HEADINGS:
+        words = heading in HEADINGS[-2:]
+        table.add_column(heading, justify="left" if words else "right", no_wrap=True)
+    every = rows(found)
+    for row in every[:: -(-len(every) // _MOST_ROWS) or 1]:
+        table.add_row(*row)
+    console.print(table)
+    if found.feasible:
+        console.print(found.verdict(), highlight=False, markup=False, soft_wrap=True)
+        console.print(
+            f"chosen among {len(found.trials):,} candidates on {found.best.measured.draws:,} "
+            f"draws; the figures are of {found.fresh.draws:,} others",
+            highlight=False,
+            soft_wrap=True,
+        )
+    for name, value in (found.bounds or {}).items():
+        console.print(f"certified      {WORDS[name]} ≤ {value:.4g}", highlight=False)
+
+
+@cache
+def _templates() -> Environment:
+    return Environment(
+        loader=FileSystemLoader([Path(__file__).parent, Path(report.__file__).parent]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
