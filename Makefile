@@ -11,6 +11,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --requir
 EDITABLE := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
 SCENARIO ?= scenarios/lane_following.toml
+CAMPAIGN ?= mb_vs_zoh
+SETTLING ?= 14
 SESSION ?= default
 ARGS ?=
 LIVE ?=
@@ -20,10 +22,10 @@ override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 help: ## Explain the targets
 	@awk 'BEGIN {FS = ":.*## "} /^##@/ {printf "\n%s\n", substr($$0, 5)} \
 		/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: SCENARIO=FILE  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
+	@printf '\nVariables: SCENARIO=FILE  CAMPAIGN=NAME  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare report certify adversary paper
+.PHONY: demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -60,6 +62,12 @@ adversary: setup ## Search the worst losses that SCENARIO's network may make
 paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/ (3 minutes)
 	@$(BIN)/noack paper --out docs $(ARGS)
 
+campaign: setup ## Run CAMPAIGN=NAME or FILE: many runs over a grid of settings, with figures
+	@$(BIN)/noack campaign "$(CAMPAIGN)" $(ARGS)
+
+design: setup ## Choose SCENARIO's trigger for the fewest transmissions; SETTLING=SECONDS
+	@$(BIN)/noack design "$(SCENARIO)" --settling $(SETTLING) $(ARGS)
+
 ##@ Five terminals, one process each (start `make record` in one, the others in any order)
 .PHONY: record plant sensor controller netem
 record: setup ## Open a run of SCENARIO and record it
@@ -78,13 +86,26 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test check format bench schema lock clean
+.PHONY: setup setup-dev test test-computing test-running check format bench schema lock clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
 
-test: setup-dev check ## Lint, types, import rules, and all tests
+# Those that only compute, which run beside the others.
+COMPUTING := $(addprefix tests/cosim/,adversary batch campaign design exact paper) tests/noack
+
+test: setup-dev check ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+ifeq ($(strip $(ARGS)),)
+	@$(MAKE) --no-print-directory --keep-going --jobs=2 test-computing test-running
+else
 	$(BIN)/python -m pytest $(ARGS)
+endif
+
+test-computing:
+	$(BIN)/python -m pytest $(COMPUTING)
+
+test-running:
+	$(BIN)/python -m pytest $(COMPUTING:%=--ignore=%)
 
 check: setup-dev ## Lint, format, strict types, import rules
 	$(BIN)/ruff check .
@@ -99,8 +120,10 @@ format: setup-dev ## Format the code
 bench: setup-dev ## Measure against the alternatives, in one run; prints tables
 	$(BIN)/python -m benchmarks $(ARGS)
 
-schema: setup ## Write the JSON Schema of scenario files to docs/
+schema: setup ## Write the JSON Schemas of scenario, campaign and links files to docs/
 	$(BIN)/noack schema > docs/scenario.schema.json
+	$(BIN)/noack schema --campaign > docs/campaign.schema.json
+	$(BIN)/noack schema --netem > docs/netem.schema.json
 
 lock: setup-dev ## Pin the dependencies anew
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \

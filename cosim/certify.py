@@ -91,7 +91,7 @@ def with_weight(
     if which == "given":
         return resolved, None
     if which == "chosen":
-        trigger = resolved.trigger
+        trigger = resolved.decaying
         try:
             weight = choose_weight(
                 loop_of(resolved), trigger.beta, trigger.alpha_per_s, resolved.network.mansd,
@@ -102,19 +102,24 @@ def with_weight(
     elif which != "identity":
         raise CallerError(f'--weight: given, identity or chosen, not "{which}"')
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
-    trigger = resolved.trigger.model_copy(update={"weight": rows})
+    trigger = resolved.decaying.model_copy(update={"weight": rows})
     return resolved.model_copy(update={"trigger": trigger}), weight
 
 
 def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -> Study:
-    """Certify a scenario under the paper's conditions and under its own schedule."""
+    """Certify a scenario under the paper's conditions and under its own schedule.
+
+    Raises:
+        CallerError: its updates are acknowledged.
+    """
+    resolved.require_unacknowledged()
     ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
     scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
     certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]
     certificates += [(SCHEDULE, scope.certificate(scheduled)) for scope in scopes]
     limits = {scope.name: _limits(scope, scheduled) for scope in scopes}
     first = certificates[0][1].constants
-    trigger = resolved.trigger
+    trigger = resolved.decaying
     theorem = (
         theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, first.delta)
         if first is not None and first.rate_per_s == trigger.alpha_per_s and not trigger.floor
@@ -156,7 +161,7 @@ def print_study(console: Console, found: Study) -> None:
 
 
 def _print_constants(console: Console, found: Study) -> None:
-    trigger = found.resolved.trigger
+    trigger = found.resolved.decaying
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
         title=f"{found.resolved.name}: what is certified, M = {found.resolved.network.mansd + 1}, "
@@ -195,7 +200,7 @@ def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
     yield (
         "decay rate, 1/s",
         constant("rate_per_s"),
-        _number(found.resolved.trigger.alpha_per_s),
+        _number(found.resolved.decaying.alpha_per_s),
     )
     yield "updates missing", constant("missing_events"), "-"
     yield (

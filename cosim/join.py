@@ -41,7 +41,7 @@ class Joined(NamedTuple):
     e_s_norm: Reals
     """(k,) ‖e_s‖_W before a reset: what the trigger tested."""
     threshold: Reals
-    """(k,)"""
+    """(k,) What ‖e_s‖_W would have to exceed for an event."""
     e_c_norm: Reals
     """(k,) ‖e_c‖_W."""
     received: NDArray[np.int64]
@@ -85,7 +85,14 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
-def join(loop: Loop, measurements: Rows, track: ControllerTrack, until_ns: int) -> Joined:
+def join(
+    loop: Loop,
+    measurements: Rows,
+    track: ControllerTrack,
+    until_ns: int,
+    *,
+    acknowledged: bool = False,
+) -> Joined:
     """Join measurements with the controller's track.
 
     Args:
@@ -93,11 +100,12 @@ def join(loop: Loop, measurements: Rows, track: ControllerTrack, until_ns: int) 
         measurements: rows of ``sensor_measurement``, ordered.
         track: the controller's states, at least from the first measurement on.
         until_ns: x_c is known up to here.
+        acknowledged: an event does not reset x_s; it shows in the next sample if one did that was
+            acknowledged.
     """
     t_ns = measurements["t_ns"]
-    x_s = np.where(
-        (measurements["event"] != NO_SEQUENCE)[:, None], measurements["x"], measurements["x_s"]
-    )
+    reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
+    x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
     x_c, received = _at(loop.H, track, t_ns, until_ns)
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
@@ -108,10 +116,21 @@ def join(loop: Loop, measurements: Rows, track: ControllerTrack, until_ns: int) 
         x_s,
         x_c,
         measurements["e_s_norm"],
-        measurements["threshold"],
+        _threshold(measurements),
         np.linalg.norm(e_c, axis=1),
         received,
     )
+
+
+def _threshold(measurements: Rows) -> Reals:
+    """Where ‖e_s‖_W would be an event, if the sides of the comparison grew with it alike.
+
+    For a trigger that compares ‖e_s‖_W itself, as the paper's does, this is its threshold.
+    """
+    left, right = measurements["compared"], measurements["threshold"]
+    norms = measurements["e_s_norm"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(left == norms, right, right * (norms / left)))
 
 
 def _at(
@@ -136,7 +155,8 @@ def join_all(record: RunRecord) -> Joined:
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
     reach_ns = int(track.model_ns[-1]) + record.scenario.controller_period_ns
-    return join(record.loop, record[SENSOR_MEASUREMENT], track, reach_ns)
+    acknowledged = record.scenario.is_acknowledged
+    return join(record.loop, record[SENSOR_MEASUREMENT], track, reach_ns, acknowledged=acknowledged)
 
 
 def identity_residual(record: RunRecord, joined: Joined) -> Reals:
@@ -144,7 +164,10 @@ def identity_residual(record: RunRecord, joined: Joined) -> Reals:
 
     Zero to rounding on every run, whatever was lost. NaN where x_c is not recorded, and as long as
     sensor and controller have nothing in common: before the first delivery, unless x(0) is known.
+    NaN throughout where updates are acknowledged: it presupposes that x_s is reset at every event.
     """
+    if record.scenario.is_acknowledged:
+        return np.full(len(joined.t_ns), np.nan)
     measurements = record[SENSOR_MEASUREMENT]
     known = record.scenario.network.initial_sync == "known_state"
     missed = MissedJumps(record.loop.H)

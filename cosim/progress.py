@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cosim.launch import Watcher
 from noack.clock import NS_PER_S
@@ -88,6 +88,30 @@ def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
     with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
         task = progress.add_task("", total=1)
         yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+@contextmanager
+def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show how many runs of how many there are, and until when, on a terminal only."""
+    columns = (
+        BarColumn(),
+        TextColumn("{task.completed:,.0f}/{task.total:,.0f} runs"),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
+    disabled = not console.is_terminal
+    began_s, before = time.monotonic(), -1
+    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
+        task = progress.add_task("", total=1, rate="")
+
+        def update(done: int, total: int) -> None:
+            nonlocal before
+            before = done if before < 0 else before
+            rate = (done - before) / max(time.monotonic() - began_s, 1e-3)
+            text = f"{rate:,.0f}/s" if done > before else ""
+            progress.update(task, completed=done, total=total, rate=text)
+
+        yield update
 
 
 @contextmanager

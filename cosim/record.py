@@ -57,10 +57,21 @@ class RunRecord:
         self.reports = reports
         self.kind: Kind = kind
         self._rows = rows
+        self.tables = tables_of(scenario)
 
     def __getitem__(self, table: str) -> Rows:
         """Rows of a table of ``noack.records``."""
         return self._rows[table]
+
+    def owned_by(self, role: str) -> dict[str, Rows]:
+        """The tables that a process fills."""
+        return {table: self[table] for table in self.tables if OWNER[table] == role}
+
+
+def tables_of(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
+    """The row types of the tables that runs of a resolved scenario have."""
+    loop = loop_of(scenario)
+    return tables(loop.n, loop.m, acknowledged=scenario.is_acknowledged)
 
 
 def load_record(run_dir: Path) -> RunRecord:
@@ -77,10 +88,9 @@ def load_record(run_dir: Path) -> RunRecord:
             f"{run_dir}: has no numeric record; `noack summary` finishes a run that was cut short"
         )
     scenario = load(run_dir / SCENARIO_FILE)
-    loop = loop_of(scenario)
     rows = {
         table: _from_parquet(folder / f"{table}.parquet", dtype)
-        for table, dtype in tables(loop.n, loop.m).items()
+        for table, dtype in tables_of(scenario).items()
     }
     return RunRecord(scenario, rows, _read_notices(folder), _reports(run_dir), kind_of(run_dir))
 
@@ -93,7 +103,7 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
     """
     folder, loop = run_dir / RECORD, record.loop
     folder.mkdir(exist_ok=True)
-    for table in tables(loop.n, loop.m):
+    for table in record.tables:
         _to_parquet(record[table], folder / f"{table}.parquet", loop)
     with (folder / _NOTICES_FILE).open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(notice) + "\n" for notice in record.notices)
@@ -108,10 +118,10 @@ def finish_record(run_dir: Path) -> RunRecord:
         MachineError: the record cannot be written; the spool is kept.
     """
     scenario = load(run_dir / SCENARIO_FILE)
-    loop, spool, folder = loop_of(scenario), run_dir / SPOOL, run_dir / RECORD
+    spool, folder = run_dir / SPOOL, run_dir / RECORD
     rows = {
         table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)
-        for table, dtype in tables(loop.n, loop.m).items()
+        for table, dtype in tables_of(scenario).items()
     }
     notices = _notices(folder, spool)
     record = RunRecord(scenario, rows, notices, _reports(run_dir), kind_of(run_dir))
@@ -138,8 +148,14 @@ def merge_rows(parts: Sequence[Rows], dtype: np.dtype[np.void]) -> Rows:
     return rows[first]
 
 
-def updates_in(packets: Rows) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
+def updates_in(
+    packets: Rows, flow: Flow = Flow.UPDATE
+) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64]]:
     """Pick the loop's updates from what reached the network emulator, which reads no payload.
+
+    Args:
+        packets: rows of ``netem_packet``.
+        flow: the updates, or what else.
 
     Returns:
         Their rows of ``netem_packet``, sequence numbers and event times.
@@ -147,7 +163,7 @@ def updates_in(packets: Rows) -> tuple[Rows, NDArray[np.int64], NDArray[np.int64
     kept, sequences, events_ns = [], [], []
     for i, head in enumerate(packets["head"]):
         header = read_header(head.tobytes())
-        if header is None or (header.version, header.flow) != (VERSION, Flow.UPDATE):
+        if header is None or (header.version, header.flow) != (VERSION, flow):
             continue
         if header.sequence < 2**63 and header.t_ns >= 0:  # what else has no place in the record
             kept.append(i)

@@ -12,7 +12,7 @@ import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.environment import Kind
-from cosim.record import RunRecord, finish_record, updates_in
+from cosim.record import RunRecord, finish_record, tables_of, updates_in
 from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
@@ -24,10 +24,16 @@ from noack.io.plane import Plane
 from noack.io.process import run_process
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import NOTICES, first_row, missing_ranges, notices_of
-from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, SENSOR_MEASUREMENT, Fate, tables
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    SENSOR_MEASUREMENT,
+    effective,
+)
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES, RECORDER
+from noack.trigger.text import trigger_text
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
@@ -55,7 +61,7 @@ class Recorder:
         live: str | None = None,
     ) -> None:
         self._loop: Loop = loop_of(scenario)
-        self._types = tables(self._loop.n, self._loop.m)
+        self._types = tables_of(scenario)
         self._run_dir = run_dir
         self._plane = plane
         self._spool = SpoolWriter(run_dir / SPOOL, RECORDER)
@@ -158,11 +164,15 @@ class Recorder:
             account["x_norm"] = float(np.linalg.norm(rows["x"][-1]))
         elif table == CONTROLLER_DELIVERY:
             account["deliveries"] += len(rows)
+            # With what was overtaken, which the network emulator does not know beforehand.
+            self._see_run(rows["dropouts"])
         elif table == NETEM_PACKET:
             rows = updates_in(rows)[0]
-            dropped = rows["drop_run"][rows["fate"] == Fate.DROPPED]
-            longest = int(dropped.max()) if len(dropped) else 0
-            account["longest_drop_run"] = max(account["longest_drop_run"], longest)
+            self._see_run(rows["drop_run"][~effective(rows["fate"])])
+
+    def _see_run(self, lost: np.ndarray[Any, np.dtype[np.int64]]) -> None:
+        longest = int(lost.max(initial=0))
+        self._account["longest_drop_run"] = max(self._account["longest_drop_run"], longest)
 
     def _goodbye(self, query: zenoh.Query) -> None:
         role = str(query.key_expr).rpartition("/")[2]
@@ -220,22 +230,25 @@ def open_view(
 
 def about(scenario: Scenario, kind: Kind = "live") -> str:
     """Markdown that says what the view shows."""
-    trigger, network = scenario.trigger, scenario.network
+    network = scenario.network
     late = {
         "live": "* **Lateness**: wall time by which each process acted after its input was due.",
         "simulated": "* The run was **simulated**, in virtual time: nothing was ever late.",
     }[kind]
+    protocol, x_s_is_reset = "Nothing is acknowledged.", "at every event"
+    if scenario.is_acknowledged:
+        protocol, x_s_is_reset = "**Updates are acknowledged.**", "when an update is acknowledged"
     hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
     return f"""# {scenario.name}
 
 {scenario.description}
 
 Sensor and controller run **{hold}** between updates. The sensor transmits when
-‖e_s‖ exceeds max(β e^(−αt), ε) with β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s,
-ε = {trigger.floor:g}. The network ({network.loss.model.replace("_", "-")} loss) drops at most
-M − 1 = {network.mansd} packets in a row. Nothing is acknowledged.
+{trigger_text(scenario.trigger)}.
+The network ({network.loss.model.replace("_", "-")} loss) drops at most
+M − 1 = {network.mansd} packets in a row. {protocol}
 
-* **States**: the plant's x, the sensor's model x_s (reset at every event), the controller's model
+* **States**: the plant's x, the sensor's model x_s (reset {x_s_is_reset}), the controller's model
   x_c (reset only by what survives). Where x_c leaves the other two, packets were lost.
 * **Intervals**: time since the last broadcast, and since the last reception.
 * **Errors**: e_s = x_s − x against its threshold, and e_c = x_c − x, which nobody in the loop can
@@ -303,8 +316,7 @@ def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
     """Write a run's recording from its finished record."""
     with open_view(record.scenario, run_dir, run_id, None, record.kind) as view:
         feed = ViewFeed(record.scenario, view)
-        loop = loop_of(record.scenario)
-        for table in tables(loop.n, loop.m):
+        for table in record.tables:
             feed.add(table, record[table])
         for notice in record.notices:
             feed.log(notice)

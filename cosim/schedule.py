@@ -43,7 +43,9 @@ def live_run(record: RunRecord) -> LiveRun:
 
     Raises:
         IncomparableError: the run diverged, or its record is too short or has gaps.
+        CallerError: its updates were acknowledged.
     """
+    record.scenario.require_unacknowledged()
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
     if len(sensor) < _LEAST_MEASUREMENTS:
         raise IncomparableError(

@@ -2,28 +2,36 @@
 
 import json
 import math
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.join import identity_residual, join_all
-from cosim.record import Rows, RunRecord, updates_in
+from cosim.crossing import Crossing, crossing
+from cosim.join import Joined, identity_residual, join_all
+from cosim.record import (
+    Rows,
+    RunRecord,
+)
 from noack.errors import ExitStatus
 from noack.io.node import HORIZON
 from noack.records import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NETEM_PACKET,
     NO_SEQUENCE,
     OWNER,
     PLANT_ACTUATION,
     PLANT_STEP,
+    SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
     Fate,
+    effective,
 )
 from noack.theory.assumptions import assumptions
 from noack.topology import LOOP_ROLES
+from noack.wire import Flow
 
 Summary = dict[str, Any]
 
@@ -47,12 +55,13 @@ def _summarise(
     record: RunRecord, exit_status: int, reason: str, startup_s: float | None
 ) -> Summary:
     scenario = record.scenario
-    sensor, (packets, _, _) = record[SENSOR_MEASUREMENT], updates_in(record[NETEM_PACKET])
+    sensor, crossed = record[SENSOR_MEASUREMENT], crossing(record)
     events = sensor[sensor["event"] != NO_SEQUENCE]
     intervals_s = np.diff(events["t_ns"]) * 1e-9
     joined = join_all(record)
     residual = identity_residual(record, joined)
-    in_common = ~np.isnan(residual)
+    residual = residual[~np.isnan(residual)]
+    in_common = _in_common(record, joined)
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
     diverged_at_s = _diverged_at_s(record[PLANT_STEP])
@@ -71,9 +80,10 @@ def _summarise(
         "reached_s": _last_s(record[PLANT_STEP]),
         "events": len(events),
         "deliveries": len(record[CONTROLLER_DELIVERY]),
-        "drops": int((packets["fate"] == Fate.DROPPED).sum()),
-        "forced_deliveries": int((packets["fate"] == Fate.FORCED).sum()),
-        "longest_drop_run": int(packets["drop_run"].max(initial=0)),
+        "drops": int(crossed.lost.sum()),
+        "drops_by_cause": _causes(crossed),
+        "forced_deliveries": int((crossed.rows["fate"] == Fate.FORCED).sum()),
+        "longest_drop_run": crossed.longest_run(),
         "assumption_violations": _violations(record),
         "assumptions": [assumption._asdict() for assumption in assumptions(scenario)],
         "missing_samples": sum(missing.values()),
@@ -81,9 +91,9 @@ def _summarise(
         "lost_outside_netem": sum(lost.values()),
         "lost_by_leg": {leg: n for leg, n in lost.items() if n},
         "rejected_datagrams": {
-            role: report["channel"]["rejected"]
+            role: rejected
             for role, report in record.reports.items()
-            if report["channel"].get("rejected")
+            if (rejected := _rejected(report["channel"]))
         },
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
@@ -92,10 +102,10 @@ def _summarise(
         "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
         "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[in_common]),
-        "identity_residual_max": _or_none(np.max, residual[in_common]),
+        "identity_residual_max": _or_none(np.max, residual),
         "identity_residual_relative": _or_none(
             lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),
-            residual[in_common],
+            residual,
         ),
         "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES if live},
         "latency_us": _latency(record) if live else None,
@@ -103,8 +113,28 @@ def _summarise(
         "diverged_at_s": diverged_at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }
+    if scenario.is_acknowledged:
+        summary["acknowledgements"] = _acknowledgements(record)
     finite: Summary = _finite(summary)
     return finite
+
+
+def _in_common(record: RunRecord, joined: Joined) -> NDArray[np.bool_]:
+    """Where x_c is on record, and sensor and controller have something in common."""
+    known = record.scenario.network.initial_sync == "known_state"
+    common = known | (joined.received != NO_SEQUENCE)
+    return np.asarray(~np.isnan(joined.x_c).any(axis=1) & common)
+
+
+def _acknowledgements(record: RunRecord) -> dict[str, int]:
+    """What became of the acknowledgements; the controller sends one for each update it takes."""
+    crossed = crossing(record, Flow.ACKNOWLEDGEMENT)
+    return {
+        "sent": len(record[CONTROLLER_DELIVERY]),
+        "lost": int(crossed.lost.sum()),
+        "longest_loss_run": crossed.longest_run(),
+        "received": len(record[SENSOR_ACKNOWLEDGEMENT]),
+    }
 
 
 def _finite(value: Any) -> Any:
@@ -114,6 +144,12 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
+    """What a process rejected, by reason, of all that it hears."""
+    heard = Counter(channel.get("rejected") or {})
+    return dict(heard + Counter((channel.get("acknowledgements") or {}).get("rejected") or {}))
 
 
 def _diverged_at_s(steps: Rows) -> float | None:
@@ -129,15 +165,24 @@ def _violations(record: RunRecord) -> list[dict[str, Any]]:
         if notice["level"] == "violation"
     ]
     mansd = record.scenario.network.mansd
-    packets, _, event_ns = updates_in(record[NETEM_PACKET])
-    survived = np.flatnonzero(packets["fate"] != Fate.DROPPED)
+    crossed = crossing(record)
+    survived = np.flatnonzero(~crossed.lost)
     last = int(survived[-1]) + 1 if len(survived) else 0
-    dropped = len(packets) - last
+    dropped = len(crossed.lost) - last
     if dropped > mansd:
         what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
-        at_s = float(event_ns[last + mansd]) * 1e-9
+        at_s = float(crossed.event_ns[last + mansd]) * 1e-9
         seen.append({"t_s": at_s, "process": "netem", "what": what})
     return seen
+
+
+def _causes(crossed: Crossing) -> dict[str, int]:
+    """How many updates were lost by what."""
+    fates = crossed.rows["fate"]
+    causes = {
+        fate.name.lower(): int((fates == fate).sum()) for fate in Fate if not fate.effective
+    } | {"overtaken": int((effective(fates) & crossed.lost).sum())}
+    return {cause: n for cause, n in causes.items() if n}
 
 
 def _last_s(rows: Rows) -> float:
@@ -151,7 +196,7 @@ def _or_none(statistic: Any, values: NDArray[np.float64]) -> float | None:
 def _missing(record: RunRecord) -> dict[str, int]:
     """Rows that a process made and the record lacks, by table."""
     missing: dict[str, int] = {}
-    for table in OWNER:
+    for table in record.tables:
         report = record.reports.get(OWNER[table])
         if report is not None:
             missing[table] = report["rows"][table] - len(record[table])
@@ -159,28 +204,31 @@ def _missing(record: RunRecord) -> dict[str, int]:
         if role in record.reports:
             continue
         # The process died without a report: its inputs are numbered, so gaps still show.
-        inputs = np.concatenate(
-            [record[table]["input"] for table, owner in OWNER.items() if owner == role]
-        )
+        inputs = np.concatenate([rows["input"] for rows in record.owned_by(role).values()])
         missing[role] = int(inputs.max() + 1 - len(inputs)) if len(inputs) else 0
     return missing
 
 
 def _lost(record: RunRecord) -> dict[str, int]:
     """Datagrams that were sent and did not arrive, other than by the emulator's decision."""
-    sensor, packets = record[SENSOR_MEASUREMENT], record[NETEM_PACKET]
+    sensor, crossed = record[SENSOR_MEASUREMENT], crossing(record)
     every = record.scenario.plant.measure_every
     sent = record[PLANT_STEP]["sequence"]
-    packets, entered, _ = updates_in(packets)
     legs = {
         "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
-        "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], entered),
+        "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], crossed.sequence),
         "update to controller": (
-            entered[packets["fate"] != Fate.DROPPED],
+            crossed.sequence[crossed.left],
             record[CONTROLLER_DELIVERY]["sequence"],
         ),
         "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
     }
+    if record.scenario.is_acknowledged:
+        answers = crossing(record, Flow.ACKNOWLEDGEMENT)
+        taken = record[CONTROLLER_DELIVERY]["sequence"]
+        legs["acknowledgement to netem"] = (taken, answers.sequence)
+        arrived = record[SENSOR_ACKNOWLEDGEMENT]["sequence"]
+        legs["acknowledgement to sensor"] = (answers.sequence[answers.left], arrived)
     whole = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
     lost: dict[str, int] = {}
     for leg, (out, arrived) in legs.items():
@@ -204,7 +252,8 @@ def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
     time, the network's is the event's.
     """
     if role == "netem":
-        rows, _, due_ns = updates_in(record[NETEM_PACKET])
+        crossed = crossing(record)
+        rows, due_ns = crossed.rows, crossed.event_ns
     else:
         steps = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
         rows = record[steps[role]]
@@ -217,7 +266,7 @@ def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
     scenario = record.scenario
     period_ns = {
         "plant": scenario.plant_period_ns,
-        "sensor": scenario.plant_period_ns * scenario.plant.measure_every,
+        "sensor": scenario.measurement_period_ns,
         "controller": scenario.controller_period_ns,
         "netem": scenario.plant_period_ns,
     }[role]

@@ -81,7 +81,9 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
         ("events (transmissions)", str(events)),
         ("deliveries", str(deliveries)),
         ("  of these forced (t_0 or cap)", str(summary["forced_deliveries"])),
-        ("dropped by the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
+        ("lost in the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
+        *_causes(summary),
+        *_acknowledgements(summary.get("acknowledgements")),
         ("longest drop run", f"{summary['longest_drop_run']} (at most {summary['mansd']})"),
         ("drop runs beyond M − 1", str(len(summary["assumption_violations"]))),
         ("shortest inter-event time", _seconds(summary["inter_event_min_s"])),
@@ -99,11 +101,32 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
     )  # fmt: skip
 
 
+def _causes(summary: Summary) -> Iterator[tuple[str, str]]:
+    causes = summary.get("drops_by_cause") or {}
+    if set(causes) - {"dropped"}:
+        for cause, number in causes.items():
+            yield f"  of these {cause.replace('_', ' ')}", str(number)
+
+
+def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]:
+    if found is not None:
+        yield "acknowledgements", str(found["sent"])
+        yield "  of these lost", f"{found['lost']} ({_percent(found['lost'], found['sent'])})"
+        yield "  longest run of losses", str(found["longest_loss_run"])
+
+
 def print_claims(console: Console, summary: Summary) -> None:
     """Print what was claimed of a run, and what became of it."""
     claims = summary.get("claims")
     if not claims:
         return
+    if summary.get("kind", "live") == "live" and any(
+        "felt after" in c["why"] or " old" in c["why"] for c in claims
+    ):
+        console.print(
+            "this machine was late, which voids claims that do not allow for it: a greater "
+            "certificate.late_periods does, where it can be certified; noack simulate is never late"
+        )
     table = Table(title="claims, and what this run says of them")
     for heading in ("source", "claim", "used", "verdict"):
         table.add_column(heading, justify="right" if heading == "used" else "left")
@@ -121,13 +144,6 @@ def print_claims(console: Console, summary: Summary) -> None:
         if verdict != "held" and why:
             console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",
                           highlight=False, markup=False)  # fmt: skip
-    if summary.get("kind", "live") == "live" and any(
-        "felt after" in c["why"] or " old" in c["why"] for c in claims
-    ):
-        console.print(
-            "[dim]this machine was late: a greater certificate.late_periods allows for it, "
-            "where it can be certified; noack simulate is never late[/]"
-        )
 
 
 def _sources(claims: list[dict[str, Any]], verdict: str, why: str) -> str:

@@ -15,14 +15,24 @@ import numpy as np
 
 from controller_node.controller import controller_of
 from cosim.record import Rows, RunRecord
-from netem.link import Datagram, update_link_of
+from netem.duplex import network_of
+from netem.link import Datagram
 from noack.io.node import HORIZON
 from noack.machine import Machine, Notice, Record
-from noack.records import NETEM_PACKET, OWNER, PACKET_HEAD_BYTES, Fate, tables
+from noack.records import (
+    ACKNOWLEDGEMENTS,
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    OWNER,
+    PACKET_HEAD_BYTES,
+    UPDATES,
+    Fate,
+    tables,
+)
 from noack.resolve import loop_of
 from noack.scenario import Scenario
-from noack.topology import LEGS, LOOP_ROLES
-from noack.wire import KEY_BYTES, Decoder, Encoder, Flow
+from noack.topology import ACKNOWLEDGES_TO, LEGS, LOOP_ROLES
+from noack.wire import KEY_BYTES, Decoder, Encoder, Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
@@ -53,7 +63,9 @@ class DecidedLink:
 
     def __init__(self, decide: Network) -> None:
         self._decide = decide
+        self._inputs = 0
         self._packets = 0
+        self._newest = -1
         self._drop_run = 0
         self._under_way: list[tuple[int, int, Datagram]] = []
 
@@ -63,7 +75,12 @@ class DecidedLink:
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Let a datagram out."""
-        return (heapq.heappop(self._under_way)[2],)
+        release_ns, packet, datagram = heapq.heappop(self._under_way)
+        stale = packet < self._newest
+        self._newest = max(self._newest, packet)
+        row = (self._inputs, packet, release_ns, now_ns, datagram.flow, 0, int(stale))
+        self._inputs += 1
+        return (datagram, Record(NETEM_RELEASE, row))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Take a datagram; return it if it survives and is not delayed."""
@@ -71,16 +88,20 @@ class DecidedLink:
         self._drop_run = self._drop_run + 1 if delay_ns is None else 0
         fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+        release_ns = -1 if delay_ns is None else now_ns + delay_ns
         row = (
-            self._packets, self._packets, now_ns, now_ns,
-            message.flow, fate, self._drop_run, len(message.data), head,
+            self._inputs, self._packets, now_ns, now_ns,
+            message.flow, fate, self._drop_run, release_ns, -1, -1, len(message.data), head,
         )  # fmt: skip
         record = Record(NETEM_PACKET, row)
+        packet = self._packets
+        self._inputs += 1
         self._packets += 1
         if delay_ns == 0:
+            self._newest = max(self._newest, packet)
             return (message, record)
         if delay_ns is not None:
-            heapq.heappush(self._under_way, (now_ns + delay_ns, self._packets, message))
+            heapq.heappush(self._under_way, (release_ns, packet, message))
         return (record,)
 
 
@@ -95,6 +116,7 @@ class Shuttle:
         n: number of states.
         m: number of inputs.
         take: takes each row and notice, with the role that emitted it.
+        acknowledged: whether updates are acknowledged.
     """
 
     def __init__(
@@ -103,6 +125,8 @@ class Shuttle:
         n: int,
         m: int,
         take: Callable[[str, Record | Notice], None],
+        *,
+        acknowledged: bool = False,
     ) -> None:
         self.machines = machines
         self._take = take
@@ -112,10 +136,12 @@ class Shuttle:
             for role, leg in LEGS.items()
             if role != "netem"  # which reads no payload
         }
+        self.acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, RUN_ID, _KEY)
+        self._acknowledged = acknowledged
         self._timers = [
             (machines[role].next_deadline_ns, rank, role) for role, rank in _TIMER_RANKS.items()
         ]
-        self._sent: deque[tuple[str, bytes]] = deque()
+        self._sent: deque[tuple[str, str, bytes]] = deque()
         self._now_ns = 0
 
     def run(self) -> Iterator[int]:
@@ -138,8 +164,14 @@ class Shuttle:
             due.append((self._now_ns, _DATAGRAM_RANK, ""))
         return min(due, default=None)
 
-    def _receive(self, role: str, data: bytes) -> bool:
-        message = Datagram(0, data) if role == "netem" else self.decoders[role].decode(data)
+    def _receive(self, sender: str, role: str, data: bytes) -> bool:
+        message: Datagram | Message | None
+        if role == "netem":
+            message = Datagram(ACKNOWLEDGEMENTS if sender == "controller" else UPDATES, data)
+        elif (sender, role) == ("netem", "sensor"):
+            message = self.acknowledgements.decode(data)
+        else:
+            message = self.decoders[role].decode(data)
         if message is None:
             return False
         self._emit(role, self.machines[role].handle(message, self._now_ns))
@@ -152,7 +184,9 @@ class Shuttle:
             else:
                 forwarded = isinstance(output, Datagram)
                 data = output.data if forwarded else self._encoder.encode(output)
-                self._sent.append((LEGS[role].to, data))
+                answers = output.flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
+                to = ACKNOWLEDGES_TO[role] if answers and self._acknowledged else LEGS[role].to
+                self._sent.append((role, to, data))
 
 
 class _Gathered:
@@ -190,28 +224,31 @@ def simulate(
 
     Args:
         resolved: the resolved scenario; its speed, ports and real-time settings play no part.
-        network: decides each update's fate; by default the scenario's own network does, which loses
-            what it would in a live run, and delays nothing.
+        network: decides each update's fate; by default the scenario's own network does what it
+            would in a live run.
         progress: is told how far the run is.
 
     Returns:
         The record of the run; reports hold what applies: no sockets, no real-time settings.
     """
     loop = loop_of(resolved)
-    gathered = _Gathered(tables(loop.n, loop.m))
+    acknowledged = resolved.is_acknowledged
+    gathered = _Gathered(tables(loop.n, loop.m, acknowledged=acknowledged))
     machines: dict[str, Machine[Any]] = {
         "plant": plant_of(resolved),
         "sensor": sensor_of(resolved),
-        "netem": update_link_of(resolved) if network is None else DecidedLink(network),
+        "netem": network_of(resolved, None if network is None else DecidedLink(network)),
         "controller": controller_of(resolved),
     }
-    shuttle = Shuttle(machines, loop.n, loop.m, gathered.take)
+    shuttle = Shuttle(machines, loop.n, loop.m, gathered.take, acknowledged=acknowledged)
     with np.errstate(all="ignore"):  # a loop that diverges has a record, too
         for happened, now_ns in enumerate(shuttle.run()):
             if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:
                 progress(now_ns)
     rows = gathered.rows()
     reports = {role: _report(role, rows, shuttle.decoders.get(role)) for role in LOOP_ROLES}
+    if acknowledged:
+        reports["sensor"]["channel"]["acknowledgements"] = shuttle.acknowledgements.report()
     notices = sorted(gathered.notices, key=lambda notice: int(notice["t_ns"]))
     return RunRecord(resolved, rows, notices, reports, "simulated")
 
@@ -219,7 +256,6 @@ def simulate(
 def _report(role: str, rows: Mapping[str, Rows], decoder: Decoder | None) -> dict[str, Any]:
     channel: dict[str, Any] = {"rejected": {}}
     if decoder is not None:
-        rejected = {reason.value: n for reason, n in decoder.rejected.items() if n}
-        channel = {"accepted": decoder.accepted, "rejected": rejected}
-    owned = {table: len(rows[table]) for table, owner in OWNER.items() if owner == role}
+        channel = decoder.report()
+    owned = {table: len(found) for table, found in rows.items() if OWNER[table] == role}
     return {"ended": HORIZON, "channel": channel, "rows": owned}

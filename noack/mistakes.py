@@ -1,36 +1,33 @@
-"""Words for mistakes in a scenario: ``file: key = value: what is wrong; what would be right``."""
+"""Words for mistakes in a settings file: ``file: key = value: what is wrong; what is right``."""
 
 import difflib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, get_args
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
-from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
-
-from noack.scenario import Loss, Scenario
-
-_LOSS = ("network", "loss")
-_LOSSES: Mapping[str, type[BaseModel]] = {
-    get_args(settings.model_fields["model"].annotation)[0]: settings
-    for settings in get_args(get_args(Loss)[0])
-}
 
 _REMEDIES = {
     "string_pattern_mismatch": "use letters, digits, _ and -, beginning with a letter or digit, "
     "at most 64",
-    "too_short": "needs at least one entry",
     "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",
 }
 
 
-def explain(error: ValidationError, source: str) -> list[str]:
-    """Return one line per mistake; ``source`` names the file."""
+def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
+    """Return one line per mistake.
+
+    Args:
+        error: what the validation raised.
+        source: names the file.
+        root: the model that the whole file was validated against.
+    """
     mistakes = error.errors()
     places = [mistake["loc"] for mistake in mistakes]
     return [
-        f"{source}: {_explain(mistake)}"
+        f"{source}: {_explain(mistake, root)}"
         for mistake in mistakes
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
     ]
@@ -41,78 +38,141 @@ def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
     return any(len(other) > len(place) and other[: len(place)] == place for other in places)
 
 
-def _explain(mistake: ErrorDetails) -> str:
-    path, section = _locate(mistake["loc"])
-    key = ".".join(map(str, path))
+def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
+    at = _locate(mistake["loc"], root)
+    key = ".".join(map(str, at.path))
     value, kind = mistake["input"], mistake["type"]
     shown = f"{key} = {_show(value)}"
     if kind == "missing":
-        return f"{key}: missing{_purpose(section, str(path[-1]))}"
+        return f"{key}: missing{_purpose(at.section, str(at.path[-1]))}"
     if kind == "extra_forbidden":
-        return f"{shown}: unknown key; {_nearest(str(path[-1]), section)}"
+        return f"{shown}: unknown key; {_nearest(str(at.path[-1]), at.section)}"
     if kind == "value_error":
         return _own_check(key, value, str(mistake["ctx"]["error"]))
-    if kind in ("union_tag_invalid", "union_tag_not_found"):
-        return _loss_model(key, value)
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{shown}: should be a table{_table_example(path)}"
+    chosen = kind in ("union_tag_invalid", "union_tag_not_found")
+    if chosen and isinstance(value, Mapping):
+        return _choice(key, value, at)
+    if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{shown}: should be a table{_table_example(at)}"
+    if kind == "too_short":
+        least = mistake["ctx"]["min_length"]
+        return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
     message = mistake["msg"].replace("Input should", "should")
     return f"{shown}: {_REMEDIES.get(kind, message[0].lower() + message[1:])}"
 
 
-def _locate(place: Sequence[Any]) -> tuple[list[Any], type[BaseModel] | None]:
-    """The key's path, and the section that it lies in.
+class _Place(NamedTuple):
+    """Where in a file something is wrong."""
 
-    Pydantic names the chosen loss model within the path; it is no key of the file.
-    """
-    path = list(place)
-    if tuple(path[:2]) == _LOSS and len(path) > 3:
-        loss = _LOSSES.get(str(path.pop(2)))
-        return path, loss
-    section: type[BaseModel] | None = Scenario
-    for part in path[:-1]:
-        field = section.model_fields.get(str(part)) if section else None
-        section = _section_of(field)
-    return path, section
+    path: Sequence[Any]
+    """Of the key."""
+    section: type[BaseModel] | None
+    """In which the key lies."""
+    choices: Mapping[str, type[BaseModel]]
+    """What a table there may be, by the value of the key that chooses."""
+    discriminator: str
+    """The key that chooses."""
 
 
-def _section_of(field: FieldInfo | None) -> type[BaseModel] | None:
-    kind = field.annotation if field is not None else None
-    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
+    """Find a place; pydantic names chosen tables within the path, which are no keys of the file."""
+    kind: Any = root
+    path: list[Any] = []
+    section: type[BaseModel] | None = None
+    for part in place:
+        choices, _ = _choices(kind)
+        if part in choices:
+            kind = choices[part]
+            continue
+        path.append(part)
+        kind, section = _within(kind, part)
+    return _Place(path, section, *_choices(kind))
+
+
+def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
+    """The annotation of an entry of ``kind``, and the section that it lies in."""
+    section = _section_of(kind)
+    if section is not None:
+        field = section.model_fields.get(str(part))
+        return (None if field is None else field.annotation), section
+    entries = [entry for inner in _alternatives(kind) for entry in get_args(inner)]
+    return (entries[0] if isinstance(part, int) and entries else None), None
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """What a value may be, without metadata: A and B for ``Annotated[A | B, ...]``."""
+    if get_origin(kind) is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return [inner for one in get_args(kind) for inner in _alternatives(one)]
+    return [kind]
+
+
+def _sections(kind: Any) -> list[type[BaseModel]]:
+    return [
+        one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)
+    ]
+
+
+def _section_of(kind: Any) -> type[BaseModel] | None:
+    sections = _sections(kind)
+    return sections[0] if len(sections) == 1 else None
+
+
+def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
+    """The tables that a value may be, by the key that all of them have a name of their own for."""
+    sections = _sections(kind)
+    if len(sections) < 2:
+        return {}, ""
+    key = next(
+        name for name, field in sections[0].model_fields.items()
+        if get_origin(field.annotation) is Literal
+    )  # fmt: skip
+    return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
 
 
 def _own_check(key: str, value: Any, message: str) -> str:
     """A section's own check says ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
-    if not colon:
-        return f"{key}: {message}"
+    if not colon or not isinstance(value, Mapping):
+        shown = f" = {_show(value)}" if isinstance(value, str) else ""
+        return f"{key}{shown}: {message}"
     path = f"{key}.{inner}" if key else inner
     for part in inner.split("."):
-        if not isinstance(value, Mapping) or part not in value:
+        try:
+            value = value[int(part) if isinstance(value, list) else part]
+        except (KeyError, IndexError, ValueError, TypeError):
             return f"{path}: {rest}"
-        value = value[part]
     return f"{path} = {_show(value)}: {rest}"
 
 
-def _loss_model(key: str, value: Any) -> str:
-    known = ", ".join(_LOSSES)
-    if not isinstance(value, Mapping) or "model" not in value:
-        return f"{key}.model: missing; one of {known}"
-    close = difflib.get_close_matches(str(value["model"]), _LOSSES, n=1)
+def _choice(key: str, value: Any, at: _Place) -> str:
+    known = ", ".join(at.choices)
+    key = f"{key}.{at.discriminator}"
+    if not isinstance(value, Mapping) or at.discriminator not in value:
+        return f"{key}: missing; one of {known}"
+    chosen = value[at.discriminator]
+    close = difflib.get_close_matches(str(chosen), at.choices, n=1)
     hint = f"; did you mean {close[0]}?" if close else ""
-    return f"{key}.model = {_show(value['model'])}: must be one of {known}{hint}"
+    return f"{key} = {_show(chosen)}: must be one of {known}{hint}"
 
 
-def _table_example(path: Sequence[Any]) -> str:
-    if tuple(path) == _LOSS:
-        return ', e.g. { model = "bernoulli", probability = 0.8 }'
-    return f", [{'.'.join(map(str, path))}]"
+def _table_example(at: _Place) -> str:
+    if at.choices:
+        chosen = list(at.choices)[1]
+        needed = (
+            f", {name} = ..." for name, field in at.choices[chosen].model_fields.items()
+            if field.is_required() and name != at.discriminator
+        )  # fmt: skip
+        return f', e.g. {{ {at.discriminator} = "{chosen}"{"".join(needed)} }}'
+    in_list = any(isinstance(part, int) for part in at.path)
+    return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
 
 
 def _purpose(section: type[BaseModel] | None, key: str) -> str:
     """What a missing key is for."""
     field = section.model_fields.get(key) if section is not None else None
-    inner = _section_of(field)
+    inner = _section_of(field.annotation) if field is not None else None
     text = (inner.__doc__ if inner is not None else field.description if field else None) or ""
     purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
     return f" ({purpose[0].lower()}{purpose[1:]})" if purpose else ""

@@ -10,14 +10,16 @@ from collections.abc import Mapping
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 PLANT_STEP = "plant_step"
 PLANT_ACTUATION = "plant_actuation"
 SENSOR_MEASUREMENT = "sensor_measurement"
 CONTROLLER_STEP = "controller_step"
 CONTROLLER_DELIVERY = "controller_delivery"
+SENSOR_ACKNOWLEDGEMENT = "sensor_acknowledgement"
 NETEM_PACKET = "netem_packet"
+NETEM_RELEASE = "netem_release"
 
 PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator keeps; it does not interpret them."""
@@ -32,11 +34,33 @@ class Fate(IntEnum):
     DELIVERED = 0
     DROPPED = 1
     FORCED = 2
-    """Delivered although the loss model said drop, because M−1 had just been dropped."""
+    """Delivered although an impairment said no, as M − 1 in a row had not been delivered."""
+    CORRUPTED = 3
+    """Sent on with a flipped bit."""
+    OVERFLOWED = 4
+    """Dropped from a full queue."""
+    BLACKED_OUT = 5
+    """Dropped during a blackout."""
+
+    @property
+    def effective(self) -> bool:
+        """Whether the datagram was effectively delivered, unless a later one overtook it."""
+        return self in (Fate.DELIVERED, Fate.FORCED)
 
 
-def tables(n: int, m: int) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of all tables for ``n`` states and ``m`` inputs."""
+def effective(fates: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Whether each datagram was effectively delivered, unless a later one overtook it, (k,)."""
+    return np.isin(fates, [fate for fate in Fate if fate.effective])
+
+
+def tables(n: int, m: int, *, acknowledged: bool = False) -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of all tables for ``n`` states and ``m`` inputs.
+
+    Args:
+        n: number of states.
+        m: number of inputs.
+        acknowledged: whether updates are acknowledged, so that there is a table of that, too.
+    """
     x: tuple[DTypeLike, tuple[int]] = ("<f8", (n,))
     u: tuple[DTypeLike, tuple[int]] = ("<f8", (m,))
     common = [("input", "<i8"), ("sequence", "<i8"), ("t_ns", "<i8"), ("now_ns", "<i8")]
@@ -45,7 +69,7 @@ def tables(n: int, m: int) -> Mapping[str, np.dtype[np.void]]:
         PLANT_ACTUATION: [*common, ("u", *u)],
         SENSOR_MEASUREMENT: [
             *common, ("x", *x), ("x_s", *x),
-            ("e_s_norm", "<f8"), ("threshold", "<f8"), ("event", "<i8"),
+            ("e_s_norm", "<f8"), ("compared", "<f8"), ("threshold", "<f8"), ("event", "<i8"),
         ],
         CONTROLLER_DELIVERY: [
             *common, ("model_t_ns", "<i8"), ("x", *x), ("x_c_before", *x), ("x_c", *x),
@@ -54,9 +78,15 @@ def tables(n: int, m: int) -> Mapping[str, np.dtype[np.void]]:
         CONTROLLER_STEP: [*common, ("model_t_ns", "<i8"), ("x_c", *x), ("u", *u)],
         NETEM_PACKET: [
             *common, ("flow", "<i8"), ("fate", "<i8"), ("drop_run", "<i8"),
+            ("release_ns", "<i8"), ("copy_ns", "<i8"), ("bit", "<i8"),
             ("size_bytes", "<i8"), ("head", f"V{PACKET_HEAD_BYTES}"),
         ],
+        NETEM_RELEASE: [*common, ("flow", "<i8"), ("copy", "<i8"), ("stale", "<i8")],
     }  # fmt: skip
+    if acknowledged:
+        columns[SENSOR_ACKNOWLEDGEMENT] = [
+            *common, ("model_t_ns", "<i8"), ("x_s_before", *x), ("x_s", *x),
+        ]  # fmt: skip
     return {table: np.dtype(fields) for table, fields in columns.items()}
 
 
@@ -64,8 +94,13 @@ OWNER: Mapping[str, str] = {
     PLANT_STEP: "plant",
     PLANT_ACTUATION: "plant",
     SENSOR_MEASUREMENT: "sensor",
+    SENSOR_ACKNOWLEDGEMENT: "sensor",
     CONTROLLER_STEP: "controller",
     CONTROLLER_DELIVERY: "controller",
     NETEM_PACKET: "netem",
+    NETEM_RELEASE: "netem",
 }
-"""Which process fills which table."""
+"""Which process fills which table; ``sensor_acknowledgement`` is not in every run."""
+
+UPDATES, ACKNOWLEDGEMENTS = 0, 1
+"""The network emulator's flows in a run: from the sensor, and from the controller."""

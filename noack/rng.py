@@ -7,6 +7,7 @@ the same whatever the plant, the timing or the other links draw.
 import hashlib
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def stream(seed: int, *name: str) -> np.random.Generator:
@@ -19,8 +20,104 @@ def stream(seed: int, *name: str) -> np.random.Generator:
     Raises:
         ValueError: ``seed`` is negative or ``name`` is empty.
     """
+    return np.random.Generator(np.random.PCG64DXSM(_sequence(seed, name)))
+
+
+def words(seed: int, *name: str, rows: range, width: int) -> NDArray[np.uint64]:
+    """Return rows of a random table; each depends on its number only, not on which are asked for.
+
+    Philox4x64 counts its blocks of four words, so that any row is found at once.
+
+    Args:
+        seed: non-negative integer.
+        name: the stream's path.
+        rows: numbers of successive rows, k of them.
+        width: words in a row.
+
+    Returns:
+        (k, width) random words of 64 bits.
+
+    Raises:
+        ValueError: ``seed`` is negative or ``name`` is empty.
+    """
+    blocks = -(-width // 4)
+    low, high = stream_key(seed, *name)
+    table = np.random.Philox(key=low | high << 32, counter=rows.start * blocks)
+    drawn = table.random_raw(len(rows) * blocks * 4)
+    return np.asarray(drawn).reshape(len(rows), blocks * 4)[:, :width]
+
+
+def uniforms(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float64]:
+    """Return rows of a table of numbers uniform in [0, 1); see :func:`words`."""
+    return np.asarray((words(seed, *name, rows=rows, width=width) >> np.uint64(11)) * 2.0**-53)
+
+
+def stream_key(seed: int, *name: str) -> tuple[int, int]:
+    """Return the key of a counter-based random stream: two words of 32 bits.
+
+    Args:
+        seed: non-negative integer of the scenario.
+        name: the stream's path.
+
+    Raises:
+        ValueError: ``seed`` is negative or ``name`` is empty.
+    """
+    low, high = _sequence(seed, name).generate_state(2).tolist()
+    return low, high
+
+
+def stream_keys(seeds: NDArray[np.uint64], *name: str) -> NDArray[np.int64]:
+    """Return the keys of :func:`stream_key` under many seeds at once, shape (k, 2).
+
+    Args:
+        seeds: (k,), below 2⁶⁴.
+        name: the stream's path.
+    """
+    # numpy's SeedSequence, many at once. A seed below 2¹²⁸ is four words of entropy.
+    words = np.zeros((8, len(seeds)), np.uint32)
+    words[0] = seeds & np.uint64(0xFFFFFFFF)
+    words[1] = seeds >> np.uint64(32)
+    words[4:] = np.array(_words(name), np.uint32)[:, None]
+    hashed = _Hash(0x43B0D7E5, 0x931E8875)
+    pool = [hashed(word) for word in words[:4]]
+    for source in range(4):
+        for into in range(4):
+            if source != into:
+                pool[into] = _mixed(pool[into], hashed(pool[source]))
+    for word in words[4:]:
+        for into in range(4):
+            pool[into] = _mixed(pool[into], hashed(word))
+    drawn = _Hash(0x8B51F9DD, 0x58F38DED)
+    return np.stack([drawn(pool[0]), drawn(pool[1])], axis=1).astype(np.int64)
+
+
+class _Hash:
+    """SeedSequence's hash of words of 32 bits, whose constant changes with each use."""
+
+    def __init__(self, constant: int, factor: int) -> None:
+        self._constant, self._factor = constant, factor
+
+    def __call__(self, words: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        words = words ^ np.uint32(self._constant)
+        self._constant = self._constant * self._factor & 0xFFFFFFFF
+        words *= np.uint32(self._constant)
+        words ^= words >> np.uint32(16)
+        return words
+
+
+def _mixed(one: NDArray[np.uint32], other: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    words = one * np.uint32(0xCA01F9DD) - other * np.uint32(0x4973F715)
+    words ^= words >> np.uint32(16)
+    return words
+
+
+def _sequence(seed: int, name: tuple[str, ...]) -> np.random.SeedSequence:
+    return np.random.SeedSequence(seed, spawn_key=_words(name))
+
+
+def _words(name: tuple[str, ...]) -> list[int]:
     if not name:
         raise ValueError("a random stream needs a name")
     digest = hashlib.blake2b("\0".join(name).encode(), digest_size=16).digest()
-    words = np.frombuffer(digest, dtype="<u4").tolist()
-    return np.random.Generator(np.random.PCG64DXSM(np.random.SeedSequence(seed, spawn_key=words)))
+    words: list[int] = np.frombuffer(digest, dtype="<u4").tolist()
+    return words

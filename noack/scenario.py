@@ -7,9 +7,11 @@ are errors. :mod:`noack.resolve` turns a scenario into one in which nothing is l
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
 from noack.clock import NS_PER_S
+from noack.errors import CallerError
+from noack.impairments import Impairment, LinkSettings, Loss, Lossless, LossOf, require_scores
 from noack.matrices import (
     Row,
     Rows,
@@ -19,20 +21,12 @@ from noack.matrices import (
     shape,
 )
 from noack.models import MODEL_PARAMETERS, NAMED_MODELS
+from noack.section import Section, Seed
+from noack.triggers import AnyTrigger, Decaying, sampling_period_ns
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-Probability = Annotated[FiniteFloat, Field(ge=0, le=1)]
-Seed = Annotated[int, Field(ge=0, lt=2**64)]
 Port = Annotated[int, Field(ge=0, le=65535)]
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
-
-
-class Section(BaseModel):
-    """A frozen table of the scenario file that knows all its keys."""
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
-    )
+_TIMEOUT_PERIODS = 5
 
 
 def period_ns(rate_hz: float) -> int:
@@ -57,7 +51,7 @@ class Model(Section):
 
     name: Literal["lane_following", "double_integrator"] | None = None
     """A named model; see noack/models.py."""
-    parameters: dict[str, FiniteFloat] = {}
+    parameters: dict[str, FiniteFloat] = Field({})
     """Parameters of the named model that differ from its defaults."""
     A: Rows | None = None
     """Â by rows, n x n, per second."""
@@ -161,21 +155,6 @@ class Plant(Section):
         return self
 
 
-class DecayingTrigger(Section):
-    """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
-
-    policy: Literal["decaying"] = "decaying"
-    """The event-triggering policy."""
-    beta: Positive
-    """β, in the units of ‖W x‖."""
-    alpha_per_s: Positive
-    """α, per second."""
-    floor: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
-    weight: Rows | None = None
-    """W by rows, n x n, invertible; the identity unless given."""
-
-
 class Controller(Section):
     """The controller's schedule."""
 
@@ -191,41 +170,30 @@ class Controller(Section):
         return self
 
 
-class Lossless(Section):
-    """Nothing is lost."""
+class Acknowledgements(Section):
+    """The way back from controller to sensor, of the acknowledgement baseline."""
 
-    model: Literal["lossless"]
+    loss: Loss = Lossless()
+    """What is lost of the acknowledgements."""
+    mansd: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    """At most so many successive acknowledgements are lost; without it, any number."""
+    impairments: tuple[Impairment, ...] = ()
+    """What else happens to them, in this order, after the loss."""
+    timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
+    """After a transmission, the sensor waits so long for its acknowledgement before it transmits
+    again. By default five measurement periods, and the longest delay there and back."""
 
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_scores(self.impairments, self.loss)
+        return self
 
-class Bernoulli(Section):
-    """Each datagram is lost independently."""
-
-    model: Literal["bernoulli"]
-    probability: Probability
-    """Probability of loss, before the MANSD cap."""
-
-
-class GilbertElliott(Section):
-    """Two-state Markov loss: a good and a bad state, each with its own loss probability."""
-
-    model: Literal["gilbert_elliott"]
-    good_to_bad: Probability
-    """Probability p of leaving the good state, per datagram."""
-    bad_to_good: Probability
-    """Probability r of leaving the bad state, per datagram."""
-    loss_in_good: Probability = 0.0
-    """Loss probability 1 − k in the good state."""
-    loss_in_bad: Probability = 1.0
-    """Loss probability 1 − h in the bad state."""
-
-
-class WorstCase(Section):
-    """Everything is lost that the MANSD allows to be lost."""
-
-    model: Literal["worst_case"]
-
-
-Loss = Annotated[Lossless | Bernoulli | GilbertElliott | WorstCase, Field(discriminator="model")]
+    @property
+    def link(self) -> LinkSettings:
+        """The link from controller to sensor."""
+        return LinkSettings(
+            impairments=(LossOf(loss=self.loss), *self.impairments), mansd=self.mansd
+        )
 
 
 class Network(Section):
@@ -235,11 +203,42 @@ class Network(Section):
     """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
     loss: Loss
     """What is lost, before the cap."""
+    impairments: tuple[Impairment, ...] = ()
+    """What else happens to the updates, in this order, after the loss."""
+    limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
+    """At most so many updates are delayed at once; more are dropped."""
     enforce_mansd: bool = True
     """false: the network ignores the cap, to see what a violated assumption does."""
     initial_sync: Literal["first_packet", "known_state"] = "first_packet"
     """How the paper's delivered t_0 is met. first_packet: the network passes the first packet of a
     flow. known_state: sensor and controller start from x(0)."""
+    protocol: Literal["none", "ack"] = "none"
+    """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
+    the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
+    acknowledgements: Acknowledgements | None = None
+    """The way back, for protocol = "ack"; by default nothing is lost on it."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_scores(self.impairments, self.loss)
+        if self.acknowledgements is not None and self.protocol != "ack":
+            raise ValueError('acknowledgements: there are none unless protocol = "ack"')
+        return self
+
+    @property
+    def way_back(self) -> Acknowledgements:
+        """The way back from controller to sensor, as given or by default."""
+        return self.acknowledgements or Acknowledgements()
+
+    @property
+    def link(self) -> LinkSettings:
+        """The link from sensor to controller."""
+        return LinkSettings(
+            impairments=(LossOf(loss=self.loss), *self.impairments),
+            mansd=self.mansd if self.enforce_mansd else None,
+            first_delivered=self.initial_sync == "first_packet",
+            limit=self.limit,
+        )
 
 
 class Certificate(Section):
@@ -316,13 +315,59 @@ class Scenario(Section):
     """Simulated time per wall time."""
     model: Model
     plant: Plant
-    trigger: DecayingTrigger
+    trigger: AnyTrigger
+    """When the sensor transmits."""
     network: Network
     controller: Controller = Controller()
     certificate: Certificate = Certificate()
     seeds: Seeds = Seeds()
     ports: Ports = Ports()
     realtime: Realtime = Realtime()
+
+    @property
+    def is_decaying(self) -> bool:
+        """Whether the trigger is the paper's."""
+        return isinstance(self.trigger, Decaying)
+
+    @property
+    def decaying(self) -> Decaying:
+        """The trigger, if it is the paper's.
+
+        Raises:
+            CallerError: it is another.
+        """
+        if not isinstance(self.trigger, Decaying):
+            raise CallerError(
+                f'trigger.policy: this is for the paper\'s trigger, "decaying", only; '
+                f'this scenario has "{self.trigger.policy}"'
+            )
+        return self.trigger
+
+    @property
+    def is_acknowledged(self) -> bool:
+        """Whether this is the acknowledgement baseline, and not the paper's loop."""
+        return self.network.protocol == "ack"
+
+    def require_unacknowledged(self) -> None:
+        """Check that nothing is acknowledged.
+
+        Raises:
+            CallerError: this is the acknowledgement baseline.
+        """
+        if self.is_acknowledged:
+            raise CallerError(
+                'network.protocol: this is for the loop without acknowledgements, "none", only; '
+                'this scenario has "ack"'
+            )
+
+    @property
+    def acknowledgement_timeout_ns(self) -> int:
+        """How long the sensor waits for an acknowledgement before it transmits again."""
+        network = self.network
+        if network.way_back.timeout_s is not None:
+            return round(network.way_back.timeout_s * NS_PER_S)
+        there_and_back_s = network.link.longest_delay_s + network.way_back.link.longest_delay_s
+        return _TIMEOUT_PERIODS * self.measurement_period_ns + round(there_and_back_s * NS_PER_S)
 
     @property
     def horizon_ns(self) -> int:
@@ -333,6 +378,11 @@ class Scenario(Section):
     def plant_period_ns(self) -> int:
         """Period of the plant's steps."""
         return period_ns(self.plant.rate_hz)
+
+    @property
+    def measurement_period_ns(self) -> int:
+        """Time between measurements."""
+        return self.plant_period_ns * self.plant.measure_every
 
     @property
     def controller_period_ns(self) -> int:
@@ -352,7 +402,7 @@ class Scenario(Section):
             )
         n, m = self.model.dimensions
         why = f"the model has {n} states and {m} inputs"
-        plant, weight = self.plant, self.trigger.weight
+        plant = self.plant
         require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), why)
         require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), why)
         require_shape(plant.A, "plant.A", (n, n), why)
@@ -361,7 +411,11 @@ class Scenario(Section):
         require_length(
             plant.initial_state_halfwidth, "plant.initial_state_halfwidth", n, "one per state"
         )
-        require_shape(weight, "trigger.weight", (n, n), why)
-        if weight is not None and np.linalg.matrix_rank(np.array(weight)) < n:
-            raise ValueError("trigger.weight: W must be invertible, this one is singular")
+        self.trigger.check(n, why)
+        sampling_ns, measured_ns = sampling_period_ns(self.trigger), self.measurement_period_ns
+        if sampling_ns is not None and sampling_ns % measured_ns:
+            raise ValueError(
+                f"trigger.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
+                "between measurements"
+            )
         return self

@@ -1,17 +1,16 @@
 """Scenario files: TOML in, frozen scenario out, and one clear line for every mistake."""
 
-import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import tomli_w
-from pydantic import ValidationError
 
+from noack import toml_file
 from noack.errors import CallerError
-from noack.mistakes import explain
-from noack.scenario import Scenario
+from noack.impairment_files import read_impairment, read_loss
+from noack.scenario import Acknowledgements, Network, Scenario
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -24,19 +23,25 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise CallerError(_missing(path)) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CallerError(f"{path}: cannot be read as text: {error}") from None
-    try:
-        content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise CallerError(f"{path}: not valid TOML: {error}") from None
+    content = toml_file.read(path)
     for override in overrides:
         _apply(content, override)
-    return validate(content, str(path))
+    return completed(content, path)
+
+
+def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
+    """Validate parsed content and read the files that it names.
+
+    Args:
+        content: of a scenario file.
+        path: of the scenario file; the files that it names lie beside it.
+        source: names the content in error messages; the path unless given.
+
+    Raises:
+        CallerError: one line per mistake.
+    """
+    source = source or str(path)
+    return _with_files(validate(content, source), path, source)
 
 
 def validate(content: Mapping[str, Any], source: str) -> Scenario:
@@ -45,13 +50,25 @@ def validate(content: Mapping[str, Any], source: str) -> Scenario:
     Raises:
         CallerError: one line per mistake.
     """
-    try:
-        # Through JSON, because strict validation takes arrays for tuples only there.
-        return Scenario.model_validate_json(json.dumps(content, default=_unfit))
-    except TypeError as error:
-        raise CallerError(f"{source}: {error}") from None
-    except ValidationError as error:
-        raise CallerError("\n".join(explain(error, source))) from None
+    return toml_file.validated(Scenario, content, source)
+
+
+def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
+    """Replace the names of files by what they say; relative ones lie beside the scenario."""
+    network, place = scenario.network, f"{source}: network"
+    update: dict[str, Any] = _read(network, path.parent, place)
+    if (back := network.acknowledgements) is not None:
+        read = _read(back, path.parent, f"{place}.acknowledgements")
+        update["acknowledgements"] = back.model_copy(update=read)
+    return scenario.model_copy(update={"network": network.model_copy(update=update)})
+
+
+def _read(section: Network | Acknowledgements, folder: Path, place: str) -> dict[str, Any]:
+    impairments = tuple(
+        read_impairment(impairment, folder, f"{place}.impairments.{number}")
+        for number, impairment in enumerate(section.impairments)
+    )
+    return {"loss": read_loss(section.loss, folder, f"{place}.loss"), "impairments": impairments}
 
 
 def dumps(scenario: Scenario) -> str:
@@ -61,9 +78,7 @@ def dumps(scenario: Scenario) -> str:
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of scenario files, for editors."""
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema"
-    } | Scenario.model_json_schema()
+    return toml_file.json_schema(Scenario)
 
 
 def _apply(content: dict[str, Any], override: str) -> None:
@@ -76,20 +91,25 @@ def _apply(content: dict[str, Any], override: str) -> None:
         value = text  # a bare word is taken as a string
     except (ValueError, RecursionError) as error:
         raise CallerError(f"--set {key}: not valid TOML: {error}") from None
+    put(content, key.strip(), value, f"--set {override}")
+
+
+def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
+    """Put a value in the place of a key, whose parts dots divide; tables are made as needed.
+
+    Args:
+        content: of a scenario file, changed in place.
+        key: e.g. ``trigger.beta``.
+        value: as parsed from TOML.
+        source: names the setting in error messages.
+
+    Raises:
+        CallerError: part of the key is a value, not a table.
+    """
     table = content
-    *path, last = key.strip().split(".")
+    *path, last = key.split(".")
     for part in path:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise CallerError(f"--set {override}: {part} is not a table")
+            raise CallerError(f"{source}: {part} is not a table")
     table[last] = value
-
-
-def _missing(path: Path) -> str:
-    others = sorted(path.parent.glob("*.toml")) if path.parent.is_dir() else []
-    names = ", ".join(str(other) for other in others[:10])
-    return f"{path}: no such file" + (f"; there are {names}" if names else "")
-
-
-def _unfit(value: object) -> None:
-    raise TypeError(f"{value}: a date or time is no value of a scenario; write text in quotes")

@@ -3,6 +3,10 @@
 plant ──measurement──▶ sensor ──update──▶ netem ──what survives──▶ controller
 ▲                                                                    │
 └────────────────────────────── actuation ───────────────────────────┘
+
+The acknowledgement baseline (``network.protocol = "ack"``) has one way more, over the same sockets:
+
+sensor ◀──what survives── netem ◀──acknowledgement── controller
 """
 
 from collections.abc import Mapping
@@ -28,6 +32,12 @@ LEGS: Mapping[str, Leg] = {
 
 SENDER: Mapping[str, str] = {leg.to: role for role, leg in LEGS.items()}
 """From whom each process receives."""
+
+ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
+"""To whom each process sends acknowledgements, in the acknowledgement baseline alone."""
+
+ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
+"""From whom each process receives them."""
 
 LOOP_ROLES = tuple(LEGS)
 RECORDER = "recorder"

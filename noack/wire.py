@@ -1,15 +1,17 @@
-"""The wire format of the loop: one datagram, one message, nothing is ever acknowledged.
+"""The wire format of the loop: one datagram, one message.
+
+Nothing is ever acknowledged, except in the variant ``network.protocol = "ack"``, the baseline.
 
 Layout, version 1, little endian (``docs/wire.md`` has test vectors)::
 
     offset  size  field
          0     2  magic, the bytes "NA"
          2     1  version, 1
-         3     1  flow: 1 measurement, 2 update, 3 actuation
-         4     2  dimension n of the vector, 1 to 64
+         3     1  flow: 1 measurement, 2 update, 3 actuation, 4 acknowledgement
+         4     2  dimension n of the vector, 1 to 64; 0 of an acknowledgement
          6     2  reserved, 0
          8     8  run id, unsigned
-        16     8  sequence number, unsigned, from 0 within a flow
+        16     8  sequence number, unsigned, from 0 within a flow; what is acknowledged
         24     8  event time, signed, nanoseconds of simulated time since the run's epoch
         32    8n  vector, float64
      32+8n    16  tag: keyed BLAKE2b over all that precedes it, under the run's key
@@ -48,6 +50,13 @@ class Flow(IntEnum):
     """sensor → network → controller: the plant state at an event, x(t_i), shape (n,)."""
     ACTUATION = 3
     """controller → plant: the control input u, shape (m,)."""
+    ACKNOWLEDGEMENT = 4
+    """controller → network → sensor, with ``protocol = "ack"`` only: an update's sequence number
+    and event time, and no vector, shape (0,)."""
+
+
+NO_VECTOR: Vector = np.zeros(0)
+"""What an acknowledgement carries."""
 
 
 class Message(NamedTuple):
@@ -96,6 +105,11 @@ def read_header(datagram: bytes) -> Header | None:
     return Header(version, flow, dimension, run_id, sequence, t_ns)
 
 
+def flow_of(datagram: bytes) -> int | None:
+    """The flow that a datagram says it is of, unverified; None if it is too short to say."""
+    return datagram[3] if len(datagram) >= HEADER_BYTES else None
+
+
 class _Tagger:
     """Computes tags under one key; keying is done once."""
 
@@ -126,10 +140,14 @@ class Encoder:
         """Return the datagram of a message.
 
         Raises:
-            ValueError: the vector does not have 1 to 64 entries, or a number does not fit.
+            ValueError: the vector does not have 1 to 64 entries (of an acknowledgement none), or a
+                number does not fit.
         """
         vector = np.ascontiguousarray(message.vector, dtype="<f8")
-        if vector.ndim != 1 or not 1 <= vector.size <= MAX_DIMENSION:
+        if message.flow is Flow.ACKNOWLEDGEMENT:
+            if vector.size:
+                raise ValueError(f"an acknowledgement carries no vector of shape {vector.shape}")
+        elif vector.ndim != 1 or not 1 <= vector.size <= MAX_DIMENSION:
             raise ValueError(
                 f"a datagram carries a vector of 1 to {MAX_DIMENSION} entries, "
                 f"not shape {vector.shape}"
@@ -183,6 +201,11 @@ class Decoder:
         self._newest = verdict.sequence
         self.accepted += 1
         return verdict
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        rejected = {reason.value: n for reason, n in self.rejected.items() if n}
+        return {"accepted": self.accepted, "rejected": rejected}
 
     def _examine(self, datagram: bytes, *, from_peer: bool) -> Message | Rejection:
         # Cheap tests of the outer form come first: they shed junk and name the commonest mistakes.

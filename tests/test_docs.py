@@ -9,17 +9,29 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
+from typer.main import get_command
 
+from cosim.campaign.grid import grid
+from cosim.campaign.metrics import METRICS
+from cosim.campaign.plan import Axis, Campaign, Comparison, Figure, Metrics
+from cosim.campaign.plan import load as load_campaign
+from cosim.cli import app
+from netem.words.parser import KEYWORDS
+from noack.impairments import Impairment, Loss
 from noack.records import tables
-from noack.scenario import Bernoulli, GilbertElliott, Scenario
+from noack.scenario import Scenario
 from noack.scenario_file import json_schema, load
+from noack.triggers import AnyTrigger
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md")
+PAGES = (
+    "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
+    "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md",
+)  # fmt: skip
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -30,7 +42,8 @@ def blocks(page: str, language: str) -> list[str]:
 def commands() -> Iterator[str]:
     for page in PAGES:
         for block in blocks(page, "sh"):
-            yield from (line.partition("#")[0].strip() for line in block.splitlines())
+            lines = (line.partition("#")[0].strip() for line in block.splitlines())
+            yield from filter(None, lines)
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +51,8 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that looks like the repository to a command, with a short run in it."""
     folder = tmp_path_factory.mktemp("docs")
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
+    (links,) = blocks("docs/netem.md", "toml")
+    (folder / "links.toml").write_text(links)
     (folder / ".venv" / "bin").mkdir(parents=True)
     noack = folder / ".venv" / "bin" / "noack"
     noack.write_text(f'#!/bin/sh\nexec {sys.executable} -m cosim.cli "$@"\n')
@@ -66,9 +81,9 @@ def test_every_command_works(command: str, run_folder: Path) -> None:
         words, cwd=run_folder, env=environment,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
-        if "netem" in words:
+        if "netem" in words and "--explain" not in words:
             assert process.stderr is not None
-            assert "Ctrl-C ends" in process.stderr.readline()
+            assert any("Ctrl-C ends" in line for line in process.stderr)
             process.send_signal(signal.SIGINT)
         stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 0, stderr
@@ -94,24 +109,97 @@ def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
             yield prefix + key
 
 
+def choices(union: Any) -> tuple[type[BaseModel], ...]:
+    """The tables that a value may be, of an annotated union."""
+    tables: tuple[type[BaseModel], ...] = get_args(get_args(union)[0])
+    return tables
+
+
 def test_every_scenario_key_is_documented_and_no_other() -> None:
     text = (ROOT / "docs/scenarios.md").read_text()
+    keys = text.partition("## Trigger policies")[0]
+    assert documented_keys(keys) == set(keys_of(Scenario))
+
+
+@pytest.mark.parametrize("table", [get_args(table)[0] for table in choices(AnyTrigger)])
+def test_every_key_of_a_policy_is_documented(table: type[BaseModel]) -> None:
+    text = (ROOT / "docs/scenarios.md").read_text()
+    policies = text.partition("## Trigger policies")[2].partition("## Loss models")[0]
+    (policy,) = get_args(table.model_fields["policy"].annotation)
+    (row,) = [line for line in policies.splitlines() if line.startswith(f"| `{policy}`")]
+    named = re.findall("`([^`]+)`", row.split("|")[-2])
+    documented = {name.partition(" ")[0] for name in named}
+    assert documented == table.model_fields.keys() - {"policy", "weight"}
+
+
+@pytest.mark.parametrize("table", [*choices(Loss), *choices(Impairment)])
+def test_every_key_of_losses_and_impairments_is_documented(table: type[BaseModel]) -> None:
+    text = (ROOT / "docs/scenarios.md").read_text().partition("## Loss models")[2]
+    (chosen,) = get_args(next(iter(table.model_fields.values())).annotation)
+    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{chosen}`")]
+    documented = set(re.findall("([a-z_0-9]+) = ", row.partition("|")[2])) - {"model"}
+    assert documented == table.model_fields.keys() - {"model", "kind"}
+
+
+def test_every_word_of_the_emulator_is_documented_and_understood() -> None:
+    text = (ROOT / "docs/netem.md").read_text().partition("## The words")[2]
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
-    documented: set[str] = set()
+    documented = {word for row in rows for word in re.findall(r"[a-z]+", row)}
+    for word in KEYWORDS:
+        assert word in documented or f"`{word}`" in text, word
+
+
+def documented_keys(text: str) -> set[str]:
+    """Names at the left of tables; those that begin with a dot lie in the first one's section."""
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    found: set[str] = set()
     for row in rows:
         names = re.findall(r"`([^`]+)`", row)
         section = names[0].partition(".")[0]
-        documented |= {name if not name.startswith(".") else section + name for name in names}
-    known = set(keys_of(Scenario))
-    assert documented == known
-    for loss in (Bernoulli, GilbertElliott):
-        for key in loss.model_fields:
-            assert f"{key} = " in text
+        found |= {name if not name.startswith(".") else section + name for name in names}
+    return found
+
+
+def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
+    text = (ROOT / "docs/campaigns.md").read_text()
+    text = text.partition("## The file")[2].partition("## Draws")[0]
+    sections = {"axes": Axis, "metrics": Metrics, "compare": Comparison}
+    keys = set(Campaign.model_fields) - {"metrics", "compare"} | {"figures.kind", "figures.where"}
+    keys |= {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}
+    figures = {table.model_fields["kind"].default: table for table in choices(Figure)}
+    assert documented_keys(text) == keys | figures.keys()
+    for name, table in figures.items():
+        (row,) = [line for line in text.splitlines() if line.startswith(f"| `{name}` |")]
+        assert set(re.findall("([a-z]+) = ", row)) == table.model_fields.keys() - {"kind", "where"}
+
+
+def test_every_campaign_and_every_metric_is_documented() -> None:
+    text = (ROOT / "docs/campaigns.md").read_text()
+    shipped = {path.stem for path in (ROOT / "campaigns").glob("*.toml")}
+    assert documented_keys(text.partition("## The file")[0]) == shipped
+    text = text.partition("## Metrics")[2].partition("##")[0]
+    assert documented_keys(text) == METRICS.keys()
+
+
+def test_the_documented_campaign_is_a_campaign(tmp_path: Path) -> None:
+    (text,) = blocks("docs/campaigns.md", "toml")
+    path = tmp_path / "thresholds.toml"
+    path.write_text(text)
+    assert len(grid(load_campaign(path), path)) == 9
+
+
+def test_every_option_of_design_is_documented_and_no_other() -> None:
+    text = (ROOT / "docs/design.md").read_text().partition("## Options")[2]
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    documented = {name for row in rows for name in re.findall("--[A-Za-z]+", row)}
+    parameters = get_command(app).commands["design"].params  # type: ignore[attr-defined]
+    known = {name for one in parameters for name in one.opts if name.startswith("--")}
+    assert documented | {"--help"} == known | {"--help"}
 
 
 def test_every_column_of_the_record_is_documented() -> None:
     text = (ROOT / "docs/record.md").read_text()
-    for table, dtype in tables(1, 1).items():
+    for table, dtype in tables(1, 1, acknowledged=True).items():
         (row,) = [line for line in text.splitlines() if line.startswith(f"| `{table}`")]
         for name in dtype.names or ():
             common = name in ("input", "sequence", "t_ns", "now_ns")
@@ -135,6 +223,6 @@ def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> N
 
 
 def test_links_lead_somewhere() -> None:
-    for page in (*PAGES, "ARCHITECTURE.md", "docs/theory.md", "docs/wire.md"):
+    for page in (*PAGES, "ARCHITECTURE.md", "docs/theory.md", "docs/wire.md", "docs/mansd.md"):
         for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text()):
             assert (ROOT / page).parent.joinpath(target).exists(), f"{page}: {target}"

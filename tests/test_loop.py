@@ -248,6 +248,16 @@ def test_only_the_plant_is_heard_by_the_sensor() -> None:
         assert ear.rejected[Rejection.FLOW] == 1
 
 
+def test_acknowledgements_are_no_leg_of_the_loop_and_are_heard_by_nobody_in_it() -> None:
+    """Not even one of the run's own key: a decoder of the ordinary loop takes one flow."""
+    assert all(Flow.ACKNOWLEDGEMENT not in (leg.receives, leg.sends) for leg in LEGS.values())
+    data = Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(0)))
+    for role in ("plant", "sensor", "controller"):
+        ear = Decoder(LEGS[role].receives, 1, RUN, KEY)
+        assert ear.decode(data) is None
+        assert ear.rejected[Rejection.LENGTH] == 1
+
+
 @given(cases(delayed=True))
 def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> None:
     loop = case.shuttle()

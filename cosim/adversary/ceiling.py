@@ -24,7 +24,7 @@ def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceilin
     """The bound for a loop; None if A + BK is not stable."""
     from scipy.linalg import solve_continuous_lyapunov
 
-    loop, trigger = system.loop, system.trigger
+    loop, trigger = system.loop, system.decaying
     closed = loop.A + loop.B @ loop.K
     models = _models(system)
     missing = models.now(Output.GAIN) + models.missing(Output.GAIN, mansd, 0.0)
@@ -48,7 +48,7 @@ def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceilin
 
 def _models(system: ContinuousLoop) -> ErrorGains:
     """The gains at the threshold's own rate if the models decay faster, otherwise at rate 0."""
-    loop, trigger = system.loop, system.trigger
+    loop, trigger = system.loop, system.decaying
     weight = np.eye(loop.n) if trigger.weight is None else trigger.weight
     gains = ErrorGains(loop.H, loop.K, weight, trigger.alpha_per_s)
     try:

@@ -52,7 +52,7 @@ class CurveStack(CurveBasis):
         """
         control = self.from_taylor @ taylor
         products = (control @ control.transpose(0, 2, 1)).reshape(len(taylor), -1)
-        return np.asarray(products @ self._square.T)
+        return np.asarray(products @ self.square.T)
 
     def halves(self, squares: Vector) -> tuple[Vector, Vector]:
         """The coefficients on [0, ½] and on [½, 1], each brought to [0, 1]."""

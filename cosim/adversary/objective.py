@@ -74,7 +74,7 @@ def measure_of(
         objective: what counts.
         rate_per_s: r of the level; α unless given.
     """
-    n, trigger = system.loop.n, system.trigger
+    n, trigger = system.loop.n, system.decaying
     rate_per_s = trigger.alpha_per_s if rate_per_s is None else rate_per_s
     floor = trigger.floor if rate_per_s == trigger.alpha_per_s else 0.0
     output = np.zeros((n, 3 * n))

@@ -54,7 +54,7 @@ class SegmentFlow:
     ) -> None:
         self.system, self.measure, self.horizon_s = system, measure, horizon_s
         self.known_start = known_start
-        trigger = system.trigger
+        trigger = system.decaying
         self._floor_from_s = (
             math.log(trigger.beta / trigger.floor) / trigger.alpha_per_s
             if trigger.floor > 0
@@ -98,7 +98,7 @@ class _Phase:
     def __init__(
         self, system: ContinuousLoop, measure: Measure, alpha_per_s: float, rate_per_s: float
     ) -> None:
-        n, generator, trigger = system.loop.n, system.generator, system.trigger
+        n, generator, trigger = system.loop.n, system.generator, system.decaying
         self._system, self._measure = system, measure
         self._alpha_per_s, self._rate_per_s = alpha_per_s, rate_per_s
         self._width_s = system.flow.width_s
@@ -126,7 +126,7 @@ class _Phase:
         nothing = np.full(count, measure.nothing)
         found = Segments(np.full(count, until_s), z.copy(), np.zeros(count, bool), nothing)
         span = (until_s - t_s) / width_s
-        trigger = self._system.trigger
+        trigger = self._system.decaying
         decaying = trigger.beta * np.exp(-trigger.alpha_per_s * t_s)
         threshold = np.maximum(decaying, trigger.floor)
         level = measure.level(t_s)

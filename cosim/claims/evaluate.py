@@ -22,7 +22,7 @@ from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box, o
 from noack.theory.monitor import ErrorMonitor
 from noack.theory.printed import Theorem2, theorem_2
 from noack.theory.schedule import ideal_conditions, nominal_conditions
-from noack.trigger.decaying import trigger_of
+from noack.trigger.choose import policy_of
 
 Reals = NDArray[np.float64]
 
@@ -60,6 +60,13 @@ class Claim(NamedTuple):
     since_s: float | None
     """Since when it was violated, or void."""
     why: str
+
+
+_NO_CLAIM = Claim(
+    "the models differ by what was missed", "(I1)", "none", None, None, None, ClaimVerdict.VOID,
+    0.0, 'network.protocol = "ack": x_s is reset when an update is acknowledged and not at every '
+    "event, which (I1) and all that rests on it presuppose",
+)  # fmt: skip
 
 
 class Envelope(NamedTuple):
@@ -130,10 +137,14 @@ class Claims:
         """Every claim with its verdict."""
         if not len(self.joined.t_ns) or not self._in_common.any():
             return []
+        if self.record.scenario.is_acknowledged:
+            return [_NO_CLAIM]
         return [*self._identity(), *self._printed(), *self._certified()]
 
     def envelopes(self) -> list[Envelope]:
         """The certified curves, at the measurements."""
+        if self.record.scenario.is_acknowledged:
+            return []
         t_s = self._t_s
         found: list[Envelope] = []  # in this order, a certificate looks alike in every figure
         for certificate in self.certificates:
@@ -145,7 +156,7 @@ class Claims:
                 found.append(self._least_interval(label, certificate.inter_event_s))
         found.append(Envelope("bound from (I1)", "e_c", t_s, self._bounds[0]))
         if (theorem := self._theorem_2) is not None:
-            alpha = self.record.scenario.trigger.alpha_per_s
+            alpha = self.record.scenario.decaying.alpha_per_s
             found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, theorem.state(t_s, alpha)))
             found.append(self._least_interval("Theorem 2 (eq:tau)", theorem.inter_event_s))
         return found
@@ -168,7 +179,7 @@ class Claims:
     @cached_property
     def _bounds(self) -> tuple[Reals, Reals]:
         """The identity's and the printed bound of ‖e_c‖_W, (k,) each; NaN before the start."""
-        monitor = ErrorMonitor(self.record.loop.H, trigger_of(self.record.scenario))
+        monitor = ErrorMonitor(self.record.loop.H, policy_of(self.record.scenario))
         rows = self.record[SENSOR_MEASUREMENT]
         found = np.array(
             [
@@ -186,13 +197,15 @@ class Claims:
     def _theorem_2(self) -> Theorem2 | None:
         """With the uniform Δ of (I1) under the paper's conditions, which Theorem 1 lacks."""
         scenario = self.record.scenario
-        ideal = certify(scenario, ideal_conditions(scenario)).constants
-        if ideal is None or ideal.rate_per_s != scenario.trigger.alpha_per_s:
+        if not scenario.is_decaying:
             return None
-        if self.record.loop.weight is not None or scenario.trigger.floor > 0:
+        ideal = certify(scenario, ideal_conditions(scenario)).constants
+        if ideal is None or ideal.rate_per_s != scenario.decaying.alpha_per_s:
+            return None
+        if self.record.loop.weight is not None or scenario.decaying.floor > 0:
             return None
         return theorem_2(
-            self.record.loop, scenario.trigger.beta, scenario.trigger.alpha_per_s, ideal.delta
+            self.record.loop, scenario.decaying.beta, scenario.decaying.alpha_per_s, ideal.delta
         )
 
     @cached_property
@@ -216,6 +229,8 @@ class Claims:
         )  # fmt: skip
 
     def _printed(self) -> Iterator[Claim]:
+        if not self.record.scenario.is_decaying:
+            return
         ideal = (
             "presupposes a trigger that watches always and a network and an input without delay, "
             "which no sampled loop has"
@@ -226,7 +241,7 @@ class Claims:
             "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1],
             self._unknown, ideal,
         )  # fmt: skip
-        trigger = self.record.scenario.trigger
+        trigger = self.record.scenario.decaying
         delta = theorem_one(self.record, self.joined, math.inf if left is None else left[0])
         if delta is not None and trigger.floor == 0:
             name = "Theorem 1" if self.record.loop.H.any() else "Theorem 3"
@@ -329,7 +344,12 @@ def _upper(
 
 
 def scheduled_certificates(scenario: Scenario) -> list[Certificate]:
-    """The certificates of a resolved scenario under its own schedule, with its allowance."""
+    """The certificates of a resolved scenario under its own schedule, with its allowance.
+
+    They are of the paper's trigger and of the loop without acknowledgements; else there are none.
+    """
+    if not scenario.is_decaying or scenario.is_acknowledged:
+        return []
     conditions = nominal_conditions(scenario, scenario.certificate.late_periods)
     found = [certify(scenario, conditions), certify_box(scenario, conditions)]
     return [certificate for certificate in found if certificate is not None]

@@ -14,7 +14,7 @@ from noack.records import (
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
-    Fate,
+    effective,
 )
 from noack.theory.certificate import Conditions
 
@@ -183,7 +183,7 @@ def _delays(
 def _fates(record: RunRecord) -> tuple[set[int], set[int]]:
     """The updates that the network dropped, and those that it let pass."""
     packets, sequences, _ = updates_in(record[NETEM_PACKET])
-    dropped = packets["fate"] == Fate.DROPPED
+    dropped = ~effective(packets["fate"])
     return set(sequences[dropped].tolist()), set(sequences[~dropped].tolist())
 
 

@@ -21,7 +21,7 @@ def theorem_one(record: RunRecord, joined: Joined, until_s: float = math.inf) ->
     Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this. Nor does it
     from ``until_s`` on, when the run has left what the theorem presupposes.
     """
-    loop, trigger = record.loop, record.scenario.trigger
+    loop, trigger = record.loop, record.scenario.decaying
     if loop.weight is not None:
         return None
     event = record[SENSOR_MEASUREMENT]["event"]
@@ -55,7 +55,7 @@ def _decay(record: RunRecord) -> float:
     H = record.loop.H
     if not H.any():
         return 0.0
-    return min(record.scenario.trigger.alpha_per_s, max(-spectral_abscissa(H), 0.0))
+    return min(record.scenario.decaying.alpha_per_s, max(-spectral_abscissa(H), 0.0))
 
 
 def _intervals(

@@ -18,6 +18,7 @@ from noack.linear import Matrix, Vector
 
 _ROUNDING = 16 * np.finfo(float).eps
 _FINEST = 2.0**-52
+_BISECTIONS = 60
 _NEWTON_STEPS = 100
 _NEWTON_RESOLUTION = 2.0**-50
 
@@ -38,7 +39,7 @@ class CurveBasis:
         """Control points = ``from_taylor`` @ Taylor coefficients, both of shape (p + 1, n)."""
 
     @cached_property
-    def _square(self) -> Matrix:
+    def square(self) -> Matrix:
         """Bernstein coefficients of |b|² from all products bᵢ·bⱼ, shape (2p + 1, (p + 1)²)."""
         p = self.degree
         square = np.zeros((2 * p + 1, p + 1, p + 1))
@@ -54,6 +55,36 @@ class CurveBasis:
         left = np.array([[comb(i, k) / 2.0**i for k in range(q + 1)] for i in range(q + 1)])
         return np.concatenate([left, left[::-1, ::-1]])
 
+    def first_negative(self, coefficients: Vector) -> float | None:
+        """The first u in [0, 1] after which a polynomial of degree 2p is negative for a while.
+
+        What is said of :meth:`first_exit` holds here, too, of rounding errors of the coefficients.
+
+        Args:
+            coefficients: in the Bernstein basis, shape (2p + 1,).
+        """
+        bracket = self._isolate(coefficients, _ROUNDING * float(np.abs(coefficients).max()))
+        if bracket is None:
+            return None
+        low, high = bracket
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            if not low < middle < high:
+                break
+            value = coefficients @ self._polynomials(middle)
+            low, high = (middle, high) if value >= 0 else (low, middle)
+        return (low + high) / 2
+
+    def _polynomials(self, u: float) -> Vector:
+        """Values of the Bernstein polynomials of degree 2p, shape (2p + 1,)."""
+        orders = np.arange(2 * self.degree + 1)
+        values: Vector = self._binomials * u**orders * (1 - u) ** orders[::-1]
+        return values
+
+    @cached_property
+    def _binomials(self) -> Vector:
+        return np.array([float(comb(2 * self.degree, k)) for k in range(2 * self.degree + 1)])
+
     def first_exit(self, taylor: Matrix) -> float | None:
         """The first u in [0, 1] after which |y(u)| > 1 for a while; None if there is none.
 
@@ -65,7 +96,7 @@ class CurveBasis:
             taylor: coefficients of y(u) = Σ_k ``taylor``[k] u^k, shape (p + 1, n).
         """
         control = self.from_taylor @ taylor
-        inside = 1.0 - self._square @ (control @ control.T).ravel()
+        inside = 1.0 - self.square @ (control @ control.T).ravel()
         tolerance = _ROUNDING * max(1.0, float(np.abs(inside).max()))
         bracket = self._isolate(inside, tolerance)
         return None if bracket is None else _refine(taylor, *bracket)

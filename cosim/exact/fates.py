@@ -2,23 +2,32 @@
 
 from collections.abc import Callable
 
-from netem.link import Datagram, update_link_of
+from netem.link import UPDATE_LINK, Link
+from noack.impairments import Corrupt, LinkSettings, LossOf
+from noack.records import Fate
 from noack.scenario import Scenario
+
+
+def timeless(settings: LinkSettings) -> LinkSettings:
+    """The part of a link that has a place in the paper's loop: losses and corruption."""
+    kept = tuple(one for one in settings.impairments if isinstance(one, LossOf | Corrupt))
+    return settings.model_copy(update={"impairments": kept})
 
 
 def network_fates(resolved: Scenario) -> Callable[[int], bool]:
     """Whether the scenario's network delivers update i, for i = 0, 1, …: as in a live run.
 
     The emulator's decisions depend on its seed and on the order of arrival only, so that they are
-    known before anything is sent. For ``initial_sync = "first_packet"`` update 0 is delivered.
+    known before anything is sent: of those that depend on nothing else. Delays, rate limits and
+    blackouts have no place in the paper's loop and play no part. For
+    ``initial_sync = "first_packet"`` update 0 is delivered.
     """
-    link = update_link_of(resolved)
+    link = Link(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
     known: list[bool] = []
 
     def delivered(event: int) -> bool:
         while len(known) <= event:
-            outputs = link.handle(Datagram(0, b""), 0)
-            known.append(any(isinstance(output, Datagram) for output in outputs))
+            known.append(Fate(link.decide(0, 1, 0).fate).effective)
         return known[event]
 
     return delivered

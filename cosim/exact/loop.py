@@ -23,31 +23,26 @@ Nothing is sampled. What remains is rounding: an excursion above the threshold b
 """
 
 import math
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.exact.bernstein import curve_basis
-from cosim.exact.flow import CELLS, DEGREE, Flow, growth_rate, taylor_terms
+from cosim.exact.flow import Flow, growth_rate
+from cosim.exact.watch import LARGEST, BallWatch, DivergedError, FormWatch, Reached
 from noack.errors import CallerError
 from noack.linear import Matrix, Vector
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
-from noack.trigger.decaying import DecayingTrigger, trigger_of
+from noack.trigger.choose import policy_of
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.guard import Form, Guard
+from noack.trigger.policy import Policy
 
-_LARGEST = 1e100
-"""Beyond, a state is said to have diverged: squares and ratios must stay finite."""
 _SMALLEST_THRESHOLD = 1e-200
-_SLACK = 1e-13
-
-
-class DivergedError(ArithmeticError):
-    """The state has grown beyond 1e100, or by that factor beyond the threshold, at ``t_s``."""
-
-    def __init__(self, t_s: float) -> None:
-        super().__init__(f"the loop diverges: the state passes 1e100 at {t_s:g} s")
-        self.t_s = t_s
+_LONGEST_CELL_S = 1e3
+_GRID_SLACK = 1e-9
+"""Of a period: so far may an event be off the grid for rounding."""
+_GRID_BLOCK = 256
 
 
 class LoopState(NamedTuple):
@@ -79,14 +74,14 @@ class Samples(NamedTuple):
 
 
 class ContinuousLoop:
-    """The loop of the paper with its trigger; made once for a system, used for many runs.
+    """The loop in continuous time, under any policy.
 
     Args:
         loop: the matrices.
         trigger: the event-triggering policy; its weight is W.
     """
 
-    def __init__(self, loop: Loop, trigger: DecayingTrigger) -> None:
+    def __init__(self, loop: Loop, trigger: Policy) -> None:
         self.loop = loop
         self.trigger = trigger
         n, H, BK = loop.n, loop.H, loop.B @ loop.K
@@ -100,35 +95,28 @@ class ContinuousLoop:
         self.generator[n : 2 * n, 2 * n :] = -BK
         self.generator[2 * n :, :n] = -mismatch
         self.generator[2 * n :, 2 * n :] = H - BK
-        alpha = trigger.alpha_per_s
-        scaled = self.generator + alpha * np.eye(3 * n)
-        self.flow = Flow(
-            self.generator, 1.0 / max(growth_rate(self.generator), growth_rate(scaled))
-        )
-        self._floor_from_s = (
-            math.log(trigger.beta / trigger.floor) / alpha if trigger.floor > 0 else math.inf
-        )
-        self._vanishes_s = max(math.log(trigger.beta / _SMALLEST_THRESHOLD) / alpha, 0.0)
-
-    @cached_property
-    def _decaying(self) -> "_Watch":
-        return _Watch(self.flow, self.generator, self._output, self.trigger.alpha_per_s)
-
-    @cached_property
-    def _floored(self) -> "_Watch":
-        return _Watch(self.flow, self.generator, self._output, 0.0)
+        guard = trigger.guard(0.0, loop.x0)
+        scaled = self.generator + guard.rate_per_s * np.eye(3 * n)
+        rate_per_s = max(growth_rate(self.generator), growth_rate(scaled))
+        if guard.reserve is not None:
+            rate_per_s = max(rate_per_s, guard.reserve.decay_per_s)
+        self.flow = Flow(self.generator, 1.0 / max(rate_per_s, 1.0 / _LONGEST_CELL_S))
+        self._watches: dict[tuple[bytes, float], BallWatch | FormWatch] = {}
 
     @property
-    def _output(self) -> Matrix:
-        n, W = self.loop.n, self.trigger.weight
-        output = np.zeros((n, 3 * n))
-        output[:, n : 2 * n] = np.eye(n) if W is None else W
-        return output
+    def decaying(self) -> DecayingTrigger:
+        """The trigger, if it is the paper's.
+
+        Raises:
+            CallerError: it is another.
+        """
+        if not isinstance(self.trigger, DecayingTrigger):
+            raise CallerError('trigger.policy: this is for the paper\'s trigger, "decaying", only')
+        return self.trigger
 
     def threshold(self, t_s: float) -> float:
-        """max(βe^{−αt}, ε)."""
-        decaying = self.trigger.beta * math.exp(-self.trigger.alpha_per_s * t_s)
-        return max(decaying, self.trigger.floor)
+        """max(βe^{−αt}, ε) of the paper's trigger."""
+        return self.decaying.threshold(t_s * 1e9)
 
     def norms(self, errors: Matrix) -> Vector:
         """‖W e‖ of k errors, shape (k, n) → (k,)."""
@@ -136,36 +124,162 @@ class ContinuousLoop:
         norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
         return norms
 
-    def next_event(self, state: LoopState, until_s: float) -> LoopState | None:
-        """The state just before the reset at the first crossing in [``state.t_s``, ``until_s``].
+    def next_event(
+        self, state: LoopState, until_s: float, guard: Guard | None = None
+    ) -> LoopState | None:
+        """The state just before the reset at the next event in [``state.t_s``, ``until_s``].
+
+        Args:
+            state: where the loop is.
+            until_s: how far to look.
+            guard: the rule until then; if ``state`` is just after an event, or at the start, the
+                policy's unless given.
 
         Returns:
-            None if ‖W e_s‖ does not exceed the threshold until then. A state that is beyond the
-            threshold already, or on it and growing, is an event itself.
+            None if there is no event until then. A state that is beyond the rule's threshold
+            already, or on it and growing, is an event itself.
 
         Raises:
             DivergedError: the state outgrows what can be computed with before.
             CallerError: the threshold decays below 1e-200 before, where nothing is left to resolve.
         """
-        t_s = state.t_s
-        z = np.concatenate(state[1:])
-        if t_s < self._floor_from_s:
-            end_s = min(until_s, self._floor_from_s, self._vanishes_s)
-            found = self._decaying.first_exit(z, t_s, self.threshold(t_s), end_s - t_s)
-            if found is not None:
-                return self._state(t_s + found[0], found[1])
-            if until_s <= min(self._floor_from_s, self._vanishes_s):
+        found = self.next_crossing(state, until_s, guard or self.guard(state))
+        return None if found is None else found[0]
+
+    def guard(self, state: LoopState) -> Guard:
+        """The rule after an event at a state."""
+        return self.trigger.guard(state.t_s * 1e9, state.x)
+
+    def next_crossing(
+        self, state: LoopState, until_s: float, guard: Guard, reserve: float = 0.0
+    ) -> tuple[LoopState, float] | None:
+        """The same as :meth:`next_event`, with the η that a dynamic policy has there.
+
+        Args:
+            state: where the loop is.
+            until_s: how far to look.
+            guard: the rule until then.
+            reserve: η at ``state``.
+        """
+        t_s, z = state.t_s, np.concatenate(state[1:])
+        begin_s, latest_s = guard.earliest_ns * 1e-9, guard.latest_ns * 1e-9
+        end_s = max(min(until_s, latest_s), t_s)
+        if begin_s > t_s:
+            if begin_s > until_s:
                 return None
-            if self._vanishes_s < self._floor_from_s:
+            z, reserve = self._advance(z, begin_s - t_s, guard, reserve)
+            t_s = begin_s
+        if len(guard.form.up):
+            if guard.grid_ns:
+                found = self._on_grid(z, t_s, state.t_s, end_s, guard)
+            else:
+                found = self._exit(z, t_s, end_s, guard, reserve)
+            if found.exceeds:
+                return self._state(t_s + found.after_s, found.z), found.reserve
+            z, reserve = found.z, found.reserve
+        else:
+            z, reserve = self._advance(z, end_s - t_s, guard, reserve)
+        return (self._state(end_s, z), reserve) if latest_s <= until_s else None
+
+    def _exit(self, z: Vector, t_s: float, end_s: float, guard: Guard, reserve: float) -> Reached:
+        """Follow the loop until the comparison holds, or to ``end_s``; first decay, then floor."""
+        begin_s, since_s = t_s, guard.since_ns * 1e-9
+        floor_from_s, vanishes_s = -math.inf, math.inf
+        if guard.level > guard.floor and guard.rate_per_s > 0:
+            rate = guard.rate_per_s
+            floor_from_s = vanishes_s = math.inf
+            if guard.floor > 0:
+                floor_from_s = since_s + math.log(guard.level / guard.floor) / rate
+            vanishes_s = since_s + max(math.log(guard.level / _SMALLEST_THRESHOLD) / rate, 0.0)
+        if t_s < floor_from_s:
+            phase_s = min(end_s, floor_from_s, vanishes_s)
+            found = self._watched(
+                z, t_s, guard.threshold(t_s * 1e9), phase_s - t_s, guard.rate_per_s, guard, reserve
+            )
+            if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
+                return found
+            if vanishes_s < floor_from_s:
                 raise CallerError(
-                    f"trigger: from {self._vanishes_s:g} s on the threshold is below "
+                    f"trigger: from {vanishes_s:g} s on the threshold is below "
                     f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
                     "give trigger.floor or a shorter horizon"
                 )
-            z = self.flow.advance(z, self._floor_from_s - t_s)
-            t_s = self._floor_from_s
-        found = self._floored.first_exit(z, t_s, self.trigger.floor, until_s - t_s)
-        return None if found is None else self._state(t_s + found[0], found[1])
+            z, reserve, t_s = found.z, found.reserve, floor_from_s
+        level = guard.floor if guard.rate_per_s > 0 else max(guard.floor, guard.level)
+        found = self._watched(z, t_s, level, end_s - t_s, 0.0, guard, reserve)
+        return found._replace(after_s=found.after_s + t_s - begin_s)
+
+    def _watched(
+        self,
+        z: Vector,
+        t_s: float,
+        threshold: float,
+        span_s: float,
+        rate_per_s: float,
+        guard: Guard,
+        reserve: float,
+    ) -> Reached:
+        form = guard.form
+        plain = threshold > 0 and not len(form.down) and guard.reserve is None
+        if not plain and threshold == 0:
+            rate_per_s = 0.0
+        key = (form.up.tobytes() + form.down.tobytes() + bytes([plain]), rate_per_s)
+        watch = self._watches.get(key)
+        if watch is None:
+            watch = self._watches[key] = self._watch(guard, rate_per_s, plain=plain)
+        if isinstance(watch, FormWatch):
+            return watch.first_exit(z, t_s, threshold, span_s, reserve)
+        exit_at = watch.first_exit(z, t_s, threshold, span_s)
+        if exit_at is not None:
+            return Reached(exit_at[0], exit_at[1], reserve, exceeds=True)
+        return Reached(span_s, self.flow.advance(z, span_s), reserve, exceeds=False)
+
+    def _watch(self, guard: Guard, rate_per_s: float, *, plain: bool) -> BallWatch | FormWatch:
+        if plain:
+            output = np.zeros((len(guard.form.up), len(self.generator)))
+            output[:, : guard.form.up.shape[1]] = guard.form.up
+            return BallWatch(self.flow, self.generator, output, rate_per_s)
+        gain = None if guard.reserve is None else guard.reserve.gain
+        decay = 0.0 if guard.reserve is None else guard.reserve.decay_per_s
+        return FormWatch(self.flow, self.generator, guard.form, rate_per_s, gain, decay)
+
+    def _advance(
+        self, z: Vector, dt_s: float, guard: Guard, reserve: float
+    ) -> tuple[Vector, float]:
+        """State and η after a time in which the comparison does not count."""
+        if guard.reserve is None:
+            return self.flow.advance(z, dt_s), reserve
+        nothing = np.zeros((0, guard.form.up.shape[1]))
+        idle = FormWatch(
+            self.flow, self.generator, Form(nothing, nothing), 0.0, guard.reserve.gain,
+            guard.reserve.decay_per_s,
+        )  # fmt: skip
+        found = idle.first_exit(z, 0.0, 0.0, dt_s, reserve)
+        return found.z, found.reserve
+
+    def _on_grid(
+        self, z: Vector, t_s: float, event_s: float, end_s: float, guard: Guard
+    ) -> Reached:
+        """Look at the comparison at the grid's points from ``t_s`` on, later than ``event_s``."""
+        grid_s = guard.grid_ns * 1e-9
+        first = max(
+            math.ceil(t_s / grid_s - _GRID_SLACK), math.floor(event_s / grid_s + _GRID_SLACK) + 1
+        )
+        last = math.floor(end_s / grid_s + _GRID_SLACK)
+        n, up, down = self.loop.n, guard.form.up, guard.form.down
+        for begin in range(first, last + 1, _GRID_BLOCK):
+            points_s = np.arange(begin, min(begin + _GRID_BLOCK, last + 1)) * grid_s
+            states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
+            if not np.abs(states).max() < LARGEST:
+                raise DivergedError(float(points_s[0]))
+            left = np.linalg.norm(states[:, : 2 * n] @ up.T, axis=1)
+            held = np.linalg.norm(states[:, : 2 * n] @ down.T, axis=1)
+            thresholds = np.array([guard.threshold(point_s * 1e9) for point_s in points_s])
+            exceeds = np.flatnonzero(left > np.hypot(held, thresholds))
+            if len(exceeds):
+                k = int(exceeds[0])
+                return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
+        return Reached(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
         """The state at ``t_s`` ≥ ``state.t_s``, no event happening in between."""
@@ -189,70 +303,10 @@ def reset(state: LoopState, delivered: bool) -> LoopState:
 
 
 def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
-    """Return the exact loop of a resolved scenario."""
-    return ContinuousLoop(loop_of(resolved), trigger_of(resolved))
+    """Return the exact loop of a resolved scenario.
 
-
-class _Watch:
-    """Finds where the scaled error y leaves the unit ball.
-
-    Args:
-        flow: of the state z.
-        generator: G, shape (3n, 3n).
-        output: [0 W 0], shape (n, 3n).
-        alpha_per_s: rate at which the threshold decays; 0 for a constant one.
+    Raises:
+        CallerError: its updates are acknowledged.
     """
-
-    def __init__(self, flow: Flow, generator: Matrix, output: Matrix, alpha_per_s: float) -> None:
-        n, size = output.shape
-        terms = taylor_terms(generator + alpha_per_s * np.eye(size), flow.width_s)
-        self._flow = flow
-        self._alpha_per_s = alpha_per_s
-        self._basis = curve_basis(DEGREE)
-        self._growth = np.exp(alpha_per_s * flow.width_s * np.arange(CELLS))
-        self._taylor: Matrix = output @ terms
-        """Taylor coefficients of y from z at the start of a cell, shape (p + 1, n, 3n)."""
-        control = np.tensordot(self._basis.from_taylor, self._taylor, 1).reshape(-1, size)
-        starts = flow.powers[:CELLS] * self._growth[:, None, None]
-        self._control = (control @ starts).reshape(-1, size)
-        """Control points of y in all cells of a window, one below the other."""
-        self._shape = (-1, DEGREE + 1, n)
-        self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=1).max()), 1.0)
-
-    def first_exit(
-        self, z: Vector, t_s: float, threshold: float, span_s: float
-    ) -> tuple[float, Vector] | None:
-        """Time and state of the first exit in [0, ``span_s``] after ``t_s``, or None.
-
-        Args:
-            z: state at ``t_s``, shape (3n,).
-            t_s: time.
-            threshold: at ``t_s``.
-            span_s: how far to look.
-
-        Raises:
-            DivergedError: the state outgrows what can be computed with.
-        """
-        width_s, window_s = self._flow.width_s, self._flow.window_s
-        rows, window = len(self._control) // CELLS, 0
-        while True:
-            begin_s = window * window_s
-            scale = math.exp(self._alpha_per_s * begin_s) / threshold
-            largest = float(np.abs(z).max())
-            if not largest * max(scale, 1.0) < _LARGEST:
-                raise DivergedError(t_s + begin_s)
-            cells = max(min(CELLS, math.ceil((span_s - begin_s) / width_s)), 1)
-            control = (self._control[: cells * rows] @ (z * scale)).reshape(self._shape)
-            reach = np.einsum("cki,cki->ck", control, control).max(axis=1)
-            for cell in np.flatnonzero(reach > 1.0 - self._slack * (1.0 + largest * scale)):
-                start = self._flow.powers[cell] @ z
-                u = self._basis.first_exit(self._taylor @ (start * (scale * self._growth[cell])))
-                if u is not None:
-                    after_s = begin_s + (cell + u) * width_s
-                    if after_s > span_s:
-                        return None
-                    return float(after_s), self._flow.within_cell(start, u)
-            window += 1
-            if window * window_s >= span_s:
-                return None
-            z = self._flow.powers[CELLS] @ z
+    resolved.require_unacknowledged()
+    return ContinuousLoop(loop_of(resolved), policy_of(resolved))

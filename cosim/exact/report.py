@@ -8,11 +8,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.exact.fates import network_fates
-from cosim.exact.loop import continuous_loop_of
+from cosim.exact.loop import Samples, continuous_loop_of
 from cosim.exact.run import ContinuousRun, simulate_continuous
 from noack.errors import ExitStatus
 from noack.linear import Vector
 from noack.scenario import Scenario
+from noack.trigger.decaying import DecayingTrigger
 
 POINTS = 501
 """States are told at so many times, evenly over the run."""
@@ -58,9 +59,15 @@ def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
             "x_c": samples.x_c.tolist(),
             "e_s_norm": run.e_s_norm(samples).tolist(),
             "e_c_norm": run.e_c_norm(samples).tolist(),
-            "threshold": [run.system.threshold(t_s) for t_s in samples.t_s.tolist()],
+            "threshold": _thresholds(run, samples),
         },
     }
+
+
+def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
+    if not isinstance(run.system.trigger, DecayingTrigger):
+        return None
+    return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
 
 
 def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:

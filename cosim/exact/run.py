@@ -7,11 +7,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.exact.loop import ContinuousLoop, DivergedError, LoopState, Samples, reset
+from cosim.exact.loop import ContinuousLoop, LoopState, Samples, reset
+from cosim.exact.watch import DivergedError
 from noack.errors import CallerError
 from noack.linear import Vector
 from noack.resolve import Loop
-from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.policy import Policy
 
 MAX_EVENTS = 100_000
 
@@ -86,7 +87,7 @@ class ContinuousRun:
 
 def simulate_continuous(
     loop: Loop | ContinuousLoop,
-    trigger: DecayingTrigger | None = None,
+    trigger: Policy | None = None,
     *,
     horizon_s: float,
     delivered: Callable[[int], bool] | Sequence[bool],
@@ -121,6 +122,7 @@ def simulate_continuous(
     fates: list[bool] = []
     diverged_at_s = None
     event = None if known_start else start
+    reserve = system.trigger.first_reserve
     while True:
         if event is not None:
             fates.append(bool(arrives(len(before))))
@@ -128,7 +130,8 @@ def simulate_continuous(
             before.append(event)
             after.append(state)
         try:
-            event = system.next_event(state, horizon_s)
+            crossing = system.next_crossing(state, horizon_s, system.guard(state), reserve)
+            event, reserve = (None, 0.0) if crossing is None else crossing
         except DivergedError as error:
             diverged_at_s = error.t_s
             break
@@ -144,7 +147,7 @@ def simulate_continuous(
     )
 
 
-def _given(trigger: DecayingTrigger | None) -> DecayingTrigger:
+def _given(trigger: Policy | None) -> Policy:
     if trigger is None:
         raise TypeError("a Loop needs a trigger")
     return trigger

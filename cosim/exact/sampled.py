@@ -74,7 +74,7 @@ class SampledLoop:
         self._known_start = known_start
         self._steps_s = np.arange(len(schedule.measured), dtype=np.float64)
         self._steps_s *= schedule.period_ns * 1e-9
-        H, trigger = system.loop.H, system.trigger
+        H, trigger = system.loop.H, system.decaying
         self._model = Flow(H, 1.0 / max(growth_rate(H), 1.0 / _LONGEST_CELL_S))
         self._model_steps = _transitions(self._model, self._steps_s[: _BLOCK + 1])
         self._loop_steps = _transitions(system.flow, self._steps_s[: _BLOCK + 1])

@@ -47,7 +47,7 @@ def certified(scenario: Scenario, draw: int) -> Certified:
 def printed(scenario: Scenario, draw: int) -> Printed:
     """Theorem 2 for a draw; zeros if it does not apply."""
     resolved, constants = resolved_draw(scenario, draw, "model"), _constants(scenario, draw)
-    trigger, nothing = resolved.trigger, Printed(0.0, 0.0, 0.0, 0.0)
+    trigger, nothing = resolved.decaying, Printed(0.0, 0.0, 0.0, 0.0)
     if constants is None:
         return nothing
     found = theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, constants.delta)

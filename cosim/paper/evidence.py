@@ -44,7 +44,7 @@ def evidence(path: Path, representative: int) -> Numbers:
         representative: the draw whose plant serves as an example.
     """
     scenario = load_condition(path, BASE)
-    M, trigger = scenario.network.mansd + 1, scenario.trigger
+    M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
         "example": {"M": M, "beta": trigger.beta, "alpha_per_s": trigger.alpha_per_s},
         "eigenvalues": _eigenvalues(),
@@ -181,7 +181,7 @@ def _standstill(path: Path) -> Numbers:
     """
     settings = ("plant.draw=nominal", "mode=zoh", "horizon_s=40")
     resolved = resolved_draw(load(path, settings), 0, "zoh")
-    loop, trigger = loop_of(resolved), resolved.trigger
+    loop, trigger = loop_of(resolved), resolved.decaying
     eigenvalues, vectors = np.linalg.eig(loop.A[:2, :2])
     slowest = int(np.argmin(eigenvalues))
     rate, lateral = float(eigenvalues[slowest]), vectors[:, slowest]
@@ -235,7 +235,7 @@ def _overshoot(path: Path, representative: int) -> Numbers:
 def _theorem_1(path: Path, representative: int) -> Numbers:
     """Theorem 1's Δ of every stretch between deliveries, from the trajectory; the best γ, η_j."""
     run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "model"))
-    trigger, H = run.system.trigger, run.system.loop.H
+    trigger, H = run.system.decaying, run.system.loop.H
     arrived = np.flatnonzero(run.delivered)
     deltas, closest = [], []
     for first, following in pairwise(arrived.tolist()):
@@ -246,7 +246,7 @@ def _theorem_1(path: Path, representative: int) -> Numbers:
 
 
 def _longest_s(run: ContinuousRun, event: int) -> float:
-    trigger = run.system.trigger
+    trigger = run.system.decaying
     t_s = np.linspace(run.event_s[event], run.event_s[event + 1], _SAMPLES)
     samples = run.system.sample(run.after[event], t_s)
     interval = Interval(t_s, np.linalg.norm(samples.x, axis=1), np.linalg.norm(samples.x_s, axis=1))
@@ -261,7 +261,7 @@ def _theorem_3(path: Path, representative: int) -> Numbers:
     from scipy.optimize import brentq
 
     run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "zoh"))
-    beta, alpha_per_s = run.system.trigger.beta, run.system.trigger.alpha_per_s
+    beta, alpha_per_s = run.system.decaying.beta, run.system.decaying.alpha_per_s
     gamma = float(open_loop_eigenvalues(_loop(lane_following({}).A)).real.max())
 
     def solved_s(eta: float, level: float) -> float:
@@ -297,7 +297,7 @@ def _sampled(path: Path, representative: int) -> Numbers:
     exact = continuous.at(joined.t_ns / NS_PER_S)
     return {
         "horizon_s": _SAMPLED_S,
-        "period_s": resolved.plant_period_ns * resolved.plant.measure_every / NS_PER_S,
+        "period_s": resolved.measurement_period_ns / NS_PER_S,
         "events": int(tested.sum()) + 1,
         "events_continuous": len(continuous.event_s),
         "beyond": float(beyond.max()),

@@ -27,7 +27,12 @@ from cosim.report.style import INK, printed, styled
 from netem.link import Datagram, update_link_of
 from noack.linear import Vector
 from noack.machine import Record
-from noack.records import NETEM_PACKET, Fate, tables
+from noack.records import (
+    NETEM_PACKET,
+    Fate,
+    effective,
+    tables,
+)
 from noack.scenario import Scenario
 
 SHOWN_S = 20.0
@@ -62,9 +67,9 @@ def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
         x_c=samples.x_c,
         state_names=run.system.loop.state_names,
         broadcast_s=event_s,
-        dropped=fates == Fate.DROPPED,
-        received_s=event_s[fates != Fate.DROPPED],
-        forced=fates[fates != Fate.DROPPED] == Fate.FORCED,
+        dropped=~effective(fates),
+        received_s=event_s[effective(fates)],
+        forced=fates[effective(fates)] == Fate.FORCED,
         title=f"draw {draw}",
     )
 

@@ -119,7 +119,7 @@ def _measure(resolved: Scenario) -> Measures:
         run = simulate_draw(resolved)
     except TooManyEventsError:
         return Measures(*[_NEVER] * len(Measures._fields))
-    loop, trigger = run.system.loop, run.system.trigger
+    loop, trigger = run.system.loop, run.system.decaying
     t_s = _grid(run.reached_s)
     samples = run.at(t_s)
     norms = np.linalg.norm(samples.x, axis=1)

@@ -10,22 +10,30 @@ import numpy as np
 from controller_node.controller import controller_of
 from cosim.record import Rows, RunRecord
 from cosim.replay.result import Difference, ProcessReplay, difference, rows_differ
-from netem.link import Datagram, update_link_of
+from netem.duplex import network_of
+from netem.link import Datagram
 from noack.machine import Machine, Notice, Record
-from noack.records import CONTROLLER_STEP, NETEM_PACKET, OWNER, PLANT_STEP
+from noack.records import (
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    OWNER,
+    PLANT_STEP,
+    SENSOR_ACKNOWLEDGEMENT,
+)
 from noack.scenario import Scenario
 from noack.topology import LEGS
-from noack.wire import Flow, Message
+from noack.wire import NO_VECTOR, Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
 _MACHINES: Mapping[str, Callable[[Scenario], Machine[Any]]] = {
     "plant": plant_of,
     "sensor": sensor_of,
-    "netem": update_link_of,
+    "netem": network_of,
     "controller": controller_of,
 }
-_TIMERS = (PLANT_STEP, CONTROLLER_STEP)
+_TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _MOST_BYTES = 65_535
 """No datagram is longer, whatever a damaged record says."""
 
@@ -38,14 +46,16 @@ class Replayed:
     sent: Sequence[Any]
 
 
-def vector_of(table: str) -> str:
-    """Name of the column that holds the vector of a received message."""
+def vector_of(table: str) -> str | None:
+    """Name of the column that holds the vector of a received message; None if it has none."""
+    if table == SENSOR_ACKNOWLEDGEMENT:
+        return None
     return "u" if LEGS[OWNER[table]].receives is Flow.ACTUATION else "x"
 
 
 def replay_machine(role: str, record: RunRecord) -> Replayed:
     """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows."""
-    owned = {table: record[table] for table, owner in OWNER.items() if owner == role}
+    owned = record.owned_by(role)
     inputs = _inputs(owned, record.reports.get(role))
     run = _Run(_MACHINES[role](record.scenario), owned)
     compared = 0
@@ -132,7 +142,7 @@ class _Run:
             else:
                 outputs = self._machine.handle(message, now_ns)
             self._compare(table, row, outputs)
-        except (ArithmeticError, ValueError) as error:  # from numbers that no run has
+        except (ArithmeticError, LookupError, ValueError) as error:  # from numbers that no run has
             self._differs(table, row, f"the machine cannot take this input: {error}")
             return False
         return True
@@ -167,9 +177,15 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | None]:
             size_bytes = min(max(size, 0), _MOST_BYTES)
             yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
     else:
-        flow = LEGS[OWNER[table]].receives
+        flow, column = LEGS[OWNER[table]].receives, vector_of(table)
+        if column is None:
+            for sequence, t_ns in zip(
+                rows["sequence"].tolist(), rows["t_ns"].tolist(), strict=True
+            ):
+                yield Message(Flow.ACKNOWLEDGEMENT, sequence, t_ns, NO_VECTOR)
+            return
         for sequence, t_ns, vector in zip(
-            rows["sequence"].tolist(), rows["t_ns"].tolist(), rows[vector_of(table)], strict=True
+            rows["sequence"].tolist(), rows["t_ns"].tolist(), rows[column], strict=True
         ):
             # A copy lies in memory as the decoder's vector does, which arithmetic may depend on.
             yield Message(flow, sequence, t_ns, vector.copy())

@@ -5,20 +5,25 @@ been sent, and bit for bit so.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+
+import numpy as np
 
 from cosim.record import Rows, RunRecord
 from cosim.replay.machines import Replayed, vector_of
 from cosim.replay.result import MessagesReplay, difference, first_entry
 from netem.link import Datagram
 from noack.records import (
+    ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
     PACKET_HEAD_BYTES,
     PLANT_ACTUATION,
+    SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
+    UPDATES,
 )
-from noack.wire import KEY_BYTES, Encoder, Header, Message, read_header
+from noack.wire import KEY_BYTES, NO_VECTOR, Encoder, Flow, Header, Message, read_header
 
 
 def check_messages(
@@ -26,26 +31,48 @@ def check_messages(
 ) -> tuple[MessagesReplay, ...]:
     """Compare the messages of every leg of the loop."""
     plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
-    measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant)
-    entering = _Received("sensor → netem", NETEM_PACKET, record, sensor)
-    updates = _Received("netem → controller", CONTROLLER_DELIVERY, record, sensor)
-    actuations = _Received("controller → plant", PLANT_ACTUATION, record, controller)
+    measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant, Flow.MEASUREMENT)
+    entering = _Received("sensor → netem", NETEM_PACKET, record, sensor, Flow.UPDATE)
+    updates = _Received("netem → controller", CONTROLLER_DELIVERY, record, sensor, Flow.UPDATE)
+    actuations = _Received(
+        "controller → plant", PLANT_ACTUATION, record, controller, Flow.ACTUATION
+    )
+    found = [measurements, entering, updates, actuations]
     measurements.compare_vectors()
     entering.compare_heads()
     updates.compare_vectors()
     updates.compare_with_survivors(replayed["netem"])
     actuations.compare_vectors()
-    return tuple(one.result() for one in (measurements, entering, updates, actuations))
+    if record.scenario.is_acknowledged:
+        flow = Flow.ACKNOWLEDGEMENT
+        answers = _Received("controller → netem", NETEM_PACKET, record, controller, flow)
+        returned = _Received("netem → sensor", SENSOR_ACKNOWLEDGEMENT, record, controller, flow)
+        answers.compare_heads()
+        returned.compare_vectors()
+        returned.compare_with_survivors(replayed["netem"])
+        found += [answers, returned]
+    else:
+        entering.compare_flows()
+    return tuple(one.result() for one in found)
 
 
 class _Received:
     """The messages of one leg, as they were received and as they are sent in the replay."""
 
-    def __init__(self, leg: str, table: str, record: RunRecord, sender: Replayed) -> None:
+    def __init__(
+        self, leg: str, table: str, record: RunRecord, sender: Replayed, flow: Flow
+    ) -> None:
         self._leg = leg
         self._table = table
         self._rows: Rows = record[table]
-        self._sent: Sequence[Message] = sender.sent  # numbered from 0, without gaps
+        self._at = np.arange(len(self._rows))
+        self._way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        if table == NETEM_PACKET and record.scenario.is_acknowledged:
+            self._at = np.flatnonzero(self._rows["flow"] == self._way)
+            self._rows = self._rows[self._at]
+        self._sent: dict[int, Message] = {
+            message.sequence: message for message in sender.sent if message.flow is flow
+        }
         self._all_sent = sender.account.whole
         self._compared = 0
         self._first: tuple[int, str, str, object, object] | None = None
@@ -54,14 +81,15 @@ class _Received:
         found = None
         if self._first is not None:
             row, what, column, recorded, replayed = self._first
-            now_ns = int(self._rows["now_ns"][row])
-            found = difference(self._table, row, now_ns, what, column, recorded, replayed)
+            now_ns, place = int(self._rows["now_ns"][row]), int(self._at[row])
+            found = difference(self._table, place, now_ns, what, column, recorded, replayed)
         return MessagesReplay(self._leg, len(self._rows), self._compared, found)
 
     def compare_vectors(self) -> None:
         """Compare sequence number, time and vector of what a machine received."""
         rows, column, newest = self._rows, vector_of(self._table), -1
-        fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), rows[column])
+        vectors = [NO_VECTOR] * len(rows) if column is None else rows[column]
+        fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
         for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
             if sequence <= newest:
                 self._differs(row, "not newer than what came before", "sequence", sequence)
@@ -71,7 +99,7 @@ class _Received:
                 continue
             if t_ns != message.t_ns:
                 self._differs(row, "was not sent so", "t_ns", t_ns, message.t_ns)
-            elif vector.tobytes() != message.vector.tobytes():
+            elif column is not None and vector.tobytes() != message.vector.tobytes():
                 entry = first_entry(vector, message.vector)
                 if entry is not None:
                     self._differs(row, "was not sent so", column + entry[0], *entry[1:])
@@ -93,6 +121,9 @@ class _Received:
                 self._differs(row, "was not sent so", "head", head, expected)
             elif size != len(data):
                 self._differs(row, "was not sent so", "size_bytes", size, len(data))
+
+    def compare_flows(self) -> None:
+        """Look whether anybody but the sensor was served."""
         for row, flow in enumerate(self._rows["flow"].tolist()):
             if flow != 0:
                 self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
@@ -101,16 +132,20 @@ class _Received:
         """Look whether the network let through what was received."""
         if not network.account.whole:
             return
-        survivors = {header.sequence for datagram in network.sent if (header := _header(datagram))}
+        survivors = {
+            header.sequence
+            for datagram in network.sent
+            if datagram.flow == self._way and (header := _header(datagram))
+        }
         for row, sequence in enumerate(self._rows["sequence"].tolist()):
             if sequence not in survivors:
                 self._differs(row, "netem does not let it through", "sequence", sequence)
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
         """Return the message of a number, if it was sent; if that can be told at all."""
-        if 0 <= sequence < len(self._sent):
+        if (message := self._sent.get(sequence)) is not None:
             self._compared += 1
-            return self._sent[sequence]
+            return message
         if sequence < 0 or self._all_sent:
             self._differs(row, "was never sent", column, value)
         return None

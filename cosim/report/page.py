@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from cosim.tables import key_numbers, warnings_of
 from noack.scenario import Scenario
+from noack.trigger.text import trigger_text
 
 _NONE = "–"
 _MOST_ROWS = 40
@@ -137,11 +138,15 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     model = loss.pop("model").replace("_", "-")
     details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
     yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
-    yield "trigger", "‖e_s‖ > max(β e^(−αt), ε)"
-    yield "β, α, ε", f"{trigger.beta:g}, {trigger.alpha_per_s:g} /s, {trigger.floor:g}"
+    yield "trigger", trigger_text(trigger)
     yield "norm", "‖v‖₂" if trigger.weight is None else "‖W v‖₂, W in the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model
+    if scenario.is_acknowledged:
+        timeout_ms = 1e-6 * scenario.acknowledgement_timeout_ns
+        back = network.way_back.loss.model_dump()
+        lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in back.items())
+        yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
     yield "start", network.initial_sync.replace("_", " ")
     yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
     yield "measurements", "every step" if every == 1 else f"every {every} steps"

@@ -6,8 +6,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from cosim.crossing import crossing
 from cosim.join import Joined, join_all
-from cosim.record import RunRecord, updates_in
+from cosim.record import (
+    RunRecord,
+)
 from cosim.report import figures
 from cosim.report.axes import Curve
 from cosim.report.decimate import Reals
@@ -16,7 +19,6 @@ from noack.clock import NS_PER_S
 from noack.records import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    NETEM_PACKET,
     NO_SEQUENCE,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
@@ -64,11 +66,11 @@ def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Curve]:
 
 
 def _states(record: RunRecord, joined: Joined) -> Picture:
-    packets, sequence, _ = updates_in(record[NETEM_PACKET])
+    crossed = crossing(record)
     measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
     events = measurements[measurements["event"] != NO_SEQUENCE]
-    dropped = np.isin(events["event"], sequence[packets["fate"] == Fate.DROPPED])
-    forced = np.isin(deliveries["sequence"], sequence[packets["fate"] == Fate.FORCED])
+    dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
+    forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.rows["fate"] == Fate.FORCED])
     scenario, names = record.scenario, record.loop.state_names
     figure = figures.paper_figure(
         mode=scenario.mode,
@@ -86,8 +88,13 @@ def _states(record: RunRecord, joined: Joined) -> Picture:
     return Picture(
         "states",
         figure,
-        "States, and the time between broadcasts and between receptions. At every event x_s jumps "
-        "to x; x_c does so only when the packet survives. A cross is a packet that was lost, a "
+        "States, and the time between broadcasts and between receptions. "
+        + (
+            "x_c jumps to x when a packet survives, x_s when its acknowledgement does, too. "
+            if scenario.is_acknowledged
+            else "At every event x_s jumps to x; x_c does so only when the packet survives. "
+        )
+        + "A cross is a packet that was lost, a "
         "diamond one that only the bound on successive drops let through.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
         f"{len(events)} broadcasts, of which {int(dropped.sum())} were dropped, and for "
@@ -102,9 +109,15 @@ def _norms(
     yield Picture(
         "errors",
         figures.error_figure(t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, e_c_bounds),
-        "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset whenever it passes the threshold. The "
-        "controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, leaves it "
-        "while packets are lost." + _dashed(e_c_bounds),
+        (
+            "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; while none comes, "
+            "the sensor transmits again and again. The controller's error is ‖e_c‖ = ‖x_c − x‖."
+            if record.scenario.is_acknowledged
+            else "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset whenever it passes the threshold. "
+            "The controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, "
+            "leaves it while packets are lost."
+        )
+        + _dashed(e_c_bounds),
         "Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
     )

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.join import ControllerTrack, Joined, controller_track, initial_track, join
-from cosim.record import Rows, updates_in
+from cosim.record import Rows, tables_of, updates_in
 from cosim.viewer.recording import RunView
 from noack.clock import NS_PER_S
 from noack.records import (
@@ -19,14 +19,14 @@ from noack.records import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
     Fate,
-    tables,
+    effective,
 )
 from noack.resolve import loop_of
 from noack.scenario import Scenario
 from noack.theory.certify import Certificate, certify
 from noack.theory.monitor import ErrorMonitor
 from noack.theory.schedule import nominal_conditions
-from noack.trigger.decaying import trigger_of
+from noack.trigger.choose import policy_of
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""
@@ -46,14 +46,12 @@ class ViewFeed:
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
-        self._pending: dict[str, list[Rows]] = {
-            table: [] for table in tables(self._loop.n, self._loop.m)
-        }
-        self._types = tables(self._loop.n, self._loop.m)
+        self._pending: dict[str, list[Rows]] = {table: [] for table in tables_of(scenario)}
+        self._types = tables_of(scenario)
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
-        self._monitor = ErrorMonitor(self._loop.H, trigger_of(scenario))
+        self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario))
         self._known = scenario.network.initial_sync == "known_state"
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
@@ -102,10 +100,11 @@ class ViewFeed:
     def _measurements(self, rows: Rows, reach_ns: int) -> None:
         if not len(rows):
             return
-        joined = join(self._loop, rows, self._track, reach_ns)
+        acknowledged = self._scenario.is_acknowledged
+        joined = join(self._loop, rows, self._track, reach_ns, acknowledged=acknowledged)
         t_s = np.asarray(joined.t_ns * 1e-9)
         bounds = np.column_stack(
-            [self._bounds(rows, joined), self._certificate.controller_error(t_s)]
+            [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
         )
         if not self._known:  # as yet, sensor and controller have nothing in common
             bounds[joined.received == NO_SEQUENCE] = np.nan
@@ -118,7 +117,7 @@ class ViewFeed:
             joined.threshold,
             joined.e_c_norm,
             bounds,
-            self._certificate.state(t_s),
+            self._certified(t_s, "state"),
         )
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
@@ -129,16 +128,30 @@ class ViewFeed:
         self._track = self._track.since(keep)
 
     @cached_property
-    def _certificate(self) -> Certificate:
-        """The certificate of the run, made when the run is under way: it takes its time."""
+    def _certificate(self) -> Certificate | None:
+        """The certificate of the run, made when the run is under way: it takes its time.
+
+        None for another trigger than the paper's, and where updates are acknowledged.
+        """
+        if not self._scenario.is_decaying or self._scenario.is_acknowledged:
+            return None
         conditions = nominal_conditions(self._scenario, self._scenario.certificate.late_periods)
         certificate = certify(self._scenario, conditions)
         if certificate.inter_event_s is not None:
             self._view.certified_interval(certificate.inter_event_s, self._scenario.horizon_ns)
         return certificate
 
+    def _certified(
+        self, t_s: NDArray[np.float64], what: Literal["controller_error", "state"]
+    ) -> NDArray[np.float64]:
+        if self._certificate is None:
+            return np.full(len(t_s), np.nan)
+        return np.asarray(getattr(self._certificate, what)(t_s))
+
     def _bounds(self, rows: Rows, joined: Joined) -> NDArray[np.float64]:
-        """The bound of ‖e_c‖ that (I1) gives, (k,)."""
+        """The bound of ‖e_c‖ that (I1) gives, (k,); none where updates are acknowledged."""
+        if self._scenario.is_acknowledged:
+            return np.full(len(rows), np.nan)
         samples = zip(
             rows["t_ns"].tolist(), rows["x_s"] - rows["x"], rows["event"].tolist(),
             joined.received.tolist(), strict=True,
@@ -163,7 +176,7 @@ class ViewFeed:
             return
         rows, sequence, event_ns = updates_in(rows)
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
-        dropped = rows["fate"] == Fate.DROPPED
+        dropped = ~effective(rows["fate"])
         if dropped.any():
             self._view.drops(event_ns[dropped])
         self._view.lateness("netem", event_ns, self._wall_us(rows["now_ns"] - event_ns))

@@ -42,11 +42,36 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     loop = loop_of(resolved)
     return [
         _closed_loop(loop),
-        _decay_rate(loop, resolved.trigger.alpha_per_s),
+        *_trigger(loop, resolved),
+        *_protocol(resolved),
         _unstable_and_distinct(loop.A),
         _mansd(resolved),
         _continuous_time(resolved),
     ]
+
+
+def _trigger(loop: Loop, resolved: Scenario) -> list[Assumption]:
+    if resolved.is_decaying:
+        return [_decay_rate(loop, resolved.decaying.alpha_per_s)]
+    policy = resolved.trigger.policy
+    return [
+        Assumption(
+            "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", Verdict.VIOLATED,
+            f'it is "{policy}": the paper\'s theorems and the certificates say nothing of it',
+        )
+    ]  # fmt: skip
+
+
+def _protocol(resolved: Scenario) -> list[Assumption]:
+    if not resolved.is_acknowledged:
+        return []
+    return [
+        Assumption(
+            "the sensor resets x_s at every event; nothing is acknowledged", "Section II",
+            Verdict.VIOLATED,
+            'protocol = "ack": the theorems and the certificates say nothing of it',
+        )
+    ]  # fmt: skip
 
 
 def _verdict(holds: bool) -> Verdict:
@@ -109,15 +134,25 @@ def _mansd(resolved: Scenario) -> Assumption:
 
 
 def _continuous_time(resolved: Scenario) -> Assumption:
-    period_ms = 1e3 * resolved.plant_period_ns * resolved.plant.measure_every / NS_PER_S
+    period_ms = 1e3 * resolved.measurement_period_ns / NS_PER_S
     control_ms = 1e3 * resolved.controller_period_ns / NS_PER_S
     return Assumption(
         "the trigger watches continuously; network and input act at once",
         "Section II",
         Verdict.VIOLATED,
         f"sampled every {period_ms:g} ms, input held for {control_ms:g} ms: "
-        "‖e_s‖ may pass the threshold by what it grows in between",
+        "‖e_s‖ may pass the threshold by what it grows in between" + _network_delay(resolved),
     )
+
+
+def _network_delay(resolved: Scenario) -> str:
+    link = resolved.network.link
+    if not link.longest_delay_s:
+        return ""
+    longest_ms = 1e3 * link.longest_delay_s
+    if link.delay_is_bounded:
+        return f"; the network delays updates by up to {longest_ms:g} ms"
+    return f"; the network delays updates without a bound, certificates allow for {longest_ms:g} ms"
 
 
 def certificate_assumptions(
@@ -138,7 +173,7 @@ def certificate_assumptions(
         constants: of the certificate; None if there is none.
         void: why there is none.
     """
-    alpha, network = resolved.trigger.alpha_per_s, resolved.network
+    alpha, network = resolved.decaying.alpha_per_s, resolved.network
     rate = 0.0 if constants is None else constants.rate_per_s
     if held:
         why = "a hold does not decay at all: what is certified is bounded, not decaying"

@@ -200,7 +200,7 @@ class Scope:
 
     def certificate(self, conditions: Conditions) -> Certificate:
         """The certificate under some conditions; a void one says why."""
-        trigger = self._resolved.trigger
+        trigger = self._resolved.decaying
         first: Constants | None = None
         late: Constants | None = None
         void = None
@@ -241,7 +241,7 @@ class Scope:
         return low
 
     def _first_phase(self, conditions: Conditions) -> Constants:
-        trigger, decay = self._resolved.trigger, min(self._decay.values())
+        trigger, decay = self._resolved.decaying, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
         if not self._held and below(alpha, decay) and floor < beta:
@@ -265,7 +265,7 @@ class Scope:
         for share in _SHARES_OF_ALPHA:
             rate = share * alpha_per_s
             with contextlib.suppress(NotDecayingError):
-                level = Level(self._resolved.trigger.beta, None)
+                level = Level(self._resolved.decaying.beta, None)
                 return self._solve(conditions, rate, rate, start, level)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
@@ -276,7 +276,7 @@ class Scope:
         at t_ε by e^{ατ}. The models' side keeps α, so that its kernels, e^{(H+αI)τ}, bring that
         factor along wherever something of the first phase reaches into this one.
         """
-        trigger = self._resolved.trigger
+        trigger = self._resolved.decaying
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
         before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)

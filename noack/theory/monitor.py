@@ -6,13 +6,15 @@ By (I1), e_c = e_s + Σ e^{H(t−t_k)} e_s(t_k⁻) over the missing events. Two 
 * the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a trigger that watches always.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.linear import Matrix, Propagator, Vector
+from noack.linear import Matrix, Propagator, Vector, norm
 from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.policy import Policy
 
 
 class ErrorBounds(NamedTuple):
@@ -20,6 +22,7 @@ class ErrorBounds(NamedTuple):
 
     identity: float
     printed: float
+    """NaN of another trigger than the paper's."""
 
 
 class ErrorMonitor:
@@ -33,7 +36,7 @@ class ErrorMonitor:
         trigger: the event-triggering policy.
     """
 
-    def __init__(self, H: Matrix, trigger: DecayingTrigger) -> None:
+    def __init__(self, H: Matrix, trigger: Policy) -> None:
         n = len(H)
         self._trigger = trigger
         self._propagate = Propagator(H)
@@ -62,19 +65,23 @@ class ErrorMonitor:
         if event >= 0:
             self._append(event, e_s)
         self._keep(self._sequences > received)
-        identity = 0.0 if event >= 0 else self._trigger.error_norm(e_s)
+        identity = 0.0 if event >= 0 else norm(self._weight @ e_s)
         ages_ns = (t_ns - self._thens_ns).tolist()
         growths = np.array([self._grown(age_ns) for age_ns in ages_ns])
         return ErrorBounds(
             identity + float(np.linalg.norm(self._jumps @ self._weight.T, axis=1).sum()),
-            self._trigger.threshold(t_ns) + float(growths @ self._thresholds),
+            self._threshold(t_ns) + float(growths @ self._thresholds),
         )
 
     def _append(self, event: int, e_s: Vector) -> None:
         self._sequences = np.append(self._sequences, event)
         self._thens_ns = np.append(self._thens_ns, self._t_ns)
-        self._thresholds = np.append(self._thresholds, self._trigger.threshold(self._t_ns))
+        self._thresholds = np.append(self._thresholds, self._threshold(self._t_ns))
         self._jumps = np.vstack([self._jumps, e_s])
+
+    def _threshold(self, t_ns: int) -> float:
+        trigger = self._trigger
+        return trigger.threshold(t_ns) if isinstance(trigger, DecayingTrigger) else math.nan
 
     def _keep(self, kept: NDArray[np.bool_]) -> None:
         if not kept.all():

@@ -12,7 +12,9 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
 
     In the plant's time, whatever the rates: an update is felt from the first step on whose newest
     tick is not before it, and the model state behind an input ages until the step after the one
-    that latched it. The plant steps before it takes what arrives at the same time.
+    that latched it. The plant steps before it takes what arrives at the same time. A delay of the
+    network that has no bound is taken at four times its jitter; a run that exceeds that leaves the
+    conditions.
     """
     step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
     phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
@@ -22,10 +24,11 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     common_ns = math.gcd(sample_ns, tick_ns)
     wait_ns = tick_ns - common_ns + phase_ns % common_ns
     late_ns = late_periods * step_ns
-    if late_periods > 0:  # an update that is late by any time up to that may just miss a tick
-        wait_ns = late_ns + tick_ns - 1
+    under_way_ns = late_ns + math.ceil(resolved.network.link.longest_delay_s * NS_PER_S)
+    if under_way_ns > 0:  # an update that is late by any time up to that may just miss a tick
+        wait_ns = under_way_ns + tick_ns - 1
     delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
-    start_ns = first_ns if late_periods == 0 else max(first_ns + late_ns, delay_ns)
+    start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
     return Conditions(
         dropouts=resolved.network.mansd,
         sampling_s=sample_ns / NS_PER_S,

@@ -24,7 +24,6 @@ from cosim.virtual import Network, simulate
 from noack.records import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
-    OWNER,
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
@@ -50,7 +49,7 @@ def fidelity(record: RunRecord) -> Fidelity:
 
 
 def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
-    rows = {table: changed.get(table, record[table]) for table in OWNER}
+    rows = {table: changed.get(table, record[table]) for table in record.tables}
     return RunRecord(record.scenario, rows, record.notices, record.reports)
 
 
@@ -114,7 +113,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
     assert plant.A is not None
     A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
     other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
-    rows = {table: record[table] for table in OWNER}
+    rows = {table: record[table] for table in record.tables}
     fidelity = compare(RunRecord(other, rows, record.notices, record.reports))
     assert fidelity.explained_relative > 0.1
     assert not fidelity.explained

@@ -14,7 +14,7 @@ from cosim.simulated_run import simulate_run
 from cosim.viewer import blueprint
 from cosim.virtual import Progress, simulate
 from noack.errors import MachineError
-from noack.records import OWNER
+from noack.records import tables
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.scenario_file import load
@@ -46,14 +46,14 @@ def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
     }  # fmt: skip
     assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
     assert {path.name for path in (run_dir / "record").iterdir()} == {
-        *(f"{table}.parquet" for table in OWNER),
+        *(f"{table}.parquet" for table in tables(4, 2)),
         "notices.jsonl",
     }
 
 
 def test_the_record_on_disk_is_the_simulators(runs: Path) -> None:
     again, loaded = simulate(resolve(load(PATH, SHORT))), load_record(runs / "latest")
-    assert all(again[table].tobytes() == loaded[table].tobytes() for table in OWNER)
+    assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
     assert loaded.scenario == again.scenario
     assert loaded.kind == again.kind == "simulated"
     assert loaded.reports == again.reports

@@ -1,13 +1,10 @@
-"""One process each, started by hand; and the network emulator on its own."""
+"""One process each, started by hand."""
 
 import json
 import os
-import re
 import signal
-import socket
 import stat
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -87,61 +84,3 @@ def test_a_process_that_a_person_ends_is_named(
     for process in processes.values():
         process.communicate(timeout=30)
     assert processes["sensor"].returncode == 130
-
-
-@pytest.mark.parametrize(("loss", "expected_run"), [("worst_case", 3), ("lossless", 0)])
-def test_netem_serves_any_udp_program(loss: str, expected_run: int) -> None:
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client,
-    ):
-        server.bind(("127.0.0.1", 0))
-        server.settimeout(20)
-        destination = f"127.0.0.1:{server.getsockname()[1]}"
-        command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to", destination]
-        command += ["--loss", loss, "--mansd", "3", "--json"]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as relay:
-            assert relay.stderr is not None
-            found = re.search(r"127\.0\.0\.1:(\d+) → ", relay.stderr.readline())
-            assert found
-            for number in range(40):
-                client.sendto(b"%d" % number, ("127.0.0.1", int(found[1])))
-            stride = expected_run + 1
-            arrived = [int(server.recv(100)) for _ in range(40 // stride)]
-            relay.send_signal(signal.SIGINT)
-            stdout, _ = relay.communicate(timeout=20)
-    assert relay.returncode == 0
-    assert arrived == list(range(0, 40, stride))
-    assert json.loads(stdout) == {
-        "delivered": 0 if expected_run else 40,
-        "dropped": 30 if expected_run else 0,
-        "forced": 10 if expected_run else 0,
-        "longest_drop_run": expected_run,
-        "send_errors": 0,
-        "lost_in_kernel": 0,
-    }
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--listen", "127.0.0.1:0"], "--listen and --to go together"),
-        (["--listen", "x", "--to", "127.0.0.1:9"], "expected HOST:PORT"),
-        (["--listen", ":0", "--to", ":9", "--loss", "bernoulli:1.5"], "less than or equal to 1"),
-        (["--listen", ":0", "--to", ":9", "--loss", "sometimes"], "expected one of lossless"),
-        (["--listen", ":0", "--to", ":9", "--mansd", "-1"], "must be 0 or more"),
-        (["--listen", ":0", "--to", ":9", "--seed", "-1"], "must be 0 or more"),
-        (["--listen", ":0", "--to", "[::1]:9"], "no such IPv4 host"),
-        (["--loss", "worst_case"], "is for an emulator on its own"),
-    ],
-)
-def test_netem_says_what_is_wrong(arguments: list[str], words: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "netem", *arguments],
-        capture_output=True, text=True, timeout=30, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr

@@ -1,10 +1,17 @@
 from noack import wire
-from noack.records import NETEM_PACKET, OWNER, PACKET_HEAD_BYTES, tables
+from noack.records import (
+    NETEM_PACKET,
+    OWNER,
+    PACKET_HEAD_BYTES,
+    SENSOR_ACKNOWLEDGEMENT,
+    tables,
+)
 from noack.topology import LOOP_ROLES
 
 
 def test_every_table_has_an_owner_in_the_loop() -> None:
-    assert set(tables(1, 1)) == set(OWNER)
+    assert set(tables(1, 1, acknowledged=True)) == set(OWNER)
+    assert set(tables(1, 1)) == set(OWNER) - {SENSOR_ACKNOWLEDGEMENT}
     assert set(OWNER.values()) == set(LOOP_ROLES)
 
 
@@ -16,7 +23,7 @@ def test_the_kept_head_of_a_datagram_is_its_whole_header() -> None:
 
 def test_rows_have_as_many_entries_as_the_loop() -> None:
     for n, m in ((1, 1), (4, 2), (64, 3)):
-        for table, dtype in tables(n, m).items():
+        for table, dtype in tables(n, m, acknowledged=True).items():
             for column in dtype.names or ():
                 shape = dtype[column].shape
                 expected = (m,) if column == "u" else (n,) if column.startswith("x") else ()
@@ -24,6 +31,6 @@ def test_rows_have_as_many_entries_as_the_loop() -> None:
 
 
 def test_every_row_tells_its_input_and_its_times() -> None:
-    for dtype in tables(2, 1).values():
+    for dtype in tables(2, 1, acknowledged=True).values():
         assert dtype.names is not None
         assert dtype.names[:4] == ("input", "sequence", "t_ns", "now_ns")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.rng import stream
+from noack.rng import stream, stream_key, stream_keys, uniforms, words
 
 seeds = st.integers(0, 2**64 - 1)
 names = st.lists(st.text("abc/", max_size=4), min_size=1, max_size=4)
@@ -53,3 +53,48 @@ def test_a_nameless_stream_or_a_negative_seed_is_refused() -> None:
         stream(0)
     with pytest.raises(ValueError, match="non-negative"):
         stream(-1, "a")
+
+
+def test_a_streams_key_is_the_seed_sequences_own() -> None:
+    """Two words of what seeds the stream of the same name; written down once, like its numbers."""
+    digest = hashlib.blake2b(b"netem\0a\0loss", digest_size=16).digest()
+    key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
+    words = np.random.SeedSequence(2, spawn_key=key).generate_state(2)
+    assert stream_key(2, "netem", "a", "loss") == tuple(words.tolist())
+    assert stream_key(2, "netem", "a", "loss") == (0xA1E54851, 0x9C1E9ED0)
+    assert all(type(word) is int for word in stream_key(2, "netem", "a", "loss"))
+
+
+def test_other_seeds_and_names_have_other_keys() -> None:
+    paths = [("a",), ("b",), ("a", "b"), ("ab",), ("a", ""), ("", "a")]
+    keys = {stream_key(seed, *path) for seed in (0, 1, 2**32, 2**64 - 1) for path in paths}
+    assert len(keys) == 4 * len(paths)
+    with pytest.raises(ValueError, match="needs a name"):
+        stream_key(0)
+
+
+def test_rows_of_a_table_are_the_same_whichever_are_asked_for() -> None:
+    whole = words(7, "a", "table", rows=range(100), width=6)
+    assert whole.shape == (100, 6)
+    for rows in (range(1), range(37, 41), range(99, 100)):
+        some = words(7, "a", "table", rows=rows, width=6)
+        np.testing.assert_array_equal(some, whole[rows.start : rows.stop])
+    assert words(7, "a", "table", rows=range(0), width=6).shape == (0, 6)
+    assert len(np.unique(whole)) == 600
+    for other in (words(8, "a", "table", rows=range(100), width=6),
+                  words(7, "another", rows=range(100), width=6)):  # fmt: skip
+        assert (whole != other).all()
+
+
+def test_a_table_is_the_generators_own_sequence() -> None:
+    low, high = stream_key(7, "t")
+    sequence = np.random.Generator(np.random.Philox(key=low | high << 32)).random(40)
+    np.testing.assert_array_equal(uniforms(7, "t", rows=range(10), width=4).ravel(), sequence)
+
+
+def test_many_keys_are_the_keys_one_by_one() -> None:
+    seeds = [0, 1, 2**32 - 1, 2**32, 2**64 - 1, *range(7, 2**63, 2**58)]
+    for path in (("netem", "a", "loss"), ("b",)):
+        keys = stream_keys(np.array(seeds, np.uint64), *path)
+        assert keys.tolist() == [list(stream_key(seed, *path)) for seed in seeds]
+    assert stream_keys(np.array([], np.uint64), "a").shape == (0, 2)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from noack.wire import Decoder, Encoder, Flow, Header, Message, Rejection, read_header
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
-FLOWS = {"measurement": 1, "update": 2, "actuation": 3}
+FLOWS = {"measurement": 1, "update": 2, "actuation": 3, "acknowledgement": 4}
 KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
 RUN = 0x0123_4567_89AB_CDEF
 
@@ -93,7 +93,7 @@ def published_vectors() -> list[Vector]:
                 int(fields["run id"], 16),
                 int(fields["sequence"]),
                 int(fields["t_ns"]),
-                [float(value) for value in fields["vector"].split()],
+                [float(value) for value in fields["vector"].split() if value != "none"],
                 bytes.fromhex(fields["datagram"]),
             )
         )
@@ -134,6 +134,7 @@ def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
 def test_what_is_sent_is_what_arrives(
     flow: Flow, run_id: int, sequence: int, t_ns: int, values: list[float]
 ) -> None:
+    values = [] if flow is Flow.ACKNOWLEDGEMENT else values
     data = Encoder(run_id, KEY).encode(Message(flow, sequence, t_ns, np.array(values)))
     assert data == datagram(values, flow=flow, run_id=run_id, sequence=sequence, t_ns=t_ns)
     decoder = Decoder(flow, len(values), run_id, KEY)
@@ -289,6 +290,17 @@ def test_a_header_is_read_from_whatever_begins_like_one(head: bytes) -> None:
 def test_only_vectors_of_1_to_64_entries_can_be_sent(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
         Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))
+
+
+def test_an_acknowledgement_carries_no_vector() -> None:
+    with pytest.raises(ValueError, match=r"carries no vector of shape \(1,\)"):
+        Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(1)))
+    decoder = new_decoder(flow=4, dimension=0)
+    assert_rejected(decoder, datagram([0.0], flow=4), Rejection.LENGTH)
+    assert_rejected(decoder, datagram([], flow=2), Rejection.FLOW)
+    message = decoder.decode(datagram([], flow=4, sequence=7, t_ns=5))
+    assert message is not None
+    assert (*message[:3], message.vector.size) == (Flow.ACKNOWLEDGEMENT, 7, 5, 0)
 
 
 @pytest.mark.parametrize("size", [0, 16, 31, 33, 64])

@@ -8,7 +8,6 @@ import pytest
 
 from cosim.record import Rows, RunRecord
 from cosim.virtual import Network, simulate
-from noack.records import OWNER
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.scenario_file import validate
@@ -21,13 +20,13 @@ Make = Callable[..., Scenario]
 
 def changed(record: RunRecord, **tables: Rows) -> RunRecord:
     """A record with some tables exchanged."""
-    rows = {table: tables.get(table, record[table]) for table in OWNER}
+    rows = {table: tables.get(table, record[table]) for table in record.tables}
     return RunRecord(record.scenario, rows, record.notices, record.reports, record.kind)
 
 
 def of_scenario(record: RunRecord, scenario: Scenario) -> RunRecord:
     """The same rows, said to be of another scenario."""
-    rows = {table: record[table] for table in OWNER}
+    rows = {table: record[table] for table in record.tables}
     return RunRecord(scenario, rows, record.notices, record.reports, record.kind)
 
 

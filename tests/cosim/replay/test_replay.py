@@ -36,6 +36,8 @@ ROOT = Path(__file__).parents[3]
 SHORT = (
     "horizon_s=1.0", "plant.rate_hz=50", "controller.rate_hz=50",
     "trigger.beta=0.01", "network.loss.probability=0.4",
+    'network.impairments=[{kind="delay", delay_s=0.01, jitter_s=0.01},'
+    ' {kind="duplicate", probability=0.3}]',
 )  # fmt: skip
 RECORD = simulate(resolve(load(ROOT / "scenarios" / "lane_following.toml", SHORT)))
 
@@ -44,7 +46,7 @@ FROM_OUTSIDE = ("input", "now_ns")
 
 
 def changed(rows: Mapping[str, Rows], reports: Any = RECORD.reports) -> RunRecord:
-    every = {table: RECORD[table] for table in OWNER} | dict(rows)
+    every = {table: RECORD[table] for table in RECORD.tables} | dict(rows)
     return RunRecord(RECORD.scenario, every, RECORD.notices, reports, "simulated")
 
 
@@ -59,7 +61,7 @@ def flipped(table: str, row: int, column: str, byte: int, bit: int) -> RunRecord
 
 
 def columns() -> Iterator[tuple[str, str]]:
-    for table in OWNER:
+    for table in RECORD.tables:
         for column in RECORD[table].dtype.names or ():
             if column not in FROM_OUTSIDE:
                 yield table, column
@@ -70,7 +72,7 @@ def test_a_run_is_replayed_bit_for_bit() -> None:
     assert found.bit_exact
     assert found.gaps == []
     assert found.first_difference is None
-    assert found.inputs == sum(len(RECORD[table]) for table in OWNER)
+    assert found.inputs == sum(len(RECORD[table]) for table in RECORD.tables)
     assert {leg.leg: leg.compared for leg in found.messages} == {
         "plant → sensor": len(RECORD[SENSOR_MEASUREMENT]),
         "sensor → netem": len(RECORD[NETEM_PACKET]),
@@ -103,7 +105,7 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
     assert first.recorded != first.replayed or first.recorded_hex != first.replayed_hex
 
 
-@pytest.mark.parametrize("table", list(OWNER))
+@pytest.mark.parametrize("table", list(RECORD.tables))
 @settings(max_examples=40)
 @given(st.data())
 def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
@@ -118,7 +120,7 @@ def test_a_wrong_input_number_is_found(table: str, data: st.DataObject) -> None:
     assert [gap.partition(":")[0] for gap in found.gaps] == [OWNER[table]]
 
 
-@pytest.mark.parametrize("table", list(OWNER))
+@pytest.mark.parametrize("table", list(RECORD.tables))
 def test_time_does_not_run_backward(table: str) -> None:
     found = replay(flipped(table, len(RECORD[table]) - 1, "now_ns", 7, 7))
     assert found.first_difference is not None
@@ -133,7 +135,7 @@ def test_no_timer_acts_before_it_is_due() -> None:
     assert (first.table, first.row, first.column) == (PLANT_STEP, 7, "now_ns")
 
 
-@pytest.mark.parametrize("table", list(OWNER))
+@pytest.mark.parametrize("table", list(RECORD.tables))
 def test_missing_rows_are_said(table: str) -> None:
     rows = RECORD[table]
     cut = len(rows) // 2
@@ -148,13 +150,13 @@ def test_missing_rows_are_said(table: str) -> None:
     assert all(account.whole for name, account in accounts.items() if name != process)
 
 
-@pytest.mark.parametrize("table", list(OWNER))
+@pytest.mark.parametrize("table", list(RECORD.tables))
 def test_rows_missing_at_the_end_are_said(table: str) -> None:
     cut = int(RECORD[table]["input"][-1])
     rows = {
         other: RECORD[other][RECORD[other]["input"] < cut]
-        for other, owner in OWNER.items()
-        if owner == OWNER[table]
+        for other in RECORD.tables
+        if OWNER[other] == OWNER[table]
     }
     found = replay(changed(rows))
     assert found.bit_exact
@@ -240,7 +242,7 @@ def test_numbers_that_no_machine_takes_are_a_difference() -> None:
 
 
 def test_an_empty_record_is_not_called_exact() -> None:
-    found = replay(changed({table: RECORD[table][:0] for table in OWNER}, reports={}))
+    found = replay(changed({table: RECORD[table][:0] for table in RECORD.tables}, reports={}))
     assert found.bit_exact is None
     assert found.inputs == 0
 

@@ -65,7 +65,16 @@ def make_record(scenario: Scenario, k: int = 500, largest: float = 1.0) -> RunRe
     ]
     norm = np.abs(np.sin(t_ns * 1e-8)) * np.exp(-1e-9 * t_ns)
     fill("plant_step", t_ns, x=x)
-    fill("sensor_measurement", t_ns, x=x, x_s=x + 0.01, e_s_norm=norm, threshold=0.5, event=event)
+    fill(
+        "sensor_measurement",
+        t_ns,
+        x=x,
+        x_s=x + 0.01,
+        e_s_norm=norm,
+        compared=norm,
+        threshold=0.5,
+        event=event,
+    )
     fill("controller_step", t_ns, model_t_ns=t_ns, x_c=x + 0.02, u=-x[:, :1])
     fill(
         "netem_packet", event_ns,
