@@ -86,26 +86,13 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test test-computing test-running check format bench schema lock clean
+.PHONY: setup setup-dev test check format bench schema lock clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
 
-# Those that only compute, which run beside the others.
-COMPUTING := $(addprefix tests/cosim/,adversary batch campaign design exact paper) tests/noack
-
 test: setup-dev check ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
-ifeq ($(strip $(ARGS)),)
-	@$(MAKE) --no-print-directory --keep-going --jobs=2 test-computing test-running
-else
-	$(BIN)/python -m pytest $(ARGS)
-endif
-
-test-computing:
-	$(BIN)/python -m pytest $(COMPUTING)
-
-test-running:
-	$(BIN)/python -m pytest $(COMPUTING:%=--ignore=%)
+	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile)
 
 check: setup-dev ## Lint, format, strict types, import rules
 	$(BIN)/ruff check .
