@@ -4,6 +4,7 @@ import sys
 
 from benchmarks import (
     batch,
+    campaign,
     demo_run,
     latency,
     lateness,
@@ -18,7 +19,7 @@ from benchmarks import (
 from benchmarks._report import run
 
 MODULES = (
-    demo_run, latency, lateness, startup, machines, simulation, batch,
+    demo_run, latency, lateness, startup, machines, simulation, batch, campaign,
     relays, relay_delay, relay_flows, relay_soak,
 )  # fmt: skip
 

@@ -14,7 +14,7 @@ from benchmarks.latency import Sample
 from benchmarks.lateness import Kernel
 
 NAMES = (
-    "demo_run", "latency", "lateness", "startup", "machines", "simulation", "batch",
+    "demo_run", "latency", "lateness", "startup", "machines", "simulation", "batch", "campaign",
     "relays", "relay_delay", "relay_flows", "relay_soak",
 )  # fmt: skip
 KERNEL = Kernel(12.0, 20.0, 60.0)
