@@ -1,7 +1,7 @@
-"""Fidelity: how a live run differs from the paper's loop, and why.
+"""Fidelity: how a live run differs from the ideal loop, and why.
 
 The run's own packet fates, by event number, in a chain of simulations, each exact, each with one
-effect more: the paper's loop in continuous time; + sampling: the trigger is tested on the
+effect more: the ideal loop in continuous time; + sampling: the trigger is tested on the
 measurement grid; + delay: an update acts from the plant step on that really was the first to hold
 an input computed with it; + held actuation: the input of each step is K x_c at the model time of
 the actuation that really was latched there, zero before the first. The last has everything that the
@@ -53,7 +53,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Stage:
-    """What one effect adds to the difference between the paper's loop and the live run."""
+    """What one effect adds to the difference between the ideal loop and the live run."""
 
     name: str
     difference: Difference
@@ -70,7 +70,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Fidelity:
-    """The comparison of a live run with the paper's loop."""
+    """The comparison of a live run with the ideal loop."""
 
     scenario: str
     mode: str
@@ -81,14 +81,14 @@ class Fidelity:
     rms_live: float
     """Root mean square of ‖x‖ in the live run, for scale."""
     total: Difference
-    """Live run minus the paper's loop."""
+    """Live run minus the ideal loop."""
     stages: tuple[Stage, ...]
     explained_relative: float
     """RMS of what remains unexplained over the RMS of the whole difference."""
     events_ideal: int
     events_live: int
     max_event_difference_s: float | None
-    """Between the paper's loop and the live run, over the events that both have."""
+    """Between the ideal loop and the live run, over the events that both have."""
     parted_event: int | None
     """First event that is more than ten measurements apart, or that one of the two lacks: from
     there on the same packet fates meet different events."""
@@ -106,11 +106,11 @@ class Fidelity:
     def verdict(self) -> str:
         """One line for people."""
         if self._nothing_to_explain:
-            return "x is that of the paper's loop, to rounding"
+            return "x is that of the ideal loop, to rounding"
         percent = 100 * self.total.rms / self.rms_live
         shares = ", ".join(f"{stage.name} {100 * stage.share:.3g} %" for stage in self.stages[:-1])
         return (
-            f"x differs from the paper's loop by {percent:.2g} % (RMS); of this {shares}; "
+            f"x differs from the ideal loop by {percent:.2g} % (RMS); of this {shares}; "
             f"{100 * self.explained_relative:.2g} % unexplained"
             + ("" if self.explained else ", which is too much")
         )
@@ -153,11 +153,11 @@ def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
 
 
 def compare(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
-    """Compare a live run with the paper's loop, effect by effect.
+    """Compare a live run with the ideal loop, effect by effect.
 
     Args:
         record: the run's record.
-        max_events: events of the paper's loop; it has no end of them if it is unstable.
+        max_events: events of the ideal loop; it has no end of them if it is unstable.
 
     Raises:
         IncomparableError: the run diverged, or its record is too short or incomplete.
@@ -222,10 +222,10 @@ def _ideal(
         )
     except TooManyEventsError:
         raise IncomparableError(
-            f"the paper's loop has more than {max_events} events, which accumulate"
+            f"the ideal loop has more than {max_events} events, which accumulate"
         ) from None
     if ideal.diverged_at_s is not None:
-        raise IncomparableError(f"the paper's loop diverges at {ideal.diverged_at_s:g} s")
+        raise IncomparableError(f"the ideal loop diverges at {ideal.diverged_at_s:g} s")
     return ideal
 
 

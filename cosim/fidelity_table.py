@@ -11,12 +11,12 @@ from cosim.fidelity import Difference, Fidelity
 
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
-    """Print the chain from the paper's loop to the run, and the verdict."""
-    table = Table(title=f"{fidelity.scenario}: difference in x to the paper's loop")
+    """Print the chain from the ideal loop to the run, and the verdict."""
+    table = Table(title=f"{fidelity.scenario}: difference in x to the ideal loop")
     table.add_column("effect", no_wrap=True)
     for heading in ("RMS", "max", "share", "events", "Δt, ms", "parted"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_row("(paper's loop)", "", "", "", str(fidelity.events_ideal), "", "")
+    table.add_row("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
     for stage in fidelity.stages:
         table.add_row(
             stage.name,
@@ -52,11 +52,11 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     if fidelity is None:
         return
     if fidelity["reason"] is not None:
-        yield "difference to the paper's loop", "not compared"
+        yield "difference to the ideal loop", f"not compared: {fidelity['reason']}"
         return
     scale = fidelity["rms_x_live"]
     of_x = f" ({100 * fidelity['rms_x'] / scale:.2g} % of x)" if scale else ""
-    yield "difference to the paper's loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
+    yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
         if name != "unexplained":
             yield f"  share of {name.replace('_', ' ')}", f"{100 * share:.3g} %"

@@ -163,7 +163,7 @@ def compare(
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
-    """Compare a run with the paper's loop in continuous time, effect by effect."""
+    """Compare a run with the ideal loop in continuous time, effect by effect."""
     from cosim.fidelity import compare as compare_record
     from cosim.fidelity_table import print_fidelity
     from cosim.progress import PatientConsole

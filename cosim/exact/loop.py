@@ -266,16 +266,13 @@ class ContinuousLoop:
             math.ceil(t_s / grid_s - _GRID_SLACK), math.floor(event_s / grid_s + _GRID_SLACK) + 1
         )
         last = math.floor(end_s / grid_s + _GRID_SLACK)
-        n, up, down = self.loop.n, guard.form.up, guard.form.down
+        n = self.loop.n
         for begin in range(first, last + 1, _GRID_BLOCK):
             points_s = np.arange(begin, min(begin + _GRID_BLOCK, last + 1)) * grid_s
             states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
             if not np.abs(states).max() < LARGEST:
                 raise DivergedError(float(points_s[0]))
-            left = np.linalg.norm(states[:, : 2 * n] @ up.T, axis=1)
-            held = np.linalg.norm(states[:, : 2 * n] @ down.T, axis=1)
-            thresholds = np.array([guard.threshold(point_s * 1e9) for point_s in points_s])
-            exceeds = np.flatnonzero(left > np.hypot(held, thresholds))
+            exceeds = np.flatnonzero(guard.exceeds(points_s * 1e9, states[:, : 2 * n]))
             if len(exceeds):
                 k = int(exceeds[0])
                 return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from cosim.exact.flow import Flow, growth_rate
 from cosim.exact.loop import ContinuousLoop
 from noack.linear import Matrix, Vector, discretise
+from noack.trigger.policy import Trigger
 
 NO_ACTUATION = -1
 """Stands for "none yet" among model times."""
@@ -63,7 +64,7 @@ class SampledLoop:
     """The loop under a schedule.
 
     Args:
-        system: matrices and trigger.
+        system: matrices and trigger, of any policy.
         schedule: what happened when.
         known_start: sensor and controller know x(0); otherwise the first measured step is event 0.
     """
@@ -74,13 +75,11 @@ class SampledLoop:
         self._known_start = known_start
         self._steps_s = np.arange(len(schedule.measured), dtype=np.float64)
         self._steps_s *= schedule.period_ns * 1e-9
-        H, trigger = system.loop.H, system.decaying
+        H = system.loop.H
         self._model = Flow(H, 1.0 / max(growth_rate(H), 1.0 / _LONGEST_CELL_S))
         self._model_steps = _transitions(self._model, self._steps_s[: _BLOCK + 1])
         self._loop_steps = _transitions(system.flow, self._steps_s[: _BLOCK + 1])
         self._one_step = discretise(system.loop.A, system.loop.B, schedule.period_ns)
-        decaying = trigger.beta * np.exp(-trigger.alpha_per_s * self._steps_s)
-        self._thresholds = np.maximum(decaying, trigger.floor)
 
     @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> SampledRun:
@@ -89,15 +88,20 @@ class SampledLoop:
         last = len(schedule.measured) - 1
         states = np.empty((last + 1, len(x0)))
         states[0] = x_s = x0
-        in_common = self._known_start
+        trigger, in_common = Trigger(self._system.trigger), self._known_start
+        if in_common:
+            trigger.start(0, x0)
         newest = _Update(-1, 0, 0, x0 if in_common else np.zeros_like(x0))
         under_way: list[_Update] = []
         events: list[int] = []
-        step = 0
+        step, event = 0, bool(schedule.measured[0])
+        if event and in_common:
+            event = trigger.test(0, x0, np.zeros_like(x0)).event
         while True:
             x, now_ns = states[step], step * period_ns
-            if schedule.measured[step] and (not in_common or self._exceeds(step, x_s - x)):
+            if event:
                 x_s, in_common, number = x, True, len(events)
+                trigger.start(now_ns, x)
                 events.append(step)
                 if schedule.delivered(number):
                     wait_ns = self._wait_ns(number, hold=hold) if delay else 0
@@ -117,9 +121,16 @@ class SampledLoop:
             else:
                 states[following] = self._continuous(x, [newest, *within], step, until)
             x_s_block = self._model_steps[1 : until - step + 1] @ x_s
-            exceeds = self._exceeds(following, x_s_block - states[following])
-            stops = schedule.measured[following] & (exceeds | (not in_common))
-            taken = int(np.argmax(stops)) if stops.any() else until - step - 1
+            seen = np.flatnonzero(schedule.measured[following])
+            if in_common:
+                block = states[following][seen]
+                found = trigger.first_event(
+                    (step + 1 + seen) * period_ns, block, x_s_block[seen] - block
+                )
+            else:
+                found = 0 if len(seen) else None
+            event = found is not None
+            taken = until - step - 1 if found is None else int(seen[found])
             x_s = x_s_block[taken]
             step += 1 + taken
 
@@ -127,10 +138,6 @@ class SampledLoop:
         if hold:
             return self._schedule.delay_steps(event) * self._schedule.period_ns
         return self._schedule.delay_ns(event)
-
-    def _exceeds(self, steps: int | slice, e_s: Matrix) -> NDArray[np.bool_]:
-        exceeds: NDArray[np.bool_] = self._system.norms(e_s) > self._thresholds[steps]
-        return exceeds
 
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
         """X at the steps after ``step`` up to ``until``, under u = K x_c(t).

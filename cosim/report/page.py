@@ -120,7 +120,7 @@ def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) ->
     if (summary.get("replay") or {}).get("bit_exact") is False:
         yield "The replay of the run differs from its record: see Replay"
     if (summary.get("fidelity") or {}).get("explained") is False:
-        yield "The run's difference to the paper's loop is not explained: see Fidelity"
+        yield "The run's difference to the ideal loop is not explained: see Fidelity"
     if summary["missing_samples"]:
         where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
         yield f"{summary['missing_samples']} samples are missing in the record: {where}"

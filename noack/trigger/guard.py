@@ -9,9 +9,10 @@ The live sensor evaluates this at its measurements; exact simulation finds the f
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.linear import Matrix, Vector, norm
 
@@ -30,6 +31,12 @@ class Form(NamedTuple):
         """‖P z‖² − ‖N z‖² of a z of shape (2n,)."""
         return norm(self.up @ z) ** 2 - norm(self.down @ z) ** 2
 
+    def values(self, z: Matrix) -> Vector:
+        """The same of k z, shape (k, 2n) → (k,)."""
+        up, down = (np.einsum("ij,ij->i", part, part) for part in (z @ self.up.T, z @ self.down.T))
+        values: Vector = up - down
+        return values
+
 
 class Reserve(NamedTuple):
     """What a dynamic rule has saved up: η̇ = −λη + ψ(z)."""
@@ -38,6 +45,12 @@ class Reserve(NamedTuple):
     """λ."""
     gain: Form
     """ψ."""
+
+    def after(self, dt_s: float, reserve: float, gain: float) -> float:
+        """η after a time in which ψ stays as it is."""
+        decay = self.decay_per_s
+        gained = -math.expm1(-decay * dt_s) / decay if decay else dt_s
+        return reserve * math.exp(-decay * dt_s) + gained * gain
 
 
 class Guard(NamedTuple):
@@ -77,6 +90,23 @@ class Guard(NamedTuple):
         if len(self.form.down) or reserve > 0:
             right = math.hypot(right, norm(self.form.down @ z), math.sqrt(max(reserve, 0.0)))
         return Sides(left, right)
+
+    def exceeds(
+        self, t_ns: NDArray[Any], z: Matrix, reserve: Vector | float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Whether the comparison holds at k times, whether it counts there or not.
+
+        Args:
+            t_ns: times, shape (k,).
+            z: (x, e_s) at them, shape (k, 2n).
+            reserve: η at them.
+        """
+        faded = self.level * np.exp(-self.rate_per_s * 1e-9 * (t_ns - self.since_ns))
+        down = np.linalg.norm(z @ self.form.down.T, axis=1)
+        right = np.hypot(np.maximum(faded, self.floor), down)
+        right = np.hypot(right, np.sqrt(np.maximum(reserve, 0.0)))
+        found: NDArray[np.bool_] = np.linalg.norm(z @ self.form.up.T, axis=1) > right
+        return found
 
     def is_looked_at(self, t_ns: int) -> bool:
         """Whether the comparison counts at a time; what is due at the latest does anyhow."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
+from noack.linear import Matrix, Vector, norm
 from noack.trigger.guard import Form, Guard, nothing, of_state
 
 
@@ -35,8 +35,7 @@ class LyapunovTrigger:
     def guard(self, t_ns: float, x: Vector) -> Guard:
         """The envelope that begins at the event."""
         n = len(x)
-        return Guard(
-            Form(of_state(n, self.factor), nothing(n)),
-            level=float(np.linalg.norm(self.factor @ x)), rate_per_s=self.rate_per_s / 2,
-            since_ns=t_ns,
-        )  # fmt: skip
+        form = Form(of_state(n, self.factor), nothing(n))
+        # To the last bit what it is compared with, so that the event itself is not above it.
+        level = norm(form.up @ np.concatenate([x, np.zeros(n)]))
+        return Guard(form, level=level, rate_per_s=self.rate_per_s / 2, since_ns=t_ns)

@@ -1,9 +1,9 @@
 """What an event-triggering policy is, and the machine that applies one to measurements."""
 
-import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from noack.linear import Matrix, Vector
 from noack.trigger.guard import Guard
@@ -78,13 +78,44 @@ class Trigger:
             raise RuntimeError("a trigger must be started")
         guard = self._guard
         if guard.reserve is not None:
-            dt_s, decay = (t_ns - self._seen_ns) * 1e-9, guard.reserve.decay_per_s
-            gained = -math.expm1(-decay * dt_s) / decay if decay else dt_s
-            self._reserve = self._reserve * math.exp(-decay * dt_s) + gained * self._gain
+            dt_s = (t_ns - self._seen_ns) * 1e-9
+            self._reserve = guard.reserve.after(dt_s, self._reserve, self._gain)
         left, right = guard.sides(t_ns, x, e_s, self._reserve)
         due = t_ns >= guard.latest_ns
         self._see(t_ns, x, e_s)
         return Verdict(due or (left > right and guard.is_looked_at(t_ns)), left, right)
+
+    def first_event(self, t_ns: NDArray[np.int64], x: Matrix, e_s: Matrix) -> int | None:
+        """Test measurements that follow one another, up to the first event; say which it is.
+
+        Args:
+            t_ns: their times, shape (k,).
+            x: the measured states, shape (k, n).
+            e_s: x_s − x without an event among them, shape (k, n).
+        """
+        if self._guard is None:
+            raise RuntimeError("a trigger must be started")
+        if not len(t_ns):
+            return None
+        guard, z = self._guard, np.hstack([x, e_s])
+        gains, reserves = np.zeros(len(z)), np.zeros(len(z))
+        if guard.reserve is not None:
+            gains = guard.reserve.gain.values(z)
+            dt_s = np.diff(t_ns, prepend=self._seen_ns) * 1e-9
+            held = [self._gain, *gains[:-1].tolist()]
+            reserve = self._reserve
+            for i, (elapsed_s, gain) in enumerate(zip(dt_s.tolist(), held, strict=True)):
+                reserves[i] = reserve = guard.reserve.after(elapsed_s, reserve, gain)
+        looked_at = t_ns >= guard.earliest_ns
+        if guard.grid_ns:
+            looked_at &= t_ns % guard.grid_ns == 0
+        due = (t_ns >= guard.latest_ns) | (looked_at & guard.exceeds(t_ns, z, reserves))
+        events = np.flatnonzero(due)
+        last = int(events[0]) if len(events) else len(z) - 1
+        self._seen_ns, self._gain = int(t_ns[last]), float(gains[last])
+        if guard.reserve is not None:
+            self._reserve = float(reserves[last])
+        return last if len(events) else None
 
     def _see(self, t_ns: int, x: Vector, e_s: Vector) -> None:
         reserve = None if self._guard is None else self._guard.reserve

@@ -18,6 +18,7 @@ import cosim.fidelity
 from cosim.cli import app
 from cosim.exact.fates import network_fates
 from cosim.fidelity import Fidelity, compare, fidelity_for_summary
+from cosim.fidelity_table import summary_rows
 from cosim.record import Rows, RunRecord
 from cosim.schedule import IncomparableError, live_run
 from cosim.virtual import Network, simulate
@@ -87,6 +88,28 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
     fidelity = compare(lane(network, *settings))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        '{ policy = "relative", sigma = 0.2 }',
+        '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }',
+        '{ policy = "deadline", interval_s = 0.3, rule = { policy = "absolute", delta = 0.2 } }',
+    ],
+)
+def test_any_policy_is_explained(policy: str) -> None:
+    fidelity = compare(lane(None, f"trigger={policy}", 'mode="zoh"'))
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.events_live > 3
+
+
+def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
+    record = lane(lambda data, now_ns: None, 'trigger={ policy = "lyapunov", rate_per_s = 0.1 }')
+    summary = fidelity_for_summary(record)
+    assert "accumulate" in summary["reason"]
+    ((_, told),) = summary_rows(summary)
+    assert told == f"not compared: {summary['reason']}"
 
 
 def test_delay_shows_as_delay() -> None:

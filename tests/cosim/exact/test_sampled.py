@@ -20,6 +20,7 @@ from noack.linear import Matrix
 from noack.records import PLANT_STEP
 from noack.resolve import Loop, resolve
 from noack.scenario_file import validate
+from noack.trigger.choose import policy_of
 from noack.trigger.decaying import DecayingTrigger
 
 PERIOD_NS = 10_000_000
@@ -164,12 +165,39 @@ def test_ever_faster_sampling_is_the_continuous_loop() -> None:
     assert np.prod(ratios) < 0.25, ratios
 
 
+def policies(n: int) -> list[dict[str, Any]]:
+    """One of each kind, whose rule is met now and then."""
+    form = np.kron(np.diag([-0.01, 1.0]), np.eye(n))
+    watched: list[dict[str, Any]] = [
+        {"beta": 0.01, "alpha_per_s": 0.3},
+        {"beta": 0.1, "alpha_per_s": 0.3},
+        {"policy": "absolute", "delta": 0.05},
+        {"policy": "relative", "sigma": 0.1, "weight": np.diag(np.arange(1.0, n + 1)).tolist()},
+        {"policy": "mixed", "sigma": 0.05, "epsilon": 0.02},
+        {"policy": "lyapunov", "rate_per_s": 0.1},
+        {"policy": "dynamic", "sigma": 0.3, "theta_s": 0.1, "decay_per_s": 0.5, "reserve": 0.01},
+    ]
+    timed = [
+        {"policy": "quadratic", "Q": form.tolist(), "period_s": 0.06, "heartbeat": 3},
+        {"policy": "periodic", "period_s": 0.13},
+        {"policy": "self_triggered", "beta": 0.1, "alpha_per_s": 0.3, "growth_per_s": 1.0,
+         "mismatch_per_s": 1.0, "shortest_s": 0.02, "longest_s": 0.5},
+    ]  # fmt: skip
+    combined = [
+        {"policy": kind, "rule": rule, "interval_s": 0.055}
+        for kind, rule in itertools.product(("deadline", "dwell"), watched[-2:])
+    ]
+    return [*watched, *timed, *combined]
+
+
 @st.composite
 def records(draw: st.DrawFn) -> RunRecord:
     """Machines in virtual time: losses, delays, overtaking, rates and phases of all kinds."""
     n = draw(st.integers(1, 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     A, B, K = (rng.uniform(-1, 1, shape) for shape in ((n, n), (n, 1), (1, n)))
+    trigger = draw(st.sampled_from(policies(n)))
+    A -= (np.linalg.eigvals(A + B @ K).real.max() + 0.2) * np.eye(n)  # for a Lyapunov function
     mismatch = draw(st.sampled_from([0.0, 0.3]))
     content = {
         "name": "random",
@@ -188,7 +216,7 @@ def records(draw: st.DrawFn) -> RunRecord:
             "rate_hz": draw(st.sampled_from([50.0, 100.0, 250.0])),
             "phase": draw(st.sampled_from([0.0, 0.3, 0.5])),
         },
-        "trigger": {"beta": draw(st.sampled_from([0.01, 0.1])), "alpha_per_s": 0.3},
+        "trigger": trigger,
         "network": {
             "mansd": 2,
             "loss": {"model": "lossless"},
@@ -204,8 +232,7 @@ def records(draw: st.DrawFn) -> RunRecord:
 @settings(max_examples=60)
 def test_with_all_effects_it_is_what_the_machines_do(record: RunRecord) -> None:
     live = live_run(record)
-    trigger = record.scenario.trigger
-    system = ContinuousLoop(record.loop, DecayingTrigger(trigger.beta, trigger.alpha_per_s))
+    system = ContinuousLoop(record.loop, policy_of(record.scenario))
     known = record.scenario.network.initial_sync == "known_state"
     run = SampledLoop(system, live.schedule, known_start=known).run(delay=True, hold=True)
     expected = record[PLANT_STEP]["x"][: len(run.x)]
