@@ -107,10 +107,10 @@ class Fidelity:
         """One line for people."""
         if self._nothing_to_explain:
             return "x is that of the ideal loop, to rounding"
-        percent = 100 * self.total.rms / self.rms_live
-        shares = ", ".join(f"{stage.name} {100 * stage.share:.3g} %" for stage in self.stages[:-1])
+        of_x = 100 * self.total.rms / self.rms_live
+        shares = ", ".join(f"{stage.name} {percent(stage.share)}" for stage in self.stages[:-1])
         return (
-            f"x differs from the ideal loop by {percent:.2g} % (RMS); of this {shares}; "
+            f"x differs from the ideal loop by {of_x:.2g} % (RMS); of this {shares}; "
             f"{100 * self.explained_relative:.2g} % unexplained"
             + ("" if self.explained else ", which is too much")
         )
@@ -227,6 +227,11 @@ def _ideal(
     if ideal.diverged_at_s is not None:
         raise IncomparableError(f"the ideal loop diverges at {ideal.diverged_at_s:g} s")
     return ideal
+
+
+def percent(share: float) -> str:
+    """A share for people, to a tenth of a per cent; the smallest have no sign."""
+    return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
 def _difference(x: Matrix) -> Difference:

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.fidelity import Difference, Fidelity
+from cosim.fidelity import Difference, Fidelity, percent
 
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
@@ -21,7 +21,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
         table.add_row(
             stage.name,
             *_sizes(stage.difference),
-            f"{round(100 * stage.share, 1) + 0.0:.1f} %",
+            percent(stage.share),
             str(stage.events),
             _milliseconds(stage.max_event_difference_s),
             _event(stage.parted_event),
@@ -59,7 +59,7 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
         if name != "unexplained":
-            yield f"  share of {name.replace('_', ' ')}", f"{100 * share:.3g} %"
+            yield f"  share of {name.replace('_', ' ')}", percent(share)
     yield "  unexplained, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
 
 
