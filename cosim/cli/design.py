@@ -120,6 +120,8 @@ def _bounds(given: list[str]) -> dict[Any, float]:
     found: dict[Any, float] = {}
     for text in given:
         name, _, value = text.partition("=")
+        if name in found:
+            raise CallerError(f"--bound {text}: {name} has one already")
         try:
             found[name] = float(value)
         except ValueError:

@@ -54,7 +54,8 @@ def trade_off(found: Found) -> Figure:
         xlabel="transmissions (mean)",
         ylabel=f"settling time, {100 * found.limits.quantile:g} % quantile [s]",
     )
-    logarithmic(axes, "x")
+    if any(np.isfinite(trial.measured.settling_s) for trial in found.trials):
+        logarithmic(axes, "x")
     legend(axes, shown)
     finish(axes)
     return figure

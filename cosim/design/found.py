@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.design.measure import Bounds, Limits, Measured
+from cosim.design.measure import Bounded, Bounds, Limits, Measured
 from cosim.design.search import Trial
 from cosim.design.space import Space
 from noack.scenario import Scenario
 
-WORDS = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
+WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
 
 
 @dataclass(frozen=True)
@@ -121,9 +121,15 @@ class Found:
         for name, limit in self.limits.bounds.items():
             value = self.best.bounds[name]
             if value > limit:
-                text = f"{value:.4g}" if math.isfinite(value) else "none certified"
-                missed.append(f"{WORDS[name]} ≤ {text} ({limit:g} allowed)")
+                missed.append(f"{certified(name, value)} ({limit:g} allowed)")
         return " and ".join(missed)
+
+
+def certified(name: Bounded, value: float) -> str:
+    """A certified bound in words."""
+    if not math.isfinite(value):
+        return f"no certified bound of {WORDS[name]}"
+    return f"{WORDS[name]} ≤ {value:.4g}"
 
 
 def seconds(measured: Measured) -> str:

@@ -5,12 +5,13 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from cosim import report
 from cosim.design.figure import trade_off
-from cosim.design.found import WORDS, Found, seconds
+from cosim.design.found import WORDS, Found, certified, seconds
 from cosim.report.save import inline
 from noack.scenario_file import dumps
 
@@ -31,7 +32,6 @@ def page(found: Found) -> str:
         f"within {limits.settling_s:g} s",
         *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
     ]
-    certified = [f"{WORDS[name]} ≤ {value:.4g}" for name, value in bounds.items()]
     return _templates().get_template("design.html.jinja").render(
         title=found.scenario.name,
         subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
@@ -39,7 +39,7 @@ def page(found: Found) -> str:
         verdict=found.verdict(),
         tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
         limits=lines,
-        certified=certified,
+        certified=[certified(name, value) for name, value in bounds.items()],
         figure=Markup(inline(trade_off(found), "trade-off", _CAPTION)),
         caption=_CAPTION,
         headings=HEADINGS,
@@ -68,15 +68,19 @@ def rows(found: Found) -> list[tuple[str, ...]]:
 
 def print_found(console: Console, found: Found) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    table = Table(title=f"{found.scenario.name}: trade-off, no other is smaller in both",
-                  title_justify="left")  # fmt: skip
+    title = f"{found.scenario.name}: trade-off, no other is smaller in both"
+    # All of it in 80 columns, no figure cut off.
+    table = Table(
+        title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
+    )
     for heading in HEADINGS:
         words = heading in HEADINGS[-2:]
         table.add_column(heading, justify="left" if words else "right", no_wrap=True)
     every = rows(found)
     for row in every[:: -(-len(every) // _MOST_ROWS) or 1]:
         table.add_row(*row)
-    console.print(table)
+    if every:
+        console.print(table)
     if found.feasible:
         console.print(found.verdict(), highlight=False, markup=False, soft_wrap=True)
         console.print(
@@ -86,7 +90,7 @@ def print_found(console: Console, found: Found) -> None:
             soft_wrap=True,
         )
     for name, value in (found.bounds or {}).items():
-        console.print(f"certified      {WORDS[name]} ≤ {value:.4g}", highlight=False)
+        console.print(f"certified      {certified(name, value)}", highlight=False)
 
 
 @cache

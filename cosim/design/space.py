@@ -132,7 +132,7 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> Space:
     """The space of scenarios by the names of gain and norm.
 
     Raises:
-        CallerError: ‖x(0)‖ = 0, or a nominal loop does not decay.
+        CallerError: ‖x(0)‖ = 0, the floor is above all β, or a nominal loop does not decay.
     """
     found = tuple(Family(gain, weight, one) for (gain, weight), one in families.items())
     first = found[0].scenario
@@ -141,5 +141,11 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> Space:
         raise CallerError(
             "plant.initial_state: is 0, but a loop settles to a share of ‖x(0)‖; give another"
         )
+    floor, highest = first.decaying.floor, float(LEVELS[-1]) * initial_norm
+    if floor >= highest:
+        raise CallerError(
+            f"trigger.floor = {floor:g}: must be less than the largest β that is tried, "
+            f"{LEVELS[-1]:g} ‖x(0)‖ = {highest:g}"
+        )
     rates = tuple(decay_rate(one.scenario) for one in found)
-    return Space(found, rates, initial_norm, first.decaying.floor)
+    return Space(found, rates, initial_norm, floor)
