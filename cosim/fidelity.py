@@ -13,7 +13,7 @@ For events that the run did not have, the network emulator's own word is taken (
 depend on its seed alone), and the median of the recorded delays.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,8 @@ EXPLAINED = 0.1
 """The share of the difference that may remain unexplained."""
 _ROUNDING = 1e-9
 """Relative to x: a difference below is rounding, and there is nothing to explain."""
+_NUDGE = 1e-13
+"""Relative to x(0): about what rounding amounts to. If this changes a run, so does rounding."""
 _PARTED_PERIODS = 10
 """Events further apart than so many measurements are told: the event sequences have parted."""
 _LARGEST = 1e100
@@ -160,7 +162,8 @@ def compare(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
         max_events: events of the ideal loop; it has no end of them if it is unstable.
 
     Raises:
-        IncomparableError: the run diverged, or its record is too short or incomplete.
+        IncomparableError: the run diverged, its record is too short or incomplete, or its loop
+            turns rounding into another run.
     """
     live = live_run(record)
     schedule, scenario = live.schedule, record.scenario
@@ -181,6 +184,15 @@ def compare(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
         raise IncomparableError("a simulation of the run diverges")
     whole = live.x - states[0]
     total, remainder = _difference(whole), _difference(live.x - states[-2])
+    if remainder.rms > EXPLAINED * total.rms:
+        other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
+        nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known)
+        moved = nudged.run(delay=True, hold=True).x[schedule.measured] - states[-2]
+        if not _difference(moved).rms < EXPLAINED * total.rms:
+            raise IncomparableError(
+                "the loop turns rounding into another run: so does a change of x(0) by "
+                f"{_NUDGE:g} of itself; a shorter run can be compared"
+            )
     part_s = _PARTED_PERIODS * scenario.plant.measure_every * period_s
     return Fidelity(
         scenario=scenario.name,

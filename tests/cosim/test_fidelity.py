@@ -112,6 +112,14 @@ def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
     assert told == f"not compared: {summary['reason']}"
 
 
+def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> None:
+    """This rule does not stand the losses; a deviation grows freely between the same events."""
+    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
+    record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
+    with pytest.raises(IncomparableError, match="turns rounding into another run"):
+        compare(record)
+
+
 def test_delay_shows_as_delay() -> None:
     prompt, late = (compare(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
