@@ -216,13 +216,17 @@ class Network(Section):
     """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
     the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     acknowledgements: Acknowledgements | None = None
-    """The way back, for protocol = "ack"; by default nothing is lost on it."""
+    """The way back, for protocol = "ack"; by default nothing is lost on it. Of no effect where
+    protocol = "none" is said."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         require_scores(self.impairments, self.loss)
-        if self.acknowledgements is not None and self.protocol != "ack":
-            raise ValueError('acknowledgements: there are none unless protocol = "ack"')
+        if self.acknowledgements is not None and "protocol" not in self.model_fields_set:
+            raise ValueError(
+                'acknowledgements: there are none unless protocol = "ack"; '
+                'say protocol = "none" to go without'
+            )
         return self
 
     @property
