@@ -8,9 +8,10 @@ import math
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
 from contextlib import contextmanager, suppress
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.campaign.arithmetic import arithmetic, difference
 from cosim.campaign.grid import Point, Work
 from cosim.campaign.store import Chunk
 from noack.errors import CallerError, PeerError
@@ -38,6 +40,10 @@ _CONNECT_TRIES = 3
 _ONE_THREAD = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
+
+
+class OtherArithmeticError(PeerError):
+    """A worker's results would not be the same, bit for bit."""
 
 
 class LostWorkersError(PeerError):
@@ -108,9 +114,26 @@ def _client(connect: Any, address: str) -> Any:
         ) from None
 
 
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np.void]:
+    """Run some draws on another machine.
+
+    Raises:
+        OtherArithmeticError: its results would be others than those of who asks.
+    """
+    if (other := difference(arithmetic(), wanted)) is not None:
+        raise OtherArithmeticError(
+            f"a worker on {socket.gethostname()} would give other results: {other}"
+        )
+    return work.run(draws)
+
+
 @contextmanager
-def cluster(address: str) -> Iterator[Runner]:
+def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
     """Run chunks on the Dask cluster of a scheduler; the workers need this noack, too.
+
+    Args:
+        address: of the scheduler.
+        say: is told, in a line, what the cluster is waited for.
 
     Raises:
         CallerError: Dask is not installed, or the address is none.
@@ -133,10 +156,12 @@ def cluster(address: str) -> Iterator[Runner]:
         raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT: {error}") from None
 
     def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        watch = _Watch(client, address)
+        watch = _Watch(client, address, say)
         executor: Executor = client.get_executor(pure=False)
         try:
-            yield from _windowed(executor, points, chunks, watch)
+            yield from _windowed(executor, points, chunks, watch, arithmetic())
+        except OtherArithmeticError as error:
+            raise OtherArithmeticError(f"{address}: {error}") from None
         except (ImportError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and "deserializ" not in str(error):
                 raise
@@ -160,10 +185,12 @@ class _Watch:
     Args:
         client: of the cluster.
         address: of its scheduler.
+        say: is told what is waited for.
     """
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+    def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
+        self._client, self._address, self._say = client, address, say
+        self._told = False
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
     def __call__(self) -> int:
@@ -180,7 +207,10 @@ class _Watch:
                 raise LostWorkersError(f"{self._address}: the scheduler is gone") from None
             self._looked_s = now_s
             if self._cores:
-                self._seen_s = now_s
+                self._seen_s, self._told = now_s, False
+            elif not self._told:
+                self._told = True
+                self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
                     f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s"
@@ -203,14 +233,19 @@ def _windowed(
     points: Sequence[Point],
     chunks: Iterable[Chunk],
     most: Callable[[], int],
+    wanted: Mapping[str, str] | None = None,
 ) -> Iterator[Finished]:
     """Keep so many chunks under way, so that memory does not grow with the campaign."""
     rest = iter(chunks)
     under_way: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(under_way), 0)):
+            task = (points[chunk.point].work, chunk.draws)
             with _interrupts_held():
-                future = executor.submit(Work.run, points[chunk.point].work, chunk.draws)
+                future = (
+                    executor.submit(Work.run, *task) if wanted is None
+                    else executor.submit(run_alike, *task, wanted)
+                )  # fmt: skip
             under_way[future] = chunk
         if not under_way:
             return

@@ -9,6 +9,9 @@ from rich.console import Console
 from cosim.cli.app import CAMPAIGNS, DEFAULT_RUNS, JsonOption, command, cores, print_json
 from noack.errors import CallerError, ExitStatus
 
+_PER_CORE = 4
+"""More processes gain nothing, and cost memory."""
+
 
 @command(CAMPAIGNS)
 def campaign(
@@ -54,8 +57,15 @@ def campaign(
     folder = out or DEFAULT_RUNS / "campaigns" / plan.name
     store = Store(folder, points, draws or plan.draws, plan.chunk)
     console = PatientConsole(stderr=True)
-    with opened(store.folder, plan, base):
-        runners = local(workers or cores()) if scheduler is None else cluster(scheduler)
+    workers = workers or cores()
+    if workers > (most := _PER_CORE * cores()):
+        raise CallerError(f"--workers {workers}: on this machine at most {most}")
+
+    def say(line: str) -> None:
+        console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+
+    with opened(plan, base, store):
+        runners = local(workers) if scheduler is None else cluster(scheduler, say)
         with runners as runner, runs_bar(console) as progress:
             made = run_campaign(store, runner, progress)
         with console.status("summarising"):
