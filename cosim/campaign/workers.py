@@ -18,6 +18,7 @@ from contextlib import contextmanager, suppress
 from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,8 @@ def local(workers: int) -> Iterator[Runner]:
     theirs, ours = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(_ONE_THREAD)  # for the children, who inherit it
-    pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
+    with _interrupts_held():  # it starts a process that keeps account of semaphores
+        pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
 
     def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
         try:
@@ -99,6 +101,17 @@ def _depend_on(parent: Connection) -> None:
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
+
+
+def _require_address(address: str) -> None:
+    """Dask's client begins to work before it looks at an address, and is long in ending."""
+    try:
+        parts = urlsplit(address if "://" in address else f"tcp://{address}")
+        known = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
+    except ValueError:
+        known = False
+    if not known:
+        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT")
 
 
 def _client(connect: Any, address: str) -> Any:
@@ -145,6 +158,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         raise CallerError(
             "--scheduler needs Dask, which is not installed: pip install 'noack[cluster]'"
         ) from None
+    _require_address(address)
     for name in list(logging.root.manager.loggerDict):
         if name.startswith("distributed"):  # what is to be said of its troubles is said below
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -152,8 +166,6 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         client = _client(distributed.Client, address)
     except (OSError, TimeoutError):
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
-    except (ValueError, TypeError) as error:
-        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT: {error}") from None
 
     def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
         watch = _Watch(client, address, say)
@@ -220,8 +232,11 @@ class _Watch:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back: what is started meanwhile never hears of it, only the parent decides."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Hold Ctrl-C and a closed terminal back: what is started meanwhile never hears of them.
+
+    The parent decides what they mean.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:
         yield
     finally:

@@ -41,7 +41,7 @@ def campaign(
     from cosim.campaign.grid import base_of, grid
     from cosim.campaign.plan import load
     from cosim.campaign.report import print_summary, write_report
-    from cosim.campaign.run import run_campaign
+    from cosim.campaign.run import run_campaign, terminations_raised
     from cosim.campaign.store import Store, opened
     from cosim.campaign.summary import summarise
     from cosim.campaign.workers import cluster, local
@@ -64,7 +64,7 @@ def campaign(
     def say(line: str) -> None:
         console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
 
-    with opened(plan, base, store):
+    with terminations_raised(), opened(plan, base, store):
         runners = local(workers) if scheduler is None else cluster(scheduler, say)
         with runners as runner, runs_bar(console) as progress:
             made = run_campaign(store, runner, progress)
