@@ -189,7 +189,10 @@ class _Combined(Section):
 
     def check(self, n: int, why: str) -> None:
         """Require that the rule fits n states."""
-        self.rule.check(n, why)
+        try:
+            self.rule.check(n, why)
+        except ValueError as error:
+            raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
 
 
 class Deadline(_Combined):
@@ -232,8 +235,21 @@ for _combined in (_Combined, Deadline, Dwell):
     _combined.model_rebuild()
 
 
-def sampling_period_ns(trigger: AnyTrigger) -> int | None:
-    """The period at which a trigger looks at its rule; None if it has none of its own."""
+def require_on_grid(trigger: AnyTrigger, measured_ns: int, key: str = "trigger") -> None:
+    """Require that a trigger with a sampling period of its own looks when something is measured.
+
+    Args:
+        trigger: the trigger.
+        measured_ns: time between measurements.
+        key: of the trigger.
+
+    Raises:
+        ValueError: it does not.
+    """
     if isinstance(trigger, Deadline | Dwell):
-        return sampling_period_ns(trigger.rule)
-    return round(trigger.period_s * NS_PER_S) if isinstance(trigger, Quadratic) else None
+        require_on_grid(trigger.rule, measured_ns, f"{key}.rule")
+    elif isinstance(trigger, Quadratic) and round(trigger.period_s * NS_PER_S) % measured_ns:
+        raise ValueError(
+            f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
+            "between measurements"
+        )

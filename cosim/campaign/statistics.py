@@ -45,10 +45,10 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         finite: those of them that count for the mean; all finite ones unless given.
     """
     finite = values[np.isfinite(values)] if finite is None else finite
-    mean = float(finite.mean()) if len(finite) else math.inf
-    halfwidth = math.inf
+    mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
     if len(finite) > 1:
-        deviation = float(finite.std(ddof=1))
+        with np.errstate(over="ignore"):  # the interval of numbers beyond 1e150 is infinite
+            deviation = float(finite.std(ddof=1))
         halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
     ordered = np.sort(values)
     q05, q25, median, q75, q95 = (float(ordered[_rank(len(values), share)]) for share in QUANTILES)

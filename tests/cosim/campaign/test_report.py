@@ -270,3 +270,19 @@ def test_numbers_are_written_with_their_interval() -> None:
     assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (in 50 %)"
     assert written(estimate(np.array([math.inf]))) == "never"
     assert set(METRICS) >= {"cost", "settling_s"}
+
+
+def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    name = "[/x] [red]"
+    plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
+    plan["axes"][1]["title"] = "[/b]"
+    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
+    out = str(tmp_path / "out")
+    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    assert result.exit_code == 0, result.output
+    assert name in result.stdout
+    assert "[/b]" in result.stdout
+    told = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
