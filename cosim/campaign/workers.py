@@ -5,18 +5,13 @@ Either way chunks are independent, and their results come back here to be writte
 
 import logging
 import math
-import multiprocessing
-import os
-import signal
 import socket
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from itertools import islice
-from multiprocessing.connection import Connection
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -26,6 +21,7 @@ from numpy.typing import NDArray
 from cosim.campaign.arithmetic import arithmetic, difference
 from cosim.campaign.grid import Point, Work
 from cosim.campaign.store import Chunk
+from cosim.pool import interrupts_held, processes
 from noack.errors import CallerError, PeerError
 
 Finished = tuple[Chunk, NDArray[np.void]]
@@ -38,9 +34,6 @@ _LOOK_EVERY_S = 1.0
 _PATIENCE_S = 30.0
 _CONNECT_S = 10.0
 _CONNECT_TRIES = 3
-_ONE_THREAD = dict.fromkeys(
-    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
 
 
 class OtherArithmeticError(PeerError):
@@ -63,44 +56,17 @@ def local(workers: int) -> Iterator[Runner]:
     if workers == 1:
         yield alone
         return
-    # A fork would inherit whatever threads the libraries have started.
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)  # for the children, who inherit it
-    with _interrupts_held():  # it starts a process that keeps account of semaphores
-        pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
+    with processes(workers) as pool:
 
-    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        try:
-            yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
-        except BrokenProcessPool:
-            raise LostWorkersError(
-                "a worker process was killed (was there not enough memory?)"
-            ) from None
+        def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+            try:
+                yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
+            except BrokenProcessPool:
+                raise LostWorkersError(
+                    "a worker process was killed (was there not enough memory?)"
+                ) from None
 
-    try:
         yield run
-        pool.shutdown()
-    finally:
-        ours.close()  # ends those that are still at work
-        pool.shutdown(cancel_futures=True)
-        theirs.close()
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _depend_on(parent: Connection) -> None:
-    """No worker outlives the parent's end of the pipe."""
-
-    def follow() -> None:
-        parent.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
 
 
 def _require_address(address: str) -> None:
@@ -230,19 +196,6 @@ class _Watch:
         return max(_AHEAD * self._cores, 1)
 
 
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C and a closed terminal back: what is started meanwhile never hears of them.
-
-    The parent decides what they mean.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _windowed(
     executor: Executor,
     points: Sequence[Point],
@@ -256,7 +209,7 @@ def _windowed(
     while True:
         for chunk in islice(rest, max(most() - len(under_way), 0)):
             task = (points[chunk.point].work, chunk.draws)
-            with _interrupts_held():
+            with interrupts_held():
                 future = (
                     executor.submit(Work.run, *task) if wanted is None
                     else executor.submit(run_alike, *task, wanted)
