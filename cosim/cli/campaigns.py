@@ -52,11 +52,12 @@ def campaign(
         raise CallerError("--workers: with --scheduler the cluster's workers are taken")
     path = find_shipped(file, "campaigns")
     plan = load(path)
-    points = grid(plan, path)
+    console = PatientConsole(stderr=True)
+    with console.status("preparing the grid"):
+        points = grid(plan, path)
     _, base = base_of(plan, path)
     folder = out or DEFAULT_RUNS / "campaigns" / plan.name
     store = Store(folder, points, draws or plan.draws, plan.chunk)
-    console = PatientConsole(stderr=True)
     workers = workers or cores()
     if workers > (most := _PER_CORE * cores()):
         raise CallerError(f"--workers {workers}: on this machine at most {most}")
