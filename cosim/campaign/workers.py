@@ -191,7 +191,8 @@ class _Watch:
                 self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
-                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s"
+                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
+                    "(those with an older noack end at once)"
                 )
         return max(_AHEAD * self._cores, 1)
 

@@ -124,7 +124,9 @@ def test_a_cluster_without_workers_is_waited_for_with_a_word_and_not_for_ever(
     monkeypatch.setattr("cosim.campaign.workers._PATIENCE_S", 0.5)
     try:
         with (
-            pytest.raises(PeerError, match=r"the cluster has had no worker for 0\.5 s; 0 of 240"),
+            pytest.raises(
+                PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 240"
+            ),
             cluster(empty.address, said.append) as runner,
         ):
             run_campaign(Store(tmp_path / "out", points, plan.draws, plan.chunk), runner)
