@@ -1,6 +1,5 @@
 """The page of a campaign: one file of HTML with all its figures and tables."""
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from cosim.campaign.figures import Drawn
 from cosim.campaign.metrics import METRICS, Metric
 from cosim.campaign.statistics import Estimate
 from cosim.campaign.summary import Compared, Found, Summary
+from cosim.plus_minus import plus_minus
 from cosim.report.save import inline
 
 NONE = "–"
@@ -94,7 +94,7 @@ def _compared_row(compared: Compared, metrics: Sequence[Metric]) -> Row:
     return Row(
         labels,
         [
-            cell if share is None else f"{cell}; {100 * share:.3g} % smaller"
+            cell if share is None else f"{cell}, smaller in {100 * share:.3g} %"
             for cell, share in zip(cells, shares, strict=True)
         ],
     )
@@ -104,12 +104,10 @@ def written(estimate: Estimate) -> str:
     """Mean ± half-width, and of how many runs if not of all."""
     if not estimate.finite:
         return "never"
-    text = f"{estimate.mean:.4g}"
-    if math.isfinite(estimate.halfwidth):
-        text += f" ± {estimate.halfwidth:.2g}"
+    text = plus_minus(estimate.mean, estimate.halfwidth)
     if estimate.finite < estimate.draws:
         text += f" (in {100 * estimate.finite / estimate.draws:.4g} %)"
-    return text.replace("-", "−")
+    return text
 
 
 def unfinished(summary: Summary) -> Iterator[str]:

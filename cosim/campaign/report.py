@@ -2,23 +2,26 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from cosim.campaign.figures import figures
 from cosim.campaign.metrics import METRICS
-from cosim.campaign.page import compared_row, found_row, page, unfinished, verdict
+from cosim.campaign.page import Row, compared_row, found_row, page, unfinished, verdict
 from cosim.campaign.store import RUNS, Store
 from cosim.campaign.summary import Summary
 from noack.errors import MachineError
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _MOST_ROWS = 40
+_APART = 3
+"""At most between columns, margins included."""
 _MOST_REMARKS = 5
 
 
@@ -55,15 +58,11 @@ def print_summary(console: Console, summary: Summary) -> None:
     if campaign.compare is not None:
         title = f"minus the same draw at {campaign.compare.axis} = {campaign.compare.reference}"
         tables.append((title, [compared_row(one, shown) for one in summary.compared]))
+    axes = [axis.called for axis in campaign.axes]
+    headings = [METRICS[metric].heading for metric in shown]
     for title, rows in tables:
-        table = Table(title=escape(title), title_justify="left")
-        for axis in campaign.axes:
-            table.add_column(escape(axis.called))
-        for metric in shown:
-            table.add_column(escape(METRICS[metric].heading), justify="right")
-        for row in rows[:_MOST_ROWS]:
-            table.add_row(*map(escape, row.labels), *row.cells)
-        console.print(table)
+        for table in tables_of(title, axes, headings, rows[:_MOST_ROWS], console.width):
+            console.print(table)
         if len(rows) > _MOST_ROWS:
             console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
     remarks = list(unfinished(summary))
@@ -72,6 +71,44 @@ def print_summary(console: Console, summary: Summary) -> None:
     if len(remarks) > _MOST_REMARKS:
         console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
     console.print(verdict(summary), style="bold red" if summary.breaches else "bold")
+
+
+def tables_of(
+    title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[Row], width: int
+) -> Iterator[Table]:
+    """Tables with all columns, as many as are needed for a terminal of this width; nothing is cut.
+
+    Args:
+        title: of the first.
+        axes: headings of the labels, which each table repeats.
+        headings: of the cells.
+        rows: of all tables.
+        width: in characters.
+    """
+    labels = sum(_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes))
+    widths = [_width(words, [row.cells[i] for row in rows]) for i, words in enumerate(headings)]
+    begin = 0
+    while begin < len(headings):
+        end = begin + 1
+        while end < len(headings) and labels + sum(widths[begin : end + 1]) <= width:
+            end += 1
+        table = Table(
+            title=escape(title) if begin == 0 else None, title_justify="left", box=SIMPLE_HEAD,
+            pad_edge=False, collapse_padding=True,
+        )  # fmt: skip
+        for words in axes:
+            table.add_column(escape(words), overflow="fold")
+        for words, least in zip(headings[begin:end], widths[begin:end], strict=True):
+            table.add_column(escape(words), justify="right", min_width=least - _APART)
+        for row in rows:
+            table.add_row(*map(escape, row.labels), *row.cells[begin:end])
+        yield table
+        begin = end
+
+
+def _width(heading: str, cells: Iterable[str]) -> int:
+    """Of a column, whose heading may break between words."""
+    return max(map(len, (*heading.split(), *cells))) + _APART
 
 
 def _known(value: Any) -> Any:

@@ -16,8 +16,9 @@ _MARKERS = "os^Dv<>PX"
 @styled
 def trade_off(found: Found) -> Figure:
     """Draw all that was tried, the trade-off curve, the limit and the chosen one."""
-    names = [family.name for family in found.space.families]
-    labels = [*names, "trade-off", "limit", "chosen" if found.feasible else "closest"]
+    names = [f"W {family.name}" for family in found.space.families]
+    star_name = "the choice" if found.feasible else "the closest"
+    labels = [*names, "trade-off", "limit", star_name]
     figure, (axes,) = single(_HEIGHT_IN, labels)
     shown = []
     for i, name in enumerate(names):

@@ -8,8 +8,10 @@ from typing import Any
 from cosim.design.measure import Bounded, Bounds, Limits, Measured
 from cosim.design.search import Trial
 from cosim.design.space import Space
+from cosim.plus_minus import plus_minus
 from noack.scenario import Scenario
 
+_DESIGNED = "_designed"
 WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
 
 
@@ -49,13 +51,28 @@ class Found:
 
     @property
     def scenario(self) -> Scenario:
-        """With what was chosen."""
-        return self.space.families[self.best.candidate.family].with_trigger(self.best.candidate)
+        """With what was chosen, under a name of its own."""
+        family = self.space.families[self.best.candidate.family]
+        chosen = family.with_trigger(self.best.candidate)
+        limits = self.limits
+        return chosen.model_copy(
+            update={
+                "name": f"{chosen.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}",
+                "description": f"{chosen.name} with the trigger that transmits least while "
+                f"{100 * limits.quantile:g} % of draws settle within {limits.settling_s:g} s.",
+            }
+        )
+
+    @property
+    def conditions(self) -> str:
+        """What certified bounds hold for."""
+        kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
+        return f"under {kind}, for the whole box"
 
     def verdict(self) -> str:
         """One line."""
         if self.confirmed:
-            sent = f"{self.fresh.transmissions:.4g} ± {self.fresh.halfwidth:.2g}"
+            sent = plus_minus(self.fresh.transmissions, self.fresh.halfwidth)
             return f"{sent} transmissions, settled after {self._settling(self.fresh)}: {self._at()}"
         if self.feasible:
             return (
@@ -69,7 +86,7 @@ class Found:
         limits, fresh = self.limits, self.fresh
         chosen = self.scenario
         return {
-            "scenario": chosen.name,
+            "scenario": self.space.families[0].scenario.name,
             "limits": {
                 "settling_s": limits.settling_s,
                 "quantile": limits.quantile,

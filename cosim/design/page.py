@@ -12,6 +12,7 @@ from rich.table import Table
 from cosim import report
 from cosim.design.figure import trade_off
 from cosim.design.found import WORDS, Found, certified, seconds
+from cosim.plus_minus import plus_minus
 from cosim.report.save import inline
 from noack.scenario_file import dumps
 
@@ -33,13 +34,14 @@ def page(found: Found) -> str:
         *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
     ]
     return _templates().get_template("design.html.jinja").render(
-        title=found.scenario.name,
+        title=found.space.families[0].scenario.name,
         subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
         f"seed {found.seed}",
         verdict=found.verdict(),
         tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
         limits=lines,
         certified=[certified(name, value) for name, value in bounds.items()],
+        conditions=found.conditions,
         figure=Markup(inline(trade_off(found), "trade-off", _CAPTION)),
         caption=_CAPTION,
         headings=HEADINGS,
@@ -55,7 +57,7 @@ def rows(found: Found) -> list[tuple[str, ...]]:
         family = found.space.families[trial.candidate.family]
         found_rows.append(
             (
-                f"{trial.measured.transmissions:.4g} ± {trial.measured.halfwidth:.2g}",
+                plus_minus(trial.measured.transmissions, trial.measured.halfwidth),
                 seconds(trial.measured),
                 f"{trial.candidate.alpha_per_s:.4g}",
                 f"{trial.candidate.beta:.4g}",
@@ -68,7 +70,7 @@ def rows(found: Found) -> list[tuple[str, ...]]:
 
 def print_found(console: Console, found: Found) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{found.scenario.name}: trade-off, no other is smaller in both"
+    title = f"{found.space.families[0].scenario.name}: trade-off, no other is smaller in both"
     # All of it in 80 columns, no figure cut off.
     table = Table(
         title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
@@ -89,8 +91,10 @@ def print_found(console: Console, found: Found) -> None:
             highlight=False,
             soft_wrap=True,
         )
-    for name, value in (found.bounds or {}).items():
-        console.print(f"certified      {certified(name, value)}", highlight=False)
+    bounds = [certified(name, value) for name, value in (found.bounds or {}).items()]
+    if bounds:
+        text = f"certified {found.conditions}: {', '.join(bounds)}"
+        console.print(text, highlight=False, soft_wrap=True)
 
 
 @cache

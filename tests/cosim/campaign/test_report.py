@@ -2,6 +2,7 @@
 
 import json
 import math
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 from typer.testing import CliRunner
 
 from cosim.batch.status import DIVERGED, OK, TOO_MANY_EVENTS
@@ -23,9 +25,9 @@ from cosim.campaign.figures import (
 )
 from cosim.campaign.grid import Point, base_of, grid
 from cosim.campaign.metrics import METRICS, certified_error, measured
-from cosim.campaign.page import page, written
+from cosim.campaign.page import Row, page, written
 from cosim.campaign.plan import Campaign, load
-from cosim.campaign.report import write_report
+from cosim.campaign.report import tables_of, write_report
 from cosim.campaign.run import run_campaign
 from cosim.campaign.statistics import estimate
 from cosim.campaign.store import Store
@@ -286,3 +288,25 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
     assert "[/b]" in result.stdout
     told = " ".join(result.stdout.split())
     assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
+
+
+@pytest.mark.parametrize("width", range(40, 120))
+def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
+    headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
+    rows = [
+        Row(["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (in 97.5 %)"]),
+        Row(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
+    ]
+    console = Console(width=width, file=StringIO(), record=True)
+    for table in tables_of("all", ["policy", "β"], headings, rows, width):
+        console.print(table)
+    lines = console.export_text().splitlines()
+    for label in ("MB-ET", "ZOH-ET"):
+        found = [line for line in lines if line.strip().startswith(label)]
+        (row,) = [row for row in rows if row.labels[0] == label]
+        for cell in row.cells:
+            assert sum(cell in line for line in found) == 1
+    for heading in headings:
+        assert all(any(word in line for line in lines) for word in heading.split())
+    assert all(len(line) <= width for line in lines)
+    assert (len(found) == 1) == (width > 83)
