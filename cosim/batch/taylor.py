@@ -95,7 +95,7 @@ def reaches(
         X_k: table.
         E: by columns.
         sizes: scratch, (HIGHEST + 2,).
-        reach_s: receives them, (len(DEGREES),).
+        reach_s: receives them, (len(DEGREES),); 0 where the tables' numbers are not finite.
         measured_s: receives them for what is measured, where a share of _MEASURED may be left out.
         n: how many states.
     """
@@ -114,8 +114,10 @@ def reaches(
     for i in range(len(reach_s)):
         p = DEGREES[i]
         left_out = 2.0 * kappa * sizes[p + 1]
-        reach_s[i], measured_s[i] = math.inf, math.inf
-        if left_out > 0.0:
+        reach_s[i], measured_s[i] = 0.0, 0.0
+        if left_out == 0.0:
+            reach_s[i], measured_s[i] = math.inf, math.inf
+        elif left_out < math.inf:
             most_s = (p + 2) / (2.0 * eta) if eta > 0.0 else math.inf
             carried_s = math.exp(math.log(_NEGLIGIBLE / left_out) / (p + 1))
             reach_s[i] = min(carried_s, most_s)
