@@ -180,5 +180,6 @@ def is_within(x_c: Lanes, e_c: Lanes, d: Lanes, limit: float, level: float) -> b
         level: the threshold, or 0.
     """
     x, e_s = x_c - e_c, e_c + d
-    size = math.sqrt(dot(x, x) + dot(e_s, e_s) + dot(e_c, e_c))
-    return size < limit * (min(level, 1.0) if level > 0.0 else 1.0)
+    if level > 0.0:
+        limit *= min(level, 1.0)
+    return dot(x, x) + dot(e_s, e_s) + dot(e_c, e_c) < limit * limit

@@ -259,11 +259,13 @@ def follow(
         if t_s >= system.horizon_s:
             break
         if fresh:
-            x, left = x_c - e_c, 0.0
-            w = x if len(system.weight) == 0 else times(system.weight, 0, x, n)
+            x, left, length = x_c - e_c, 0.0, 0.0
             if squares is not None:
                 left = left_side(squares, x)
-            span = span_after(rule, t_s, left, math.sqrt(dot(w, w)))
+            if rule.forecasts:
+                w = x if len(system.weight) == 0 else times(system.weight, 0, x, n)
+                length = math.sqrt(dot(w, w))
+            span = span_after(rule, t_s, left, length)
             point, fresh, looked = span.point, False, False
         phase = phase_at(rule, span, t_s)
         until_s = min(phase.until_s, system.horizon_s)
@@ -313,7 +315,11 @@ def follow(
         p = degree_for(space.reach_s, spent_s)
         x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
         d = value(space.d, p, spent_s, n)
-        faded = threshold * math.exp(-rate * spent_s) if rate > 0.0 else threshold
+        growth, rise = math.exp(system.fading_per_s * t_s), math.exp(system.fading_per_s * spent_s)
+        faded = threshold
+        if rate > 0.0:
+            # Where it fades as the supremum is scaled, an exponential is saved.
+            faded *= 1.0 / rise if rate == system.fading_per_s else math.exp(-rate * spent_s)
         if not is_within(x_c, e_c, d, _LARGEST, faded):
             status = DIVERGED
             t_s += passed_at(
@@ -327,8 +333,7 @@ def follow(
             space.x_scaled, space.u_scaled, n, m,
         )  # fmt: skip
         weighted = e_c if len(system.weight) == 0 else times(system.weight, 0, e_c, n)
-        growth = math.exp(system.fading_per_s * t_s)
-        grown = growth * math.exp(system.fading_per_s * spent_s)
+        grown = growth * rise
         best = max(best, math.sqrt(dot(weighted, weighted)) * grown)
         # While both models agree, e_c is e_s, which is below a threshold that meets it at an event.
         ceiling = math.inf

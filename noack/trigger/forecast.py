@@ -47,6 +47,8 @@ def interval_ns(
         return longest_ns
     # The left side grows and the right one does not: they meet once.
     for _ in range(_HALVINGS):
+        if math.floor(low_s * 1e9) == math.floor(high_s * 1e9):
+            break
         middle_s = (low_s + high_s) / 2
         if is_reached(forecast, size, t_s, middle_s):
             high_s = middle_s
