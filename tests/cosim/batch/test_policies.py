@@ -25,7 +25,6 @@ from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
 from tests.cosim.batch.exact import (
-    SIZES,
     cost_of,
     dense,
     one,
@@ -75,7 +74,7 @@ def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy
 
 POLICIES: dict[str, Make] = {
     "absolute": lambda rng, n, W: AbsoluteTrigger(0.01, W),
-    "relative": lambda rng, n, W: relative_trigger(rng.uniform(0.02, 0.3), W),
+    "relative": lambda rng, n, W: relative_trigger(rng.uniform(0.01, 0.05), W),
     "mixed": mixed,
     "lyapunov": lyapunov,
     "dynamic": dynamic,
@@ -95,6 +94,13 @@ POLICIES: dict[str, Make] = {
         DwellTrigger(dynamic(*given), 300 * MS), 100 * MS
     ),
 }
+NORM_OR_TIME = (
+    "absolute", "periodic", "self_triggered", "deadline of decaying", "dwell of decaying",
+    "dwell of deadline of self_triggered",
+)  # fmt: skip
+"""They run in the code that the paper's policy has."""
+SIZES = {True: (2, 1), False: (3, 2)}
+"""Of those, and of the others. Each is compiled, which takes seconds."""
 MOST_EVENTS = 500
 
 
@@ -103,7 +109,7 @@ def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
     made = []
     for seed in seeds:
         rng = np.random.default_rng([seed, *name.encode()])
-        n, m = SIZES[seed % 2]
+        n, m = SIZES[name in NORM_OR_TIME]
         setting = random_setting(rng, n, m)
         policy = POLICIES[name](rng, n, setting.trigger.weight)
         if name == "lyapunov":  # Where an update is lost, the next event is at once.
@@ -147,7 +153,7 @@ def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -
                 assert low_s - 1e-12 <= row["settling_s"] <= high_s + 1e-12
             events += len(run.event_s)
             finished += 1
-    assert events > (3 if name == "lyapunov" else 40)
+    assert events > (3 if name == "lyapunov" else 30)
     assert finished == 12 or (name == "lyapunov" and finished >= 3)
 
 
@@ -166,13 +172,13 @@ def test_a_row_depends_on_its_own_draw_only(name: str) -> None:
 
 def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Population]:
     """‖x‖ = e^{−αt}, ‖e_s‖ = 2 e^{−αt} sin(ωt/2): the relative rule meets sin(ωt/2) > σ/2."""
-    turn = np.array([[0.0, omega], [-omega, 0.0]])
+    turn = omega * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     setting = Setting(
-        H=-alpha * np.eye(2), K=np.zeros((1, 2)), trigger=relative_trigger(sigma),
+        H=-alpha * np.eye(3), K=np.zeros((2, 3)), trigger=relative_trigger(sigma),
         link=LinkSettings(), horizon_s=1.5 * math.pi / omega, known_start=True,
     )  # fmt: skip
     draw = Population(
-        (turn - alpha * np.eye(2))[None], np.ones((1, 2, 1)), np.array([[0.6, 0.8]]),
+        (turn - alpha * np.eye(3))[None], np.ones((1, 3, 2)), np.array([[0.6, 0.8, 0.0]]),
         np.zeros(1, np.uint64),
     )  # fmt: skip
     return setting, draw
@@ -182,10 +188,13 @@ def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Populati
 @pytest.mark.parametrize("omega", [0.3, 200.0])
 @pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-8, 1e-11])
 def test_a_crossing_however_short_is_found(depth: float, omega: float, alpha_omega: float) -> None:
-    """Also where the state has decayed to e^{−70π}, 1e-95."""
+    """Also where the state has decayed to e^{−70π}, 1e-95.
+
+    On the way there a hundred polynomials lose some 1e-14 each of its relative accuracy.
+    """
     found = run_events(*turning(2 * (1 - depth), omega, alpha_omega * omega))
     first_s = 2 / omega * math.asin(1 - depth)
-    tolerance_s = 1e-13 / math.sqrt(depth) / omega + 1e-12 * first_s
+    tolerance_s = 5e-13 / math.sqrt(depth) / omega + 1e-12 * first_s
     assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
     beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
     assert run_events(*beyond).event_s.size == 0
