@@ -314,12 +314,15 @@ class ContinuousLoop:
         for begin in range(first, last + 1, _GRID_BLOCK):
             points_s = np.arange(begin, min(begin + _GRID_BLOCK, last + 1)) * grid_s
             states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
-            if not np.abs(states).max() < LARGEST:
-                raise DivergedError(float(points_s[0]))
-            exceeds = np.flatnonzero(guard.exceeds(points_s * 1e9, states[:, : 2 * n]))
+            beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
+            known = len(states) if not len(beyond) else int(beyond[0])
+            z_s = states[:known, : 2 * n]
+            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, z_s))
             if len(exceeds):
                 k = int(exceeds[0])
                 return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
+            if len(beyond):
+                raise DivergedError(float(points_s[beyond[0]]))
         return Reached(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
