@@ -22,7 +22,7 @@ met. Backwards from the end the same holds for s ↦ y(end − s).
 How it ends. Each step leads on, or is too short to be one in floating point, which ends it. A curve
 that stays just below its threshold may still take very many; after MOST_STEPS it is UNRESOLVED. A
 chord of φ is above φ, so that Newton's method may be left at any time, for a step that is shorter
-and as safe. Where h ascends it may take _NEWTON_STEPS; then its bracket is halved, to the last bit.
+and as safe. Where h ascends it may take NEWTON_STEPS; then its bracket is halved, to the last bit.
 
 Only |y| is known here. Other quadratic event functions are :mod:`cosim.batch.squares`.
 """
@@ -40,9 +40,9 @@ CLOSE = 1e-8
 """Newton's last step, as a share of the way; its square is below rounding."""
 _AHEAD = 3.0
 _NEARER = 0.6
-_NEWTON_STEPS = 60
-_HALVINGS = 1100
-"""More than there are between any two numbers."""
+NEWTON_STEPS = 60
+TURNS = NEWTON_STEPS + 1100
+"""More halvings than there are between any two numbers."""
 
 
 def first_exit(
@@ -115,7 +115,7 @@ def safe(
     """
     length, below = span, limit - math.sqrt(square)
     above = 0.0
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(NEWTON_STEPS):
         straight = math.sqrt(max(square + length * (2.0 * mixed + length * speed), 0.0))
         above = straight + limit * (rate * length - 1.0) + 0.5 * most * length * length
         if above <= 0.0:
@@ -152,16 +152,11 @@ def ascent(
         n: how many numbers.
     """
     low_s, high_s, beyond = s, ahead_s, False
-    for turn in range(_NEWTON_STEPS + _HALVINGS):
+    for turn in range(TURNS):
         following = s - excess / slope if slope > 0.0 else math.inf
-        if turn >= _NEWTON_STEPS:
-            following = 0.5 * (low_s + high_s) if beyond else high_s
-        elif abs(following - s) <= CLOSE * s:
+        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
             return following if following < ahead_s or beyond else NONE
-        elif following >= high_s:
-            following = 0.5 * (low_s + high_s) if beyond else high_s
-        elif following <= low_s:
-            following = 0.5 * (low_s + high_s)
+        following = bracketed(following, turn, low_s, high_s, beyond)
         if following == s:
             return s
         s = following
@@ -177,6 +172,23 @@ def ascent(
         else:
             low_s = s
     return s
+
+
+def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
+    """Newton's next point if it is within the bracket, and not too many came before; or a safe one.
+
+    Args:
+        following: Newton's.
+        turn: how many came before.
+        low_s: below the root, if there is one.
+        high_s: above it, if ``beyond``; else the end.
+        beyond: there is one.
+    """
+    if turn < NEWTON_STEPS and low_s < following < high_s:
+        return following
+    if not beyond and (turn >= NEWTON_STEPS or following >= high_s):
+        return high_s
+    return 0.5 * (low_s + high_s)
 
 
 def look(

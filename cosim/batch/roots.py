@@ -18,19 +18,24 @@ h may begin at 0, as an envelope does that begins at the event, and go down from
 step is −2ḣ/b. It is an event at once if it begins above 0, or at 0 and goes up.
 
 How it ends. Each step leads on, or is too short to be one in floating point, which ends it; so does
-MOST_STEPS. Newton's method may take _NEWTON_STEPS; then its bracket is halved, to the last bit.
+MOST_STEPS. Newton's method may take NEWTON_STEPS; then its bracket is halved, to the last bit.
 """
 
 import math
 
-from cosim.batch.crossing import CLOSE, MOST_STEPS, NONE, UNRESOLVED
+from cosim.batch.crossing import (
+    CLOSE,
+    MOST_STEPS,
+    NEWTON_STEPS,
+    NONE,
+    TURNS,
+    UNRESOLVED,
+    bracketed,
+)
 from cosim.batch.taylor import Array
 
 _AHEAD = 3.0
 _NEARER = 0.6
-_NEWTON_STEPS = 60
-_HALVINGS = 1100
-"""More than there are between any two numbers."""
 
 
 def first_root(
@@ -119,16 +124,11 @@ def ascending_root(
         ahead_s: a.
     """
     low_s, high_s, beyond = s, ahead_s, False
-    for turn in range(_NEWTON_STEPS + _HALVINGS):
+    for turn in range(TURNS):
         following = s - value / slope if slope > 0.0 else math.inf
-        if turn >= _NEWTON_STEPS:
-            following = 0.5 * (low_s + high_s) if beyond else high_s
-        elif abs(following - s) <= CLOSE * s:
+        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
             return following if following < ahead_s or beyond else NONE
-        elif following >= high_s:
-            following = 0.5 * (low_s + high_s) if beyond else high_s
-        elif following <= low_s:
-            following = 0.5 * (low_s + high_s)
+        following = bracketed(following, turn, low_s, high_s, beyond)
         if following == s:
             return s
         s = following

@@ -316,8 +316,8 @@ class ContinuousLoop:
             states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
             beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
             known = len(states) if not len(beyond) else int(beyond[0])
-            z_s = states[:known, : 2 * n]
-            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, z_s))
+            seen = states[:known, : 2 * n]
+            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, seen))
             if len(exceeds):
                 k = int(exceeds[0])
                 return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)

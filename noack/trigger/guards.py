@@ -47,6 +47,7 @@ class Guards(NamedTuple):
         """
         level, since_ns, due_ns = self.level, 0.0, self.longest_ns
         if self.from_event:
+            # To the last bit what it is compared with, so that the event itself is not above it.
             level, since_ns = norm(self.form.up @ np.concatenate([x, np.zeros_like(x)])), t_ns
         if self.forecast is not None:
             size = norm(x if self.weight is None else self.weight @ x)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from cosim.batch import roots
+from cosim.batch import crossing, roots
 from cosim.batch.crossing import NONE, UNRESOLVED
 from cosim.batch.roots import estimate, first_root
 from noack.linear import Vector
@@ -57,7 +57,8 @@ def test_too_many_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_newton_gives_way_to_halving(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roots, "_NEWTON_STEPS", 0)
+    monkeypatch.setattr(roots, "NEWTON_STEPS", 0)
+    monkeypatch.setattr(crossing, "NEWTON_STEPS", 0)
     g = np.array([-0.1, 0.0, 0.0, 1.0])
     found = first_root(g, 3, 0.0, 0.0, 0.0, 1.0)
     assert found == pytest.approx(0.1 ** (1 / 3), rel=1e-15)
