@@ -192,6 +192,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         measured_s=np.empty(len(DEGREES)),
         u=np.empty(terms * m),
         u_scaled=np.empty(terms * m),
+        squares=np.empty(2 * terms),
         sizes=np.empty(terms + 1),
         **{name: np.empty(terms * max(n, m)) for name in states},
     )

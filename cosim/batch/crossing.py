@@ -46,8 +46,9 @@ TURNS = NEWTON_STEPS + 1100
 
 
 def first_exit(
-    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, n: Width
-) -> float:
+    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, most_steps: int,
+    n: Width,
+) -> float:  # fmt: skip
     """The first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
 
     Args:
@@ -57,10 +58,11 @@ def first_exit(
         rate: r ≥ 0, per second; 0 if ``backward``.
         end_s: where to stop.
         backward: look at y(``end_s`` − s) instead.
+        most_steps: give up after so many.
         n: how many numbers y has.
 
     Returns:
-        The time; NONE; or UNRESOLVED after MOST_STEPS.
+        The time; NONE; or UNRESOLVED.
     """
     s, ahead_s = 0.0, end_s
     most = bend(curve, p, end_s, n)
@@ -68,7 +70,7 @@ def first_exit(
         y, dy = look(curve, p, s, end_s, backward, n)
     else:
         y, dy = load(curve, 0, n), load(curve, len(n), n)
-    for _ in range(MOST_STEPS):
+    for _ in range(most_steps):
         square, mixed, speed = dot(y, y), dot(y, dy), dot(dy, dy)
         limit = level * math.exp(-rate * s) if rate > 0.0 else level
         size = math.sqrt(square)
@@ -203,5 +205,5 @@ def look(
 
 def last_entry(curve: Array, p: int, level: float, end_s: float, n: Width) -> float:
     """The last s in [0, ``end_s``] up to which |y(s)| ≥ ``level``; or NONE, or UNRESOLVED."""
-    back_s = first_exit(curve, p, level, 0.0, end_s, True, n)
+    back_s = first_exit(curve, p, level, 0.0, end_s, True, MOST_STEPS, n)
     return back_s if back_s < 0.0 else end_s - back_s

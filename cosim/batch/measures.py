@@ -8,7 +8,8 @@ import math
 
 from cosim.batch.crossing import NONE, UNRESOLVED, first_exit, last_entry
 from cosim.batch.lanes import Lanes, Width, dot, filled, fma, load, store, times
-from cosim.batch.taylor import Array, largest, value, value_and_slope
+from cosim.batch.roots import first_root
+from cosim.batch.taylor import Array, largest, squared, value, value_and_slope
 
 CERTAINTY = 1e-10
 """The true supremum is at most by this share above the one that is returned."""
@@ -17,6 +18,7 @@ _LEAST = 1e-150
 _LARGEST = 1e150
 _CLIMBS = 12
 _HALVINGS = 60
+_FEW_STEPS = 50
 _RISES = 10_000
 """Each passes a maximum, of which a polynomial of degree 24 has few, or rises by CERTAINTY."""
 
@@ -76,19 +78,34 @@ def square_integrals(
 
 
 def raised(
-    best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, n: Width
-) -> float:
+    best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, squares: Array,
+    n: Width,
+) -> float:  # fmt: skip
     """The larger of ``best`` and the supremum of |y(s)| e^{rate s} ``growth`` in [0, ``end_s``].
 
     It is a value that is taken, and the true supremum is larger by a share of CERTAINTY at most
-    (or below 1e-150, or infinite beyond 1e150). UNRESOLVED if the curve stays too close to one
-    level (:mod:`cosim.batch.crossing`), or rises above it again and again.
+    (or below 1e-150, or infinite beyond 1e150). A curve that stays close to one level, as an
+    oscillation does, is looked at once more as |y|², a number, where terms that cancel are gone.
+    UNRESOLVED if that does not help (:mod:`cosim.batch.roots`), or the curve rises again and again.
+
+    Args:
+        best: a value.
+        curve: coefficients of y.
+        p: the degree.
+        end_s: where to stop.
+        rate: per second.
+        growth: a factor.
+        squares: scratch, 2p + 1 numbers.
+        n: how many numbers y has.
     """
     for _ in range(_RISES):
         if best >= _LARGEST:
             return best
         level = max(best * (1.0 + CERTAINTY), _LEAST) / growth
-        s = first_exit(curve, p, level, rate, end_s, False, n)
+        s = first_exit(curve, p, level, rate, end_s, False, _FEW_STEPS, n)
+        if s == UNRESOLVED:
+            squared(curve, p, filled(1.0, n), squares, n)
+            s = first_root(squares, 2 * p, level * level, 2.0 * rate, 0.0, end_s)
         if s == NONE:
             return best
         if s == UNRESOLVED:

@@ -3,7 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
-from cosim.batch.crossing import NONE, UNRESOLVED, first_exit
+from cosim.batch.crossing import MOST_STEPS, NONE, UNRESOLVED, first_exit
 from cosim.batch.lanes import Lanes, Width, dot, filled, load, store, times
 from cosim.batch.measures import (
     CERTAINTY,
@@ -95,6 +95,8 @@ class Space(NamedTuple):
     """W e_c."""
     x_scaled: Array
     u_scaled: Array
+    squares: Array
+    """Coefficients of ‖W e_c‖²."""
     sizes: Array
 
 
@@ -300,7 +302,9 @@ def follow(
             degree = compare(squares, p, reserve / (scale * scale))
         if phase.compares:
             if squares is None:
-                found_s = first_exit(space.error, p, threshold, rate, window_s, False, n)
+                found_s = first_exit(
+                    space.error, p, threshold, rate, window_s, False, MOST_STEPS, n
+                )
             else:
                 found_s, point = first_event(
                     squares, rule, degree, level, 2.0 * rate, point, t_s, window_s
@@ -340,7 +344,9 @@ def follow(
         if agree and phase.compares and squares is None:
             ceiling = threshold * (grown if rate == 0.0 else growth)
         if not ceiling <= best * (1.0 + CERTAINTY):
-            best = raised(best, space.weighted, q, spent_s, system.fading_per_s, growth, n)
+            best = raised(
+                best, space.weighted, q, spent_s, system.fading_per_s, growth, space.squares, n
+            )
         within_s = last_above(space.x, q, spent_s, settled, x_c - e_c, n)
         if best == UNRESOLVED or within_s == UNRESOLVED:
             status = UNDECIDED

@@ -22,10 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.batch.crossing import NONE
-from cosim.batch.lanes import Lanes, Width, dot, filled, fma, load, store, times, width
+from cosim.batch.lanes import Lanes, Width, dot, load, store, times, width
 from cosim.batch.roots import estimate, first_root, number_and_slope
 from cosim.batch.rule import Rule, last_point
-from cosim.batch.taylor import HIGHEST, Array
+from cosim.batch.taylor import HIGHEST, Array, squared
 from noack.trigger.guard import Form, of_error
 from noack.trigger.policy import Policy
 
@@ -132,10 +132,12 @@ def compare(squares: Squares, p: int, reserve: float) -> int:
         Their degree.
     """
     degree = 2 * p
-    multiply(squares.y, squares.form_signs, p, squares.g, squares.rows)
+    signs = load(squares.form_signs, 0, squares.rows)
+    squared(squares.y, p, signs, squares.g, squares.rows)
     if len(squares.gain) == 0:
         return degree
-    multiply(squares.w, squares.gain_signs, p, squares.eta, squares.rows)
+    signs = load(squares.gain_signs, 0, squares.rows)
+    squared(squares.w, p, signs, squares.eta, squares.rows)
     # From the gain's coefficients to those of η, in the same place.
     last = reserve
     for k in range(degree + 1 + _MORE):
@@ -148,20 +150,6 @@ def compare(squares: Squares, p: int, reserve: float) -> int:
     for k in range(degree + 1, degree + 2 + _MORE):
         squares.g[k] = -squares.eta[k]
     return degree + 1 + _MORE
-
-
-def multiply(y: Array, signs: Array, p: int, out: Array, rows: Width) -> None:
-    """The coefficients of yᵀSy, of degree 2p."""
-    size, S = len(rows), load(signs, 0, rows)
-    for k in range(2 * p + 1):
-        total = filled(0.0, rows)
-        for i in range(max(0, k - p), (k + 1) // 2):
-            total = fma(load(y, i * size, rows), load(y, (k - i) * size, rows), total)
-        total = total + total
-        if k % 2 == 0:
-            middle = load(y, (k // 2) * size, rows)
-            total = fma(middle, middle, total)
-        out[k] = dot(total, S)
 
 
 def left_side(squares: Squares, x: Lanes) -> float:

@@ -170,3 +170,17 @@ def largest(curve: Array, p: int, s: float, n: Width) -> float:
     for k in range(p - 1, -1, -1):
         total = fma(total, s, magnitude(load(curve, k * len(n), n)))
     return _ROUNDED_UP * dot(total, total)
+
+
+def squared(curve: Array, p: int, signs: Lanes, out: Array, n: Width) -> None:
+    """The coefficients of yᵀ S y, S diagonal: of degree 2p, Σ_{i+j=k} c_i · S c_j."""
+    size = len(n)
+    for k in range(2 * p + 1):
+        total = filled(0.0, n)
+        for i in range(max(0, k - p), (k + 1) // 2):
+            total = fma(load(curve, i * size, n), load(curve, (k - i) * size, n), total)
+        total = total + total
+        if k % 2 == 0:
+            middle = load(curve, (k // 2) * size, n)
+            total = fma(middle, middle, total)
+        out[k] = dot(total, signs)

@@ -10,7 +10,7 @@ import pytest
 from cosim.batch.api import Population, Setting, run_batch, run_events
 from cosim.batch.status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.exact.run import TooManyEventsError
-from noack.impairments import LinkSettings
+from noack.impairments import LinkSettings, LossOf, WorstCase
 from noack.linear import Matrix
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
@@ -217,6 +217,22 @@ def test_runs_that_diverge_do_so_at_the_time_of_the_exact_simulator(name: str) -
         assert row["status"] == DIVERGED
         assert row["diverged_at_s"] == pytest.approx(run.diverged_at_s, rel=1e-9)
         assert row["transmissions"] == len(run.event_s)
+
+
+def test_an_oscillation_is_no_hard_case() -> None:
+    """x turns and nothing arrives: ‖e_c‖ is 1 for ever, all but the level 1 + 1e-10."""
+    turn = np.array([[0.0, 100.0], [-100.0, 0.0]])
+    lost = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=None)
+    setting = Setting(
+        H=np.zeros((2, 2)), K=np.zeros((1, 2)), trigger=PeriodicTrigger(1000 * MS), link=lost,
+        horizon_s=20.0, known_start=False,
+    )  # fmt: skip
+    draw = Population(
+        turn[None], np.ones((1, 2, 1)), np.array([[0.6, 0.8]]), np.zeros(1, np.uint64)
+    )
+    (row,) = run_batch(setting, draw)
+    assert row["status"] == OK
+    assert row["sup_e_c_scaled"] == pytest.approx(1.0, rel=1e-9)
 
 
 def test_a_level_that_is_all_but_met_all_the_time_is_undecided() -> None:
