@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from netem.say import say
+
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
 
@@ -37,6 +39,17 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
     except (OSError, RuntimeError):  # not writable, full, or there is no home
         return None
     return folder
+
+
+def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
+    """Whether a function has been compiled before, for this machine, and is in a folder."""
+    return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
+
+
+def say_compiling(what: str, kept: bool) -> None:
+    """Tell a waiting person what takes so long."""
+    once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) takes nothing"
+    say(f"compiling {what} for this machine, {once} ...")
 
 
 def _forget_old(folder: Path, name: str) -> None:

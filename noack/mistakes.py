@@ -9,9 +9,13 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
+    "or digit, at most 64",
+    r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, "
+    "at most 32",
+}
 _REMEDIES = {
-    "string_pattern_mismatch": "use letters, digits, _ and -, beginning with a letter or digit, "
-    "at most 64",
     "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",
 }
 
@@ -57,6 +61,8 @@ def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
     if kind == "too_short":
         least = mistake["ctx"]["min_length"]
         return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
+    if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
+        return f"{shown}: {_PATTERNS[mistake['ctx']['pattern']]}"
     message = mistake["msg"].replace("Input should", "should")
     return f"{shown}: {_REMEDIES.get(kind, message[0].lower() + message[1:])}"
 

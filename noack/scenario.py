@@ -22,7 +22,7 @@ from noack.matrices import (
 )
 from noack.models import MODEL_PARAMETERS, NAMED_MODELS
 from noack.section import Section, Seed
-from noack.triggers import AnyTrigger, Decaying, sampling_period_ns
+from noack.triggers import AnyTrigger, Decaying, require_on_grid
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
@@ -216,13 +216,17 @@ class Network(Section):
     """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
     the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     acknowledgements: Acknowledgements | None = None
-    """The way back, for protocol = "ack"; by default nothing is lost on it."""
+    """The way back, for protocol = "ack"; by default nothing is lost on it. Of no effect where
+    protocol = "none" is said."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         require_scores(self.impairments, self.loss)
-        if self.acknowledgements is not None and self.protocol != "ack":
-            raise ValueError('acknowledgements: there are none unless protocol = "ack"')
+        if self.acknowledgements is not None and "protocol" not in self.model_fields_set:
+            raise ValueError(
+                'acknowledgements: there are none unless protocol = "ack"; '
+                'say protocol = "none" to go without'
+            )
         return self
 
     @property
@@ -412,10 +416,5 @@ class Scenario(Section):
             plant.initial_state_halfwidth, "plant.initial_state_halfwidth", n, "one per state"
         )
         self.trigger.check(n, why)
-        sampling_ns, measured_ns = sampling_period_ns(self.trigger), self.measurement_period_ns
-        if sampling_ns is not None and sampling_ns % measured_ns:
-            raise ValueError(
-                f"trigger.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
-                "between measurements"
-            )
+        require_on_grid(self.trigger, self.measurement_period_ns)
         return self

@@ -10,6 +10,8 @@ from noack.matrices import Rows, require_shape
 from noack.section import Positive, Section
 
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
+Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
+Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
 Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 
 
@@ -46,7 +48,7 @@ class Absolute(_Weighted):
 
     policy: Literal["absolute"]
     """The event-triggering policy."""
-    delta: Positive
+    delta: Size
     """δ, in the units of ‖W x‖."""
 
 
@@ -55,7 +57,7 @@ class Relative(_Weighted):
 
     policy: Literal["relative"]
     """The event-triggering policy."""
-    sigma: Positive
+    sigma: Share
     """σ."""
 
 
@@ -64,9 +66,9 @@ class Mixed(_Weighted):
 
     policy: Literal["mixed"]
     """The event-triggering policy."""
-    sigma: Positive
+    sigma: Share
     """σ."""
-    epsilon: Positive
+    epsilon: Size
     """ε, in the units of ‖W x‖."""
 
 
@@ -113,7 +115,7 @@ class Lyapunov(_WithLyapunov):
 
     policy: Literal["lyapunov"]
     """The event-triggering policy."""
-    rate_per_s: Positive
+    rate_per_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)]
     """ρ."""
 
 
@@ -124,11 +126,11 @@ class Dynamic(_WithLyapunov):
     """The event-triggering policy."""
     sigma: Annotated[FiniteFloat, Field(gt=0, lt=1)]
     """σ."""
-    theta_s: Positive
+    theta_s: Annotated[FiniteFloat, Field(gt=0, le=1e9)]
     """θ, in seconds."""
-    decay_per_s: NonNegative
-    """λ."""
-    reserve: NonNegative = 0.0
+    decay_per_s: Annotated[FiniteFloat, Field(ge=0, le=1e4)]
+    """λ. What is saved is forgotten within 1/λ, which exact simulation must follow."""
+    reserve: Annotated[FiniteFloat, Field(ge=0, le=1e15)] = 0.0
     """η at the start."""
 
 
@@ -187,7 +189,10 @@ class _Combined(Section):
 
     def check(self, n: int, why: str) -> None:
         """Require that the rule fits n states."""
-        self.rule.check(n, why)
+        try:
+            self.rule.check(n, why)
+        except ValueError as error:
+            raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
 
 
 class Deadline(_Combined):
@@ -230,8 +235,21 @@ for _combined in (_Combined, Deadline, Dwell):
     _combined.model_rebuild()
 
 
-def sampling_period_ns(trigger: AnyTrigger) -> int | None:
-    """The period at which a trigger looks at its rule; None if it has none of its own."""
+def require_on_grid(trigger: AnyTrigger, measured_ns: int, key: str = "trigger") -> None:
+    """Require that a trigger with a sampling period of its own looks when something is measured.
+
+    Args:
+        trigger: the trigger.
+        measured_ns: time between measurements.
+        key: of the trigger.
+
+    Raises:
+        ValueError: it does not.
+    """
     if isinstance(trigger, Deadline | Dwell):
-        return sampling_period_ns(trigger.rule)
-    return round(trigger.period_s * NS_PER_S) if isinstance(trigger, Quadratic) else None
+        require_on_grid(trigger.rule, measured_ns, f"{key}.rule")
+    elif isinstance(trigger, Quadratic) and round(trigger.period_s * NS_PER_S) % measured_ns:
+        raise ValueError(
+            f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
+            "between measurements"
+        )

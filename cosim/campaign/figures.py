@@ -116,7 +116,7 @@ def undominated(x: Vector, y: Vector) -> Any:
 def curve_figure(
     x: Vector | None,
     labels: Sequence[str],
-    series: Mapping[str, Sequence[Estimate]],
+    series: Mapping[str, Sequence[Estimate | None]],
     axis: str,
     metric: Metric,
 ) -> Figure:
@@ -125,7 +125,7 @@ def curve_figure(
     Args:
         x: the axis' values, (k,); None if they are no numbers.
         labels: k of them.
-        series: by name k estimates.
+        series: by name k estimates; None where there is none.
         axis: its title.
         metric: the metric.
     """
@@ -136,7 +136,8 @@ def curve_figure(
     for i, (label, estimates) in enumerate(series.items()):
         style = _style(i)
         mean, half = (
-            np.array([getattr(estimates[j], name) for j in order]) for name in ("mean", "halfwidth")
+            np.array([getattr(estimates[j], name, np.nan) for j in order])
+            for name in ("mean", "halfwidth")
         )
         mean, half = np.where(np.isfinite(mean), mean, np.nan), np.where(np.isfinite(half), half, 0)
         axes.plot(at[order], mean, markersize=4, **style)
@@ -147,7 +148,7 @@ def curve_figure(
     if x is None:
         axes.set_xticks(at, [plain(label) for label in labels])
     axes.set(xlabel=plain(axis, _LONGEST_LABEL), ylabel=METRICS[metric].label)
-    _scale(axes, "y", [e for estimates in series.values() for e in estimates], metric)
+    _scale(axes, "y", [e for estimates in series.values() for e in estimates if e], metric)
     legend(axes, shown)
     finish(axes)
     return figure
@@ -247,13 +248,12 @@ def _curve(summary: Summary, found: Sequence[Found], wanted: plan.Curve) -> tupl
     axis = summary.campaign.by_name[wanted.x]
     numbers = None if axis.numbers is None else np.array(axis.numbers)
     place = summary.campaign.axes.index(axis)
-    series: dict[str, list[Estimate]] = {}
-    kept: list[int] = []
+    kept = sorted({one.point.place[place] for one in found if wanted.metric in one.estimates})
+    series: dict[str, list[Estimate | None]] = {}
     for label, group in _series(summary, found, (wanted.x, *wanted.where)):
-        those = [one for one in group if wanted.metric in one.estimates]
-        if those:
-            series[label] = [one.estimates[wanted.metric] for one in those]
-            kept = [one.point.place[place] for one in those]
+        known = {one.point.place[place]: one.estimates.get(wanted.metric) for one in group}
+        if any(known.values()):
+            series[label] = [known.get(i) for i in kept]
     figure = curve_figure(
         None if numbers is None else numbers[kept],
         [axis.labels[i] for i in kept],

@@ -1,8 +1,10 @@
 """From a campaign file to the points of its grid, each a scenario and what its runs share."""
 
 import copy
-from collections.abc import Mapping
+import pickle
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from cosim.batch.api import Setting, run_batch, setting_of
 from cosim.campaign.draws import Box, box_of
 from cosim.campaign.metrics import certified_error
 from cosim.campaign.plan import Campaign, Value
+from cosim.exact.fates import timeless
 from cosim.shipped import find_shipped
 from noack import toml_file
 from noack.errors import CallerError
@@ -62,8 +65,17 @@ def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
     Raises:
         CallerError: it cannot be read, or a setting does not fit.
     """
-    beside = path.parent / campaign.scenario
-    scenario = beside if beside.is_file() else find_shipped(campaign.scenario, SCENARIOS)
+    source = f'{path}: scenario = "{campaign.scenario}"'
+    scenario = path.parent / campaign.scenario
+    if not scenario.is_file():
+        if scenario.suffix == ".toml" or scenario.exists():
+            raise CallerError(
+                f"{source}: no such file; it lies beside the campaign's, or is shipped"
+            )
+        try:
+            scenario = find_shipped(campaign.scenario, SCENARIOS)
+        except CallerError as error:
+            raise CallerError(f"{path}: scenario: {error}") from None
     content = toml_file.read(scenario)
     for key, value in campaign.settings.items():
         put(content, key, value, f"{path}: settings.{key}")
@@ -96,7 +108,22 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
             for axis, i in chosen
         }
         points.append(_point(campaign, number, place, labels, values, scenario, source))
+    _require_effects(campaign, points, path)
     return points
+
+
+def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
+    """Refuse an axis two of whose values are the same runs: what it sets plays no part in them."""
+    runs = {point.place: blake2b(pickle.dumps(point.work)).digest() for point in points}
+    for i, axis in enumerate(campaign.axes):
+        found: dict[bytes, str] = {}
+        for value, label in enumerate(axis.labels):
+            same = b"".join(content for place, content in runs.items() if place[i] == value)
+            if (other := found.setdefault(same, label)) != label:
+                raise CallerError(
+                    f"{path}: axes.{i}: {axis.name} = {other} and {axis.name} = {label} are the "
+                    f"same runs: what {', '.join(axis.keys)} says there makes no difference to them"
+                )
 
 
 def _point(
@@ -112,17 +139,32 @@ def _point(
     n, m = scenario.model.dimensions
     try:
         resolved = resolve(scenario)
+        _require_timeless(resolved)
         Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
         R = _weight(metrics.R, "metrics.R", m, "one row per input")
+        setting = replace(
+            setting_of(resolved), Q=Q, R=R, settle=metrics.settle, most_events=metrics.most_events
+        )
     except (CallerError, ValueError) as error:
         raise CallerError(f"{source}: {error}") from None
-    setting = replace(
-        setting_of(resolved), Q=Q, R=R, settle=metrics.settle, most_events=metrics.most_events
-    )
     work = Work(setting, box_of(scenario), campaign.seed)
     return Point(number, place, labels, values, scenario, certified_error(resolved), work)
 
 
+def _require_timeless(scenario: Scenario) -> None:
+    network = scenario.network
+    kept = timeless(network.link).impairments
+    taking_time = [one.kind for one in network.link.impairments if one not in kept]
+    if taking_time:
+        raise CallerError(
+            f"network.impairments: {', '.join(taking_time)}: in a campaign the network takes "
+            'no time; leave it out, e.g. settings = { "network.impairments" = [] }'
+        )
+
+
 def _weight(rows: Rows | None, key: str, size: int, why: str) -> Matrix | None:
     require_shape(rows, key, (size, size), why)
-    return None if rows is None else np.array(rows)
+    weight = None if rows is None else np.array(rows)
+    if weight is not None and not np.array_equal(weight, weight.T):
+        raise ValueError(f"{key}: must be symmetric")
+    return weight

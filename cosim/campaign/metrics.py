@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.batch.status import OK
 from noack.linear import Vector
 from noack.resolve import loop_of
 from noack.scenario import Scenario
@@ -62,18 +63,20 @@ METRICS: Mapping[Metric, Description] = {
 
 
 def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> dict[Metric, Vector]:
-    """All metrics of some runs; infinite is what does not happen, or not before a run fails.
+    """All metrics of some runs; infinite is what does not happen, and all of a run that fails.
 
     Args:
         columns: what the batch engine says of k runs, (k,) each.
         certified: Δβ; without it there is no ``certificate_used``.
     """
     found: dict[Metric, Vector] = {}
+    failed = columns["status"] != OK
     for name in METRICS:
         if name in columns:
             values = np.asarray(columns[name], dtype=np.float64)
-            found[name] = np.where(np.isnan(values), np.inf, values)
-    found["lost_share"] = 1.0 - found["deliveries"] / np.maximum(found["transmissions"], 1.0)
+            found[name] = np.where(np.isnan(values) | failed, np.inf, values)
+    arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
+    found["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)
     if certified is not None:
         found["certificate_used"] = found["sup_e_c_scaled"] / certified
     return found

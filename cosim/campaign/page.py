@@ -43,8 +43,8 @@ def page(summary: Summary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> s
         subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
         f"seed {campaign.seed}",
         verdict=verdict(summary),
-        tone="bad" if summary.breaches else "doubt" if any(_ended(summary)) else "good",
-        remarks=list(_ended(summary)),
+        tone="bad" if summary.breaches else "doubt" if any(unfinished(summary)) else "good",
+        remarks=list(unfinished(summary)),
         figures=[
             (one.name, Markup(inline(one.figure, one.name, one.caption)), one.caption)
             for one in drawn
@@ -112,7 +112,7 @@ def written(estimate: Estimate) -> str:
     return text.replace("-", "−")
 
 
-def _ended(summary: Summary) -> Iterator[str]:
+def unfinished(summary: Summary) -> Iterator[str]:
     """Of grid points where not all runs reached the horizon."""
     for found in summary.found:
         others = {how: count for how, count in found.ended.items() if how != "finished"}

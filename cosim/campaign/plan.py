@@ -6,7 +6,7 @@ Settings are those of a scenario, as after ``--set``: a key with dots, in quotes
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -32,7 +32,23 @@ def label_of(value: JsonValue) -> str:
     """How a value of an axis is written."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | None:
+    """A key and the later one that replaces its value, or the table that it lies in."""
+    pairs = itertools.product(before, after)
+    return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
+
+
+def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
+    keys = list(settings)
+    for i in range(1, len(keys)):
+        if (lost := replaced(keys[:i], keys[i : i + 1])) is not None:
+            raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which stands before it")
 
 
 class Axis(Section):
@@ -58,6 +74,8 @@ class Axis(Section):
             raise ValueError(f"{missing}: missing; key and values go together")
         if self.name in (*(ROW.names or ()), *METRICS, "draw"):
             raise ValueError(f"name: {self.name} is a column already; take another")
+        for name, settings in (self.variants or {}).items():
+            _require_kept(f"variants.{name}", settings)
         labels = self.labels
         twice = next((label for i, label in enumerate(labels) if label in labels[:i]), None)
         if twice is not None:
@@ -80,6 +98,11 @@ class Axis(Section):
         if self.variants is not None:
             return list(self.variants.values())
         return [{self.key or "": value} for value in self.values or ()]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """All keys that it sets."""
+        return tuple({key: None for settings in self.settings for key in settings})
 
     @property
     def numbers(self) -> list[float] | None:
@@ -223,6 +246,14 @@ class Campaign(Section):
             names = [axis.name for axis in self.axes]
             twice = next(i for i, name in enumerate(names) if name in names[:i])
             raise ValueError(f"axes.{twice}.name: there is such an axis already")
+        for i, axis in enumerate(self.axes):
+            for other in self.axes[:i]:
+                if (lost := replaced(other.keys, axis.keys)) is not None:
+                    raise ValueError(
+                        f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {other.name}; "
+                        "an axis that sets a whole table comes first, and no two set the same key"
+                    )
+        _require_kept("settings", self.settings)
         size = math.prod(len(axis.labels) for axis in self.axes)
         if size > MOST_POINTS:
             raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} may be")

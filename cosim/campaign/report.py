@@ -7,17 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cosim.campaign.figures import figures
 from cosim.campaign.metrics import METRICS
-from cosim.campaign.page import compared_row, found_row, page, verdict
+from cosim.campaign.page import compared_row, found_row, page, unfinished, verdict
 from cosim.campaign.store import RUNS, Store
 from cosim.campaign.summary import Summary
 from noack.errors import MachineError
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _MOST_ROWS = 40
+_MOST_REMARKS = 5
 
 
 def write_report(summary: Summary, store: Store, base: Mapping[str, Any]) -> list[Path]:
@@ -54,16 +56,21 @@ def print_summary(console: Console, summary: Summary) -> None:
         title = f"minus the same draw at {campaign.compare.axis} = {campaign.compare.reference}"
         tables.append((title, [compared_row(one, shown) for one in summary.compared]))
     for title, rows in tables:
-        table = Table(title=title, title_justify="left")
+        table = Table(title=escape(title), title_justify="left")
         for axis in campaign.axes:
-            table.add_column(axis.called)
+            table.add_column(escape(axis.called))
         for metric in shown:
-            table.add_column(METRICS[metric].heading, justify="right")
+            table.add_column(escape(METRICS[metric].heading), justify="right")
         for row in rows[:_MOST_ROWS]:
-            table.add_row(*row.labels, *row.cells)
+            table.add_row(*map(escape, row.labels), *row.cells)
         console.print(table)
         if len(rows) > _MOST_ROWS:
             console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
+    remarks = list(unfinished(summary))
+    for remark in remarks[:_MOST_REMARKS]:
+        console.print(remark, style="yellow", markup=False, highlight=False)
+    if len(remarks) > _MOST_REMARKS:
+        console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
     console.print(verdict(summary), style="bold red" if summary.breaches else "bold")
 
 

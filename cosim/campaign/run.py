@@ -1,9 +1,12 @@
 """Runs a campaign: what is missing in its folder is made; what is there stays."""
 
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
 
 from cosim.campaign.store import Store
-from cosim.campaign.workers import LostWorkersError, Runner
+from cosim.campaign.workers import LostWorkersError, OtherArithmeticError, Runner
 from noack.errors import ExitStatus, MachineError, NoackError
 
 Progress = Callable[[int, int], None]
@@ -16,6 +19,34 @@ class InterruptedCampaignError(NoackError):
     exit_status = ExitStatus.INTERRUPTED
 
 
+class TerminatedCampaignError(NoackError):
+    """The system, or who runs it, wanted it to end; what is written stays."""
+
+    exit_status = ExitStatus.TERMINATED
+
+
+@contextmanager
+def terminations_raised() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the work in good order, unless they are ignored.
+
+    Raises:
+        TerminatedCampaignError: one of them came.
+    """
+
+    def terminated(number: int, _: FrameType | None) -> None:
+        raise TerminatedCampaignError(f"ended by {signal.Signals(number).name}")
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    for number, handler in before.items():
+        if handler is signal.SIG_DFL:
+            signal.signal(number, terminated)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
     """Run what is missing; return how many runs that were.
 
@@ -26,6 +57,7 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
 
     Raises:
         InterruptedCampaignError: by Ctrl-C.
+        TerminatedCampaignError: by a signal, where :func:`terminations_raised`.
         LostWorkersError: workers have died.
         MachineError: the results cannot be written.
     """
@@ -52,6 +84,6 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
             tell(done, total)
     except KeyboardInterrupt:
         raise InterruptedCampaignError(told("interrupted")) from None
-    except LostWorkersError as error:
-        raise LostWorkersError(told(str(error))) from None
+    except (LostWorkersError, OtherArithmeticError, TerminatedCampaignError) as error:
+        raise type(error)(told(str(error))) from None
     return total - before

@@ -1,11 +1,12 @@
 """What the draws of a grid point say of a metric, and how surely.
 
-Means have normal confidence intervals, ±1.96 s/√k; they and their spread are of the finite values,
+Means have Student's confidence intervals, ± t s/√k; they and their spread are of the finite values,
 whose number is said. The median's interval is that of order statistics (binomial, free of any
 distribution) and counts what is infinite: a run that never settles is later than all others.
 """
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +14,6 @@ import numpy as np
 from noack.linear import Vector
 
 CONFIDENCE = 0.95
-_Z = 1.959963984540054
-"""97.5 % quantile of the normal distribution."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -46,10 +45,11 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         finite: those of them that count for the mean; all finite ones unless given.
     """
     finite = values[np.isfinite(values)] if finite is None else finite
-    mean = float(finite.mean()) if len(finite) else math.inf
-    halfwidth = (
-        _Z * float(finite.std(ddof=1)) / math.sqrt(len(finite)) if len(finite) > 1 else math.inf
-    )
+    mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
+    if len(finite) > 1:
+        with np.errstate(over="ignore"):  # the interval of numbers beyond 1e150 is infinite
+            deviation = float(finite.std(ddof=1))
+        halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
     ordered = np.sort(values)
     q05, q25, median, q75, q95 = (float(ordered[_rank(len(values), share)]) for share in QUANTILES)
     low, high = _median_ranks(len(values))
@@ -92,6 +92,14 @@ def difference(values: Vector, reference: Vector) -> Difference:
         float((values > reference).mean()),
         float((values < reference).mean()),
     )
+
+
+@cache
+def _student(count: int) -> float:
+    """What the standard error of a mean of so many values is multiplied by."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
 
 
 def _rank(count: int, share: float) -> int:

@@ -8,7 +8,8 @@ import contextlib
 import fcntl
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.batch.api import ROW
+from cosim.campaign.arithmetic import arithmetic, difference
 from cosim.campaign.grid import Point
 from cosim.campaign.plan import Campaign
 from noack.errors import CallerError, MachineError
@@ -26,6 +28,7 @@ RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
 _FORMAT = 1
 _PARTIAL = ".partial"
+MOST_FILES = 1_000_000
 
 
 class Chunk(NamedTuple):
@@ -49,9 +52,17 @@ class Store:
         points: of its grid.
         draws: runs at each point.
         size: draws in a chunk.
+
+    Raises:
+        CallerError: there would be too many files.
     """
 
     def __init__(self, folder: Path, points: Sequence[Point], draws: int, size: int) -> None:
+        if (count := len(points) * -(-draws // size)) > MOST_FILES:
+            raise CallerError(
+                f"draws = {draws}, chunk = {size}: the results would be {count:,} files; "
+                f"at most {MOST_FILES:,}: give fewer draws, or a larger chunk"
+            )
         self.folder, self.points, self.draws = folder, points, draws
         self._size = size
         self._schema = pa.schema(
@@ -95,7 +106,8 @@ class Store:
         scratch = path.with_name(f".{path.name}{_PARTIAL}")
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            pq.write_table(pa.table(columns, self._schema), scratch, compression="zstd")
+            table = pa.table(columns, self._schema)
+            pq.write_table(table, scratch, compression="zstd", write_page_checksum=True)
             scratch.replace(path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -112,9 +124,12 @@ class Store:
         for chunk in self.chunks(point):
             path = self._path(chunk)
             try:
-                table = pq.read_table(path, columns=list(names))
-            except (OSError, pa.ArrowException) as error:
-                raise MachineError(f"{path}: cannot be read: {error}") from None
+                table = pq.read_table(path, columns=list(names), page_checksum_verification=True)
+            except (OSError, pa.ArrowException):
+                raise MachineError(
+                    f"{path}: cannot be read, or is damaged; remove it, and the same command "
+                    "makes it again"
+                ) from None
             for name in names:
                 parts[name].append(table[name].to_numpy()[: len(chunk.draws)])
         return {name: np.concatenate(part) for name, part in parts.items()}
@@ -135,38 +150,60 @@ class Store:
 
 
 @contextmanager
-def opened(folder: Path, campaign: Campaign, base: Mapping[str, Any]) -> Iterator[None]:
+def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterator[None]:
     """Have a campaign's folder to oneself: a new one, or one of the same campaign.
 
-    What may differ is how many draws there are, and what is shown.
+    What may differ is how many draws there are, and what is shown; also what the arithmetic
+    depends on, if nothing is to be made any more.
 
     Args:
-        folder: the folder.
         campaign: the campaign.
         base: content of the scenario that all runs start from.
+        store: its folder.
 
     Raises:
-        CallerError: it holds another campaign, or someone else is at work in it.
+        CallerError: it holds another campaign, or one made by another arithmetic, or someone else
+            is at work in it.
         MachineError: it cannot be made.
     """
-    manifest = {"format": _FORMAT, "campaign": _identity(campaign), "scenario": base}
+    folder = store.folder
+    manifest = {
+        "format": _FORMAT,
+        "campaign": _identity(campaign),
+        "scenario": base,
+        # What the scenario's files say, and its defaults, is not in what stands above.
+        "scenario_resolved": blake2b(
+            "".join(point.scenario.model_dump_json() for point in store.points).encode(),
+            digest_size=16,
+        ).hexdigest(),
+        "arithmetic": arithmetic(),
+    }
     manifest = json.loads(json.dumps(manifest, default=str))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / _LOCK).open("a") as lock:
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / _LOCK).open("a"))
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise CallerError(f"{folder}: another noack is at work in it") from None
-            _claim(folder, manifest)
+            made_by = _claim(folder, manifest)
             for scratch in (folder / RUNS).glob(f"*/.*{_PARTIAL}"):
                 scratch.unlink(missing_ok=True)
-            yield
-    except OSError as error:
-        raise MachineError(f"{folder}: cannot be written: {error.strerror or error}") from None
+        except OSError as error:
+            reason = error.strerror or error
+            raise MachineError(f"{folder}: cannot be written: {reason}") from None
+        other = difference(made_by, arithmetic())
+        if other is not None and next(store.missing(), None) is not None:
+            raise CallerError(
+                f"{folder}: cannot be gone on with, results would not be of one piece "
+                f"({other}); give another --out, or remove it"
+            )
+        yield
 
 
-def _claim(folder: Path, manifest: Mapping[str, Any]) -> None:
+def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
+    """Make the folder this campaign's; return the arithmetic that its runs are made by."""
     path = folder / MANIFEST
     try:
         there = json.loads(path.read_text(encoding="utf-8"))
@@ -178,14 +215,18 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> None:
         scratch = path.with_name(f".{path.name}{_PARTIAL}")
         scratch.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         scratch.replace(path)
-        return
+        return dict(manifest["arithmetic"])
     except ValueError:
-        raise CallerError(f"{path}: not a campaign's; give another --out") from None
-    found = _difference(there, manifest)
+        there = None
+    if not isinstance(there, dict) or not isinstance(there.get("arithmetic"), dict):
+        raise CallerError(f"{path}: not a campaign's; give another --out")
+    made_by: dict[str, str] = there.pop("arithmetic")
+    found = _difference(there, {k: v for k, v in manifest.items() if k != "arithmetic"})
     if found is not None:
         raise CallerError(
             f"{folder}: holds another campaign ({found}); give another --out, or remove it"
         )
+    return made_by
 
 
 def _identity(campaign: Campaign) -> dict[str, Any]:

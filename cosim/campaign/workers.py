@@ -5,24 +5,23 @@ Either way chunks are independent, and their results come back here to be writte
 
 import logging
 import math
-import multiprocessing
-import os
-import signal
-import threading
+import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
-from concurrent.futures.process import BrokenProcessPool, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from itertools import islice
-from multiprocessing.connection import Connection
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.campaign.arithmetic import arithmetic, difference
 from cosim.campaign.grid import Point, Work
 from cosim.campaign.store import Chunk
+from cosim.pool import interrupts_held, processes
 from noack.errors import CallerError, PeerError
 
 Finished = tuple[Chunk, NDArray[np.void]]
@@ -35,9 +34,10 @@ _LOOK_EVERY_S = 1.0
 _PATIENCE_S = 30.0
 _CONNECT_S = 10.0
 _CONNECT_TRIES = 3
-_ONE_THREAD = dict.fromkeys(
-    ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+
+
+class OtherArithmeticError(PeerError):
+    """A worker's results would not be the same, bit for bit."""
 
 
 class LostWorkersError(PeerError):
@@ -56,43 +56,28 @@ def local(workers: int) -> Iterator[Runner]:
     if workers == 1:
         yield alone
         return
-    # A fork would inherit whatever threads the libraries have started.
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)  # for the children, who inherit it
-    pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
+    with processes(workers) as pool:
 
-    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        try:
-            yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
-        except BrokenProcessPool:
-            raise LostWorkersError(
-                "a worker process was killed (was there not enough memory?)"
-            ) from None
+        def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+            try:
+                yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
+            except BrokenProcessPool:
+                raise LostWorkersError(
+                    "a worker process was killed (was there not enough memory?)"
+                ) from None
 
-    try:
         yield run
-        pool.shutdown()
-    finally:
-        ours.close()  # ends those that are still at work
-        pool.shutdown(cancel_futures=True)
-        theirs.close()
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
-def _depend_on(parent: Connection) -> None:
-    """No worker outlives the parent's end of the pipe."""
-
-    def follow() -> None:
-        parent.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
+def _require_address(address: str) -> None:
+    """Dask's client begins to work before it looks at an address, and is long in ending."""
+    try:
+        parts = urlsplit(address if "://" in address else f"tcp://{address}")
+        known = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
+    except ValueError:
+        known = False
+    if not known:
+        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT")
 
 
 def _client(connect: Any, address: str) -> Any:
@@ -108,9 +93,26 @@ def _client(connect: Any, address: str) -> Any:
         ) from None
 
 
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np.void]:
+    """Run some draws on another machine.
+
+    Raises:
+        OtherArithmeticError: its results would be others than those of who asks.
+    """
+    if (other := difference(arithmetic(), wanted)) is not None:
+        raise OtherArithmeticError(
+            f"a worker on {socket.gethostname()} would give other results: {other}"
+        )
+    return work.run(draws)
+
+
 @contextmanager
-def cluster(address: str) -> Iterator[Runner]:
+def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
     """Run chunks on the Dask cluster of a scheduler; the workers need this noack, too.
+
+    Args:
+        address: of the scheduler.
+        say: is told, in a line, what the cluster is waited for.
 
     Raises:
         CallerError: Dask is not installed, or the address is none.
@@ -122,6 +124,7 @@ def cluster(address: str) -> Iterator[Runner]:
         raise CallerError(
             "--scheduler needs Dask, which is not installed: pip install 'noack[cluster]'"
         ) from None
+    _require_address(address)
     for name in list(logging.root.manager.loggerDict):
         if name.startswith("distributed"):  # what is to be said of its troubles is said below
             logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -129,14 +132,14 @@ def cluster(address: str) -> Iterator[Runner]:
         client = _client(distributed.Client, address)
     except (OSError, TimeoutError):
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
-    except (ValueError, TypeError) as error:
-        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT: {error}") from None
 
     def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-        watch = _Watch(client, address)
+        watch = _Watch(client, address, say)
         executor: Executor = client.get_executor(pure=False)
         try:
-            yield from _windowed(executor, points, chunks, watch)
+            yield from _windowed(executor, points, chunks, watch, arithmetic())
+        except OtherArithmeticError as error:
+            raise OtherArithmeticError(f"{address}: {error}") from None
         except (ImportError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and "deserializ" not in str(error):
                 raise
@@ -160,10 +163,12 @@ class _Watch:
     Args:
         client: of the cluster.
         address: of its scheduler.
+        say: is told what is waited for.
     """
 
-    def __init__(self, client: Any, address: str) -> None:
-        self._client, self._address = client, address
+    def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
+        self._client, self._address, self._say = client, address, say
+        self._told = False
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
     def __call__(self) -> int:
@@ -180,22 +185,16 @@ class _Watch:
                 raise LostWorkersError(f"{self._address}: the scheduler is gone") from None
             self._looked_s = now_s
             if self._cores:
-                self._seen_s = now_s
+                self._seen_s, self._told = now_s, False
+            elif not self._told:
+                self._told = True
+                self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
-                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s"
+                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
+                    "(those with an older noack end at once)"
                 )
         return max(_AHEAD * self._cores, 1)
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back: what is started meanwhile never hears of it, only the parent decides."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _windowed(
@@ -203,14 +202,19 @@ def _windowed(
     points: Sequence[Point],
     chunks: Iterable[Chunk],
     most: Callable[[], int],
+    wanted: Mapping[str, str] | None = None,
 ) -> Iterator[Finished]:
     """Keep so many chunks under way, so that memory does not grow with the campaign."""
     rest = iter(chunks)
     under_way: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(under_way), 0)):
-            with _interrupts_held():
-                future = executor.submit(Work.run, points[chunk.point].work, chunk.draws)
+            task = (points[chunk.point].work, chunk.draws)
+            with interrupts_held():
+                future = (
+                    executor.submit(Work.run, *task) if wanted is None
+                    else executor.submit(run_alike, *task, wanted)
+                )  # fmt: skip
             under_way[future] = chunk
         if not under_way:
             return

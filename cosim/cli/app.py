@@ -76,7 +76,8 @@ def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Calla
         def reported(*arguments: Any, **options: Any) -> None:
             try:
                 status = function(*arguments, **options)
-                sys.stdout.flush()
+                if sys.stdout is not None:  # a shell's >&- gives a program none
+                    sys.stdout.flush()
             except NoackError as error:
                 status = _failed(str(error), error.exit_status)
             except OSError as error:  # standard output is a full disk or a closed pipe

@@ -9,6 +9,9 @@ from rich.console import Console
 from cosim.cli.app import CAMPAIGNS, DEFAULT_RUNS, JsonOption, command, cores, print_json
 from noack.errors import CallerError, ExitStatus
 
+_PER_CORE = 4
+"""More processes gain nothing, and cost memory."""
+
 
 @command(CAMPAIGNS)
 def campaign(
@@ -38,7 +41,7 @@ def campaign(
     from cosim.campaign.grid import base_of, grid
     from cosim.campaign.plan import load
     from cosim.campaign.report import print_summary, write_report
-    from cosim.campaign.run import run_campaign
+    from cosim.campaign.run import run_campaign, terminations_raised
     from cosim.campaign.store import Store, opened
     from cosim.campaign.summary import summarise
     from cosim.campaign.workers import cluster, local
@@ -49,13 +52,21 @@ def campaign(
         raise CallerError("--workers: with --scheduler the cluster's workers are taken")
     path = find_shipped(file, "campaigns")
     plan = load(path)
-    points = grid(plan, path)
+    console = PatientConsole(stderr=True)
+    with console.status("preparing the grid"):
+        points = grid(plan, path)
     _, base = base_of(plan, path)
     folder = out or DEFAULT_RUNS / "campaigns" / plan.name
     store = Store(folder, points, draws or plan.draws, plan.chunk)
-    console = PatientConsole(stderr=True)
-    with opened(store.folder, plan, base):
-        runners = local(workers or cores()) if scheduler is None else cluster(scheduler)
+    workers = workers or cores()
+    if workers > (most := _PER_CORE * cores()):
+        raise CallerError(f"--workers {workers}: on this machine at most {most}")
+
+    def say(line: str) -> None:
+        console.print(f"noack: {line}", highlight=False, markup=False, soft_wrap=True)
+
+    with terminations_raised(), opened(plan, base, store):
+        runners = local(workers) if scheduler is None else cluster(scheduler, say)
         with runners as runner, runs_bar(console) as progress:
             made = run_campaign(store, runner, progress)
         with console.status("summarising"):

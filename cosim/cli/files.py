@@ -25,8 +25,10 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
     from cosim.tables import print_assumptions
     from noack.resolve import resolve
     from noack.theory.assumptions import assumptions
+    from noack.trigger.choose import policy_of
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
+    policy_of(resolved)  # some need a stable loop
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     print_assumptions(Console(stderr=True), verdicts)
     if json:

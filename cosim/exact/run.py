@@ -140,7 +140,7 @@ def simulate_continuous(
         if len(before) >= max_events or (before and event.t_s <= before[-1].t_s):
             raise TooManyEventsError(
                 f"trigger: event {len(before)} at {event.t_s:.9g} s is one too many: the events "
-                "accumulate; a stable loop, a larger beta or a floor would keep them apart"
+                "accumulate; a stable loop, a larger threshold or a floor would keep them apart"
             )
     return ContinuousRun(
         system, horizon_s, start, tuple(before), tuple(after), np.array(fates, bool), diverged_at_s

@@ -1,17 +1,13 @@
 """Simulates all draws of all conditions, on several cores."""
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 from cosim.paper.bounds import Certified, Printed, certified, printed
 from cosim.paper.conditions import BASE, CONDITIONS, Condition, load_condition
 from cosim.paper.measure import Draw, Measures, measure_draw
+from cosim.pool import interrupts_held, processes
 from noack.scenario import Scenario
 
 Row = tuple[float, ...]
@@ -106,27 +102,10 @@ def _work(tasks: Sequence[_Task], workers: int) -> Iterator[list[Row]]:
     if workers == 1:
         yield from (rows_of(*task) for task in tasks)
         return
-    # A fork would inherit whatever threads the libraries have started.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _depend_on_the_parent) as pool:
-        try:
-            yield from pool.map(_rows_of, tasks)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _depend_on_the_parent() -> None:
-    """It decides what an interrupt means, and no worker outlives it, however it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
+    with processes(workers) as pool:
+        with interrupts_held():
+            rows = pool.map(_rows_of, tasks)
+        yield from rows
 
 
 def _rows_of(task: _Task) -> list[Row]:

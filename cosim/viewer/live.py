@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FrameType
 
 from cosim.viewer.server import RecordingServer, end_process
-from noack.errors import CallerError, MachineError
+from noack.errors import CallerError, ExitStatus, MachineError
 
 _PATIENCE_S = 5.0
 _WINDOW = "window"
@@ -116,9 +116,12 @@ def view_recording(path: Path) -> None:
     Raises:
         CallerError: there is no such file.
         MachineError: the viewer cannot be started.
+        SystemExit: by SIGTERM or SIGHUP.
     """
     if not path.is_file():
         raise CallerError(f"{path}: no such recording")
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:
         window = server.open_window() if has_display() else None
         if window is not None:
@@ -130,11 +133,7 @@ def view_recording(path: Path) -> None:
 
 def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
     """Serve a growing file: say where it is shown, then obey ``commands`` until their end."""
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        sys.exit(0)
-
-    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGTERM, _exit)
     if hasattr(os, "nice"):
         os.nice(10)  # the processes of the run come first
     with RecordingServer(path, follow=True) as server:
@@ -148,6 +147,10 @@ def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
         if keep:
             threading.Event().wait()
         server.drain()
+
+
+def _exit(_number: int, _frame: FrameType | None) -> None:
+    sys.exit(ExitStatus.TERMINATED)
 
 
 def _main() -> int:

@@ -5,15 +5,19 @@ to each viewer at that viewer's pace.
 """
 
 import contextlib
+import ctypes
 import http.client
 import importlib.util
 import os
+import signal
 import socket
 import socketserver
 import subprocess
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, Self
@@ -28,6 +32,7 @@ _BLOCK = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
 _DRAIN_S = 2.0
+_PR_SET_PDEATHSIG = 1
 
 
 class RecordingServer:
@@ -214,6 +219,8 @@ def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) ->
 def _start_viewer(
     arguments: list[str], *, start_new_session: bool = False
 ) -> subprocess.Popen[bytes]:
+    """Start rerun's program; unless it is a session of its own, it ends when this process does."""
+    tied = sys.platform == "linux" and not start_new_session
     return subprocess.Popen(
         [_viewer_program(), *arguments],
         env=os.environ | {"CI": "1"},  # keeps it quiet
@@ -221,7 +228,14 @@ def _start_viewer(
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=start_new_session,
+        preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGTERM) if tied else None,
     )
+
+
+def _prctl() -> Callable[[int, int], int]:
+    """Linux's; looked up here, as little as possible is to be done in a child."""
+    prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
+    return prctl
 
 
 def _viewer_program() -> str:

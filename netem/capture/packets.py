@@ -22,10 +22,9 @@ Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Events = NDArray[np.void]
 _Function = TypeVar("_Function", bound=Callable[..., Any])
-_compiled = cast(
-    Callable[[_Function], _Function],
-    compiler(cache_folder("capture", [Path(__file__)]), nogil=True),
-)
+FOLDER = cache_folder("capture", [Path(__file__)])
+"""Where what is compiled is kept; None if it is not."""
+_compiled = cast(Callable[[_Function], _Function], compiler(FOLDER, nogil=True))
 _integer = cast(Callable[[Any], int], np.int64)  # unsigned and signed would make a float
 _part = cast(Callable[[_Function], _Function], numba.njit)
 

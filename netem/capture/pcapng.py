@@ -25,7 +25,15 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.capture.packets import MAX_HEADER_BYTES, Bytes, Events, blocks_bytes, put_blocks
+from netem.capture.packets import (
+    FOLDER,
+    MAX_HEADER_BYTES,
+    Bytes,
+    Events,
+    blocks_bytes,
+    put_blocks,
+)
+from netem.code_cache import is_kept, say_compiling
 from netem.events import EVENT
 
 SNAP_BYTES = 262_144
@@ -67,6 +75,8 @@ class Section:
         self._start_ns = 0
         self._end_ns = 0
         self._out = np.empty(0, np.uint8)
+        if not is_kept(FOLDER, put_blocks):
+            say_compiling("the capture", kept=FOLDER is not None)
         self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
 
     def header(self) -> bytes:

@@ -3,7 +3,8 @@
 import ctypes
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from functools import cache
 
 import numpy as np
 
@@ -39,6 +40,7 @@ from netem.engine.unreachable import Unreachable
 from netem.records import Counters, Verdict, dtype_of
 from noack.errors import CallerError
 from noack.impairments import LinkSettings
+from noack.io.udp import LOOPBACK
 
 _PERIOD_NS = 20_000_000
 _RARELY_NS = 250_000_000
@@ -111,7 +113,6 @@ class BatchedRelay:
         self._rarely_ns = 0
         self.began_unix_ns: int | None = None
         """Unix time at which the relay began to run, to which its times refer."""
-        self._load()
 
     def addresses(self) -> Mapping[str, Address]:
         """Where each link listens."""
@@ -206,8 +207,8 @@ class BatchedRelay:
             else:
                 self._clients.stamp_arrivals(place // 2)
 
-    def _load(self) -> None:
-        """Call every compiled function once, so that no datagram has to wait for its loading."""
+    def call_all(self) -> None:
+        """Call every compiled function once, which loads it."""
         self._run_pump(_LONG_AGO_NS)
         memory, way = self._memory.memory, self._ways[0]
         self._functions.insert(memory.table, memory.clients, 0, memory.in_names[0])
@@ -304,3 +305,12 @@ def _shortest_timer_slack() -> Iterator[None]:
     finally:
         if slack_ns > 0:
             libc.prctl(_PR_SET_TIMERSLACK, slack_ns, 0, 0, 0)
+
+
+@cache
+def load() -> None:
+    """Load or compile all that is compiled, once; what came to an open port would wait for it."""
+    nothing = LinkSettings()
+    spec = LinkSpec("none", (LOOPBACK, 0), (LOOPBACK, 9), nothing, nothing)
+    with closing(BatchedRelay([spec])) as relay:
+        relay.call_all()

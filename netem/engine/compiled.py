@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import netem.engine.pump
 import netem.rules
-from netem import events, records
+from netem import code_cache, events, records
 from netem.code_cache import cache_folder, compiler
 from netem.engine import histogram
 from netem.program import new_flow
@@ -120,8 +120,7 @@ def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
 
 def is_kept(function: Callable[..., Any]) -> bool:
     """Whether a function has been compiled before, for this machine."""
-    folder = _prepare()
-    return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
+    return code_cache.is_kept(_prepare(), function)
 
 
 def keeps() -> bool:

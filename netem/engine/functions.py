@@ -4,11 +4,11 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
+from netem.code_cache import say_compiling
 from netem.engine.compiled import compile_rule, is_kept, keeps
 from netem.engine.pump.clients import insert, remove
 from netem.engine.pump.pump import run_pump
 from netem.rules.change import carry
-from netem.say import say
 
 
 class Functions(NamedTuple):
@@ -25,6 +25,5 @@ def functions() -> Functions:
     """Return them; say so if they have to be compiled, which takes a while."""
     sources: Any = (run_pump, insert, remove, carry)
     if not all(map(is_kept, sources)):
-        once = "once" if keeps() else "as the user's cache (XDG_CACHE_HOME) takes nothing"
-        say(f"compiling the relay for this machine, {once} ...")
+        say_compiling("the relay", keeps())
     return Functions(*map(compile_rule, sources))

@@ -41,8 +41,9 @@ def open_relay(
         raise CallerError(f"the batched engine {missing}; use the plain one")
     if engine == "plain" or missing:
         return PlainRelay(specs, taps)
-    from netem.engine.batched import BatchedRelay
+    from netem.engine.batched import BatchedRelay, load
 
+    load()
     return BatchedRelay(specs, segment, taps, spin_ns)
 
 

@@ -29,7 +29,8 @@ class Form(NamedTuple):
 
     def value(self, z: Vector) -> float:
         """‖P z‖² − ‖N z‖² of a z of shape (2n,)."""
-        return norm(self.up @ z) ** 2 - norm(self.down @ z) ** 2
+        up, down = norm(self.up @ z), norm(self.down @ z)
+        return up * up - down * down  # where a float's power would raise, its product is infinite
 
     def values(self, z: Matrix) -> Vector:
         """The same of k z, shape (k, 2n) → (k,)."""

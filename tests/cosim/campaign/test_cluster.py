@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from cosim.campaign.arithmetic import arithmetic
 from cosim.campaign.grid import Point, grid
 from cosim.campaign.plan import Campaign, load
 from cosim.campaign.run import run_campaign
@@ -16,6 +18,7 @@ from cosim.campaign.workers import alone, cluster
 from noack.errors import CallerError, PeerError
 
 from .conftest import Write
+from .test_store import files
 from .test_workers import contents
 
 distributed = pytest.importorskip("distributed")
@@ -24,16 +27,16 @@ START = "from distributed.cli.dask_{0} import main; main()"
 
 
 class Cluster:
-    """A scheduler and two workers."""
+    """A scheduler and workers."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, workers: int = 2) -> None:
         self._folder = folder
         scheduler = self.start("scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard")
         assert scheduler.stderr is not None
         line = next(line for line in scheduler.stderr if "Scheduler at:" in line)
         self.address = line.split()[-1]
         self.scheduler = scheduler
-        self.workers = [self.worker() for _ in range(2)]
+        self.workers = [self.worker() for _ in range(workers)]
 
     def worker(self) -> "subprocess.Popen[str]":
         return self.start(
@@ -92,6 +95,46 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     assert len(contents(there.folder)) == 120
 
 
+def test_a_worker_that_computes_otherwise_is_refused_and_named(
+    dask: Cluster, tmp_path: Path, some: tuple[Campaign, list[Point]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    plan, points = some
+    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
+    other = {**arithmetic(), "numpy": "1.0"}
+    monkeypatch.setattr("cosim.campaign.workers.arithmetic", lambda: other)
+    with (
+        pytest.raises(PeerError) as found,
+        cluster(dask.address) as runner,
+    ):
+        run_campaign(store, runner)
+    text = str(found.value)
+    assert text.startswith(f"{dask.address}: a worker on ")
+    assert f"would give other results: numpy is {np.__version__} there, 1.0 here; 0 of" in text
+    assert files(store.folder) == {}
+
+
+def test_a_cluster_without_workers_is_waited_for_with_a_word_and_not_for_ever(
+    tmp_path: Path, some: tuple[Campaign, list[Point]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, points = some
+    said: list[str] = []
+    empty = Cluster(tmp_path, workers=0)
+    monkeypatch.setattr("cosim.campaign.workers._LOOK_EVERY_S", 0.1)
+    monkeypatch.setattr("cosim.campaign.workers._PATIENCE_S", 0.5)
+    try:
+        with (
+            pytest.raises(
+                PeerError, match=r"the cluster has had no worker for 0\.5 s \(.*\); 0 of 240"
+            ),
+            cluster(empty.address, said.append) as runner,
+        ):
+            run_campaign(Store(tmp_path / "out", points, plan.draws, plan.chunk), runner)
+    finally:
+        empty.close()
+    assert said == [f"{empty.address}: no worker; waiting 0.5 s for one"]
+
+
 def test_nobody_there_and_no_address_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cosim.campaign.workers._CONNECT_S", 0.5)
     with (
@@ -99,8 +142,9 @@ def test_nobody_there_and_no_address_are_one_line(monkeypatch: pytest.MonkeyPatc
         cluster("tcp://127.0.0.1:9"),
     ):
         pass
-    with pytest.raises(CallerError, match="write it as tcp://HOST:PORT"), cluster("nonsense://x"):
-        pass
+    for address in ("nonsense://x:1", "foo", "", "tcp://x", "tcp://x:abc", "tcp://x:99999"):
+        with pytest.raises(CallerError, match="write it as tcp://HOST:PORT"), cluster(address):
+            pass
 
 
 def test_without_dask_the_way_to_get_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

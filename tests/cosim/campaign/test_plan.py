@@ -46,6 +46,25 @@ def test_a_key_with_dots_sets_a_value_and_one_without_a_whole_table(
     assert (whole.beta, whole.alpha_per_s, whole.floor) == (2.0, 1.0, 0.0)
 
 
+def test_an_axis_of_tables_goes_before_one_of_their_keys(
+    write: Write, plan: dict[str, Any]
+) -> None:
+    variants = {"t": {"trigger": {"beta": 2.0, "alpha_per_s": 1.0}}, "f": {"trigger.floor": 0.1}}
+    tables = {"name": "trigger", "variants": variants}
+    key = {"name": "beta", "key": "trigger.beta", "values": [0.1, 0.3]}
+    path = write(plan, axes=[tables, key], compare=None, figures=[])
+    assert [p.scenario.trigger.beta for p in grid(load(path), path)] == [0.1, 0.3, 0.1, 0.3]
+    with pytest.raises(CallerError, match="an axis that sets a whole table comes first"):
+        load(write(plan, axes=[key, tables], compare=None, figures=[]))
+
+
+def test_values_that_differ_late_are_told_apart(write: Write, plan: dict[str, Any]) -> None:
+    values = [0.1, 0.1234567, 0.1234568]
+    plan["axes"][1]["values"] = values
+    labels = load(write(plan, figures=[])).axes[1].labels
+    assert labels == ["0.1", "0.1234567", "0.1234568"]
+
+
 def test_points_do_not_see_each_others_settings(write: Write, plan: dict[str, Any]) -> None:
     variants = {"a": {"trigger.floor": 0.02}, "b": {"mode": "zoh"}}
     path = write(plan, axes=[{"name": "v", "variants": variants}], compare=None, figures=[])
@@ -61,7 +80,20 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("axes.0.name", "cost", 'axes.0.name = "cost": cost is a column already'),
     ("axes.0.name", "beta", 'axes.1.name = "beta": there is such an axis already'),
     ("axes.1.key", None, "key: missing; key and values go together"),
+    ("axes.0.name", "Axis", "use small letters, digits and _, beginning with a letter"),
     ("axes.1.values", [1, 1.0], "1 is there twice"),
+    (
+        "axes.0.variants",
+        {"MB": {"mode": "model"}, "ZOH": {"mode": "zoh", "trigger.beta": 0.1}},
+        'axes.1.name = "beta": trigger.beta would replace trigger.beta of axis policy',
+    ),
+    ("axes.1.key", "mode", 'axes.1.name = "beta": mode would replace mode of axis policy'),
+    (
+        "axes.1",
+        {"name": "beta", "variants": {"a": {"trigger.beta": 0.1, "trigger": {}}}},
+        "axes.1.variants.a = {",
+    ),
+    ("settings", {"plant.draw": "nominal", "plant": {}}, "plant replaces plant.draw, which stands"),
     ("axes.1.values", list(range(1, 6000)), "the grid has 11998 points; at most 10000"),
     (
         "axes.1.variants",
@@ -113,6 +145,20 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(
             "at m = 1: trigger.betta = 1.0: unknown key; did you mean beta?",
         ),
         ({"settings": {"horizon_s.x": 1.0}}, "settings.horizon_s.x: horizon_s is not a table"),
+        (
+            {"axes": [{"name": "r", "key": "plant.rate_hz", "values": [100.0, 200.0]}]},
+            "axes.0: r = 100 and r = 200 are the same runs: what plant.rate_hz says there makes no",
+        ),
+        (
+            {"settings": {"network.impairments": [{"kind": "delay", "delay_s": 0.1}]}},
+            "at policy = MB, beta = 0.1: network.impairments: delay: in a campaign the network",
+        ),
+        (
+            {"settings": {"network.protocol": "ack"}},
+            "at policy = MB, beta = 0.1: network.protocol: this is for the loop without",
+        ),
+        ({"scenario": "none.toml"}, 'scenario = "none.toml": no such file'),
+        ({"metrics": {"Q": [[1.0, 2.0], [0.0, 1.0]]}}, "metrics.Q: must be symmetric"),
         ({"metrics": {"Q": [[1.0]]}}, "metrics.Q: expected 2 x 2 (one row per state)"),
         ({"metrics": {"R": [[1.0, 2.0]]}}, "metrics.R: expected 1 x 1 (one row per input)"),
     ],

@@ -11,15 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from cosim.batch.status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.campaign import figures as figures_module
 from cosim.campaign.figures import (
     curve_figure,
     distribution_figure,
+    figures,
     heat_map_figure,
     pareto_figure,
     undominated,
 )
-from cosim.campaign.grid import Point, base_of
+from cosim.campaign.grid import Point, base_of, grid
 from cosim.campaign.metrics import METRICS, certified_error, measured
 from cosim.campaign.page import page, written
 from cosim.campaign.plan import Campaign, load
@@ -98,12 +100,53 @@ def test_metrics_that_have_no_number_are_infinite_and_shares_are_derived() -> No
         "deliveries": np.array([4, 1]),
         "settling_s": np.array([1.5, math.nan]),
         "sup_e_c_scaled": np.array([0.5, 0.25]),
+        "status": np.array([OK, OK]),
     }
     found = measured(columns, 2.0)
     assert found["lost_share"].tolist() == [0.6, 0.0]
     assert found["settling_s"].tolist() == [1.5, math.inf]
     assert found["certificate_used"].tolist() == [0.25, 0.125]
     assert "certificate_used" not in measured(columns, None)
+
+
+@pytest.mark.parametrize("status", [DIVERGED, TOO_MANY_EVENTS])
+def test_a_run_that_fails_is_not_taken_for_one_that_transmits_little(status: int) -> None:
+    columns = {
+        "transmissions": np.array([10, 1]),
+        "deliveries": np.array([5, 0]),
+        "status": np.array([OK, status]),
+    }
+    found = measured(columns, None)
+    assert found["transmissions"].tolist() == [10.0, math.inf]
+    assert found["lost_share"].tolist() == [0.5, math.inf]
+    assert estimate(found["transmissions"]).mean == 10.0
+
+
+def test_a_curve_has_gaps_where_a_metric_is_not_known(
+    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the two models have a certificate for other values of α."""
+    plan["axes"] = [
+        {"name": "gain", "variants": {"weak": {"model.gain": [[-1.0, -2.0]]},
+                                      "strong": {"model.gain": [[-9.0, -6.0]]}}},
+        {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
+    ]  # fmt: skip
+    figure = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
+    path = write(plan | {"compare": None}, figures=[figure], draws=2)
+    campaign = load(path)
+    store = Store(tmp_path / "out", grid(campaign, path), 2, 3)
+    run_campaign(store, alone)
+    drawn: list[Any] = []
+    monkeypatch.setattr(figures_module, "curve_figure", lambda *given: drawn.append(given))
+    list(figures(summarise(campaign, store), store))
+    ((x, labels, series, *_),) = drawn
+    assert (x.tolist(), labels) == ([0.25, 2.0], ["0.25", "2"])
+    assert [e is None for e in series["weak"]] == [False, True]
+    assert [e is None for e in series["strong"]] == [False, False]
+    monkeypatch.undo()
+    (one,) = figures(summarise(campaign, store), store)
+    lines = [line.get_xydata() for line in one.figure.axes[0].lines]
+    assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
 
 
 def test_a_summary_is_of_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
@@ -223,7 +266,23 @@ def test_a_distribution_reaches_the_share_that_is_finite() -> None:
 
 
 def test_numbers_are_written_with_their_interval() -> None:
-    assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 2"
+    assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
     assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (in 50 %)"
     assert written(estimate(np.array([math.inf]))) == "never"
     assert set(METRICS) >= {"cost", "settling_s"}
+
+
+def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    name = "[/x] [red]"
+    plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
+    plan["axes"][1]["title"] = "[/b]"
+    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
+    out = str(tmp_path / "out")
+    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    assert result.exit_code == 0, result.output
+    assert name in result.stdout
+    assert "[/b]" in result.stdout
+    told = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import t as student
 
 from cosim.campaign.statistics import difference, estimate
 
@@ -14,7 +14,7 @@ def test_the_means_interval_is_the_textbooks() -> None:
     found = estimate(values)
     assert found.mean == 4.0
     deviation = math.sqrt(((values - 4.0) ** 2).sum() / 3)
-    assert found.halfwidth == pytest.approx(norm.ppf(0.975) * deviation / 2, rel=1e-12)
+    assert found.halfwidth == pytest.approx(student.ppf(0.975, 3) * deviation / 2, rel=1e-12)
     assert (found.median, found.q05, found.q95, found.largest) == (2.0, 1.0, 9.0, 9.0)
 
 
@@ -28,6 +28,17 @@ def test_intervals_contain_the_truth_as_often_as_they_say() -> None:
     # Standard deviation of a share: 0.005. A normal interval of a skewed law covers a little less.
     assert 0.92 < of_mean / trials < 0.97
     assert 0.94 < of_median / trials < 0.98
+
+
+@pytest.mark.parametrize("draws", [2, 3, 10])
+def test_the_intervals_of_few_draws_are_as_honest(draws: int) -> None:
+    """A normal interval of two draws contains the truth in 70 % of the cases only."""
+    values = np.random.default_rng(draws).normal(3.0, 2.0, (4000, draws))
+    hits = 0
+    for row in values:
+        found = estimate(row)
+        hits += abs(found.mean - 3.0) <= found.halfwidth
+    assert abs(hits / len(values) - 0.95) < 0.014  # four standard deviations of a share
 
 
 def test_what_never_happens_counts_for_quantiles_and_not_for_the_mean() -> None:

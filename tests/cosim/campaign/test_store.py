@@ -1,6 +1,7 @@
 """The campaign's folder: whole chunks or none, and no other campaign's."""
 
 import errno
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -114,8 +115,8 @@ def test_a_full_disk_is_one_line_and_leaves_whole_files_only(
 def changed_folder(write: Write, folder: Path, plan: dict[str, Any]) -> None:
     path = write(plan)
     campaign = load(path)
-    grid(campaign, path)
-    with opened(folder, campaign, base_of(campaign, path)[1]):
+    store = Store(folder, grid(campaign, path), campaign.draws, campaign.chunk)
+    with opened(campaign, base_of(campaign, path)[1], store):
         pass
 
 
@@ -168,10 +169,11 @@ def test_a_folder_in_use_and_a_folder_of_someone_else_are_refused(
     path = write(plan)
     campaign = load(path)
     base = base_of(campaign, path)[1]
+    store = Store(tmp_path / "out", grid(campaign, path), campaign.draws, campaign.chunk)
     with (
-        opened(tmp_path / "out", campaign, base),
+        opened(campaign, base, store),
         pytest.raises(CallerError, match="another noack is at work"),
-        opened(tmp_path / "out", campaign, base),
+        opened(campaign, base, store),
     ):
         pass
     (tmp_path / "mine" / "runs").mkdir(parents=True)
@@ -191,3 +193,64 @@ def test_what_a_kill_left_half_written_is_swept_away(
     left.write_bytes(b"PAR1")
     changed_folder(write, folder, plan)
     assert not left.exists()
+
+
+def test_a_damaged_page_is_one_line_that_says_how_to_mend_it(full: Store) -> None:
+    """Sums over what a disk has changed would be wrong in silence."""
+    path = full.folder / "runs" / "point-00001" / "draws-000000003.parquet"
+    whole = bytearray(path.read_bytes())
+    place = whole.find(np.float64(full.columns(1, ["cost"])["cost"][3]).tobytes())
+    assert place > 0
+    whole[place] ^= 1
+    path.write_bytes(whole)
+    with pytest.raises(MachineError, match="is damaged; remove it, and the same command makes it"):
+        full.columns(1, ["cost"])
+
+
+def test_what_a_file_of_the_scenario_says_is_part_of_the_campaign(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    (tmp_path / "lost.txt").write_text("0 1 1\n")
+    plan["settings"]["network.loss"] = {"model": "trace", "file": "lost.txt"}
+    changed_folder(write, tmp_path / "out", plan)
+    changed_folder(write, tmp_path / "out", plan)
+    (tmp_path / "lost.txt").write_text("0 1 0\n")
+    with pytest.raises(CallerError, match="holds another campaign"):
+        changed_folder(write, tmp_path / "out", plan)
+
+
+def test_runs_of_another_noack_are_shown_but_not_added_to(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    path, folder = write(plan), tmp_path / "out"
+    campaign = load(path)
+    store = Store(folder, grid(campaign, path), campaign.draws, campaign.chunk)
+    base = base_of(campaign, path)[1]
+    with opened(campaign, base, store):
+        run_campaign(store, alone)
+    manifest = json.loads((folder / "campaign.json").read_text())
+    manifest["arithmetic"]["numpy"] = "1.0"
+    (folder / "campaign.json").write_text(json.dumps(manifest))
+    with opened(campaign, base, store):
+        assert run_campaign(store, alone) == 0
+    more = Store(folder, store.points, 10, campaign.chunk)
+    with (
+        pytest.raises(CallerError, match=r"not be of one piece \(numpy is 1\.0 there"),
+        opened(campaign, base, more),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", "nonsense", '{"arithmetic": 3}'])
+def test_a_manifest_that_is_none_is_one_line(
+    write: Write, plan: dict[str, Any], tmp_path: Path, text: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "campaign.json").write_text(text)
+    with pytest.raises(CallerError, match=r"campaign\.json: not a campaign's; give another --out"):
+        changed_folder(write, tmp_path / "out", plan)
+
+
+def test_more_files_than_a_folder_can_bear_are_refused(campaign: Few, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"would be 400,000,000 files; .* or a larger chunk"):
+        Store(tmp_path, campaign[1], 100_000_000, 1)

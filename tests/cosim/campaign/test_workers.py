@@ -121,6 +121,25 @@ def test_ctrl_c_ends_it_with_one_line_that_says_how_to_go_on(start: Start, tmp_p
     assert psutil.wait_procs(children, timeout=10)[1] == []
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_all_ends_it_with_one_line(
+    start: Start, tmp_path: Path, number: signal.Signals
+) -> None:
+    process = start()
+    wait_for_files(tmp_path / "out", 5, process)
+    children = offspring(process)
+    os.killpg(process.pid, number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 143
+    lines = [line for line in err.splitlines() if line.startswith("noack: ")]
+    assert lines[0].startswith(f"noack: ended by {number.name}; ") or lines[0].startswith(
+        "noack: a worker process was killed"  # it may be the first to hear of it
+    )
+    assert lines[0].endswith("the same command goes on from there")
+    assert "Traceback" not in err
+    assert psutil.wait_procs(children, timeout=10)[1] == []
+
+
 def test_a_killed_worker_is_one_line_and_no_hang(start: Start, tmp_path: Path) -> None:
     process = start()
     wait_for_files(tmp_path / "out", 5, process)

@@ -23,7 +23,8 @@ from cosim.viewer import blueprint
 from cosim.viewer.live import LiveView, has_display, view_recording
 from cosim.viewer.recording import APPLICATION_ID, RunView, ViewError
 from cosim.viewer.server import RECORDING, RecordingServer
-from noack.errors import CallerError
+from noack.errors import CallerError, ExitStatus
+from tests.integration.conftest import wait_for
 
 ROOT = Path(__file__).parents[3]
 Floats = NDArray[np.float64]
@@ -591,7 +592,21 @@ def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> N
         view_recording(tmp_path / "run" / "recording.rrd")
 
 
-def test_viewing_without_a_display_serves_a_page_until_ctrl_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        (signal.SIGINT, 0),
+        (signal.SIGTERM, ExitStatus.TERMINATED),
+        (signal.SIGHUP, ExitStatus.TERMINATED),
+        pytest.param(
+            signal.SIGKILL, -signal.SIGKILL,
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="tells no child elsewhere"),
+        ),
+    ],
+)  # fmt: skip
+def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
+    tmp_path: Path, sent: int, status: int
+) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path).close()
     with another_process("t.view_recording(path)", path) as child:
@@ -599,9 +614,9 @@ def test_viewing_without_a_display_serves_a_page_until_ctrl_c(tmp_path: Path) ->
         page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
         assert get(page)[0] == 200
         assert get(recording_url(page)) == (200, path.read_bytes())
-        child.send_signal(signal.SIGINT)
-        assert child.wait() == 0
-        assert not is_left(child.pid)
+        child.send_signal(sent)
+        assert child.wait() == status
+        wait_for(lambda: not is_left(child.pid))
 
 
 @pytest.mark.parametrize("wanted", ["missing recording", "missing browser"])

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from netem.capture import pcapng
 from netem.capture.packets import put_blocks
 from netem.capture.pcapng import Interface, Section
 from noack.records import Fate
@@ -225,3 +226,13 @@ def test_missing_events_are_told_where_they_are_missing_and_at_the_end() -> None
 
 def test_formatting_lets_go_of_the_interpreter() -> None:
     assert put_blocks.targetoptions["nogil"]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_wait_for_the_compiler_is_explained(
+    kept: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pcapng, "is_kept", lambda folder, function: kept)
+    Section([Interface("a", "b")])
+    line = "noack netem: compiling the capture for this machine, once ...\n"
+    assert capsys.readouterr().err == ("" if kept else line)

@@ -1,0 +1,68 @@
+"""What the bits of results depend on besides the campaign: noack's code, libraries, arithmetic."""
+
+import platform
+from collections.abc import Mapping
+from functools import cache
+from hashlib import blake2b
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import expm
+
+import cosim
+import netem
+import noack
+
+_PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
+_CODE = (noack, netem, cosim)
+_NO_CODE_OF_RUNS = ("campaign", "cli", "design", "paper", "report", "viewer")
+
+
+@cache
+def arithmetic() -> Mapping[str, str]:
+    """Names and contents: where all are the same, so are the bits of the results.
+
+    ``rounding`` is a digest of what this processor's libraries make of a few fixed matrices: they
+    choose their instructions by what they find it to be capable of.
+    """
+    return {
+        **{name: metadata.version(name) for name in _PACKAGES},
+        "Python": ".".join(platform.python_version_tuple()[:2]),
+        "noack's code": _code(),
+        "machine": platform.machine(),
+        "rounding": _rounding(),
+    }
+
+
+def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
+    """The first thing that is another there, in words; None if nothing is."""
+    for name in here:
+        if there.get(name) != here[name]:
+            return f"{name} is {there.get(name, 'unknown')} there, {here[name]} here"
+    return None
+
+
+def _code() -> str:
+    digest = blake2b(digest_size=8)
+    for package in _CODE:
+        root = Path(str(package.__file__)).parent
+        for path in sorted(root.rglob("*.py")):
+            name = path.relative_to(root)
+            if package is not cosim or name.parts[0] not in _NO_CODE_OF_RUNS:
+                digest.update(path.read_bytes())
+    digest.update(Path(__file__).with_name("draws.py").read_bytes())
+    return digest.hexdigest()
+
+
+def _rounding() -> str:
+    entries = np.arange(1, 50) * 7919 % 101 - 50
+    matrix = entries.reshape(7, 7) / 64  # exact
+    parts = (
+        expm(matrix),
+        matrix @ matrix,
+        np.linalg.solve(matrix, matrix[:, :2]),
+        np.exp(matrix),
+        np.linalg.norm(matrix, axis=1),
+    )
+    return blake2b(b"".join(part.tobytes() for part in parts), digest_size=8).hexdigest()

@@ -1,0 +1,36 @@
+"""What all commands share."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+from typer.testing import CliRunner
+
+from cosim.cli import app
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell's redirection")
+def test_a_program_without_standard_output_ends_as_any_other() -> None:
+    command = f"'{sys.executable}' -m cosim.cli schema --json >&-"
+    done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("keys", [
+    {"policy": "lyapunov", "rate_per_s": 1.0},
+    {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5},
+])  # fmt: skip
+def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
+    tmp_path: Path, content: dict[str, Any], keys: dict[str, Any]
+) -> None:
+    content["trigger"] = keys
+    content["model"]["gain"] = [[3.0, 3.0]]
+    path = tmp_path / "unstable.toml"
+    path.write_text(tomli_w.dumps(content))
+    result = CliRunner().invoke(app, ["check", str(path)])
+    assert result.exit_code == 2
+    assert result.stderr.endswith("but Â + B̂K is not stable\n")
+    assert result.stdout == ""
