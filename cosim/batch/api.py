@@ -23,8 +23,8 @@ from noack.linear import Matrix, Vector
 from noack.resolve import loop_of
 from noack.rng import stream_keys
 from noack.scenario import Scenario
+from noack.trigger import forecast
 from noack.trigger.choose import policy_of
-from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.policy import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
@@ -51,9 +51,10 @@ inter_event_min_s, inter_event_mean_s: of the times between successive events; N
 settling_s: the last time at which ‖x‖ > settle ‖x(0)‖; NaN if it is so at the horizon.
 cost: ∫ xᵀQx + uᵀRu dt over the horizon, u = K x_c.
 sup_e_c_scaled: the supremum over the horizon of ‖W e_c‖ e^{αt}, the left limits at events included,
-to within 1e-10 of it (certified: no sample). Without a known start, e_c counts from event 0 on.
+to within 1e-10 of it (certified: no sample). Without a known start, e_c counts from event 0 on. α
+is that of a threshold that decays from the run's start on; of other policies it is 0.
 final_norm: ‖x‖ at the horizon.
-diverged_at_s: where a diverged run ends.
+diverged_at_s: where a diverged run ends, as in :mod:`cosim.exact.loop`.
 status: of :mod:`cosim.batch.status`; if it is not OK, the measures of the whole run are NaN.
 """
 
@@ -80,7 +81,6 @@ class Setting:
     K: Matrix
     """Gain, (m, n)."""
     trigger: Policy
-    """The paper's is compiled; runs of another are simulated one by one."""
     link: LinkSettings
     """Losses, corruption, and the cap; :func:`cosim.exact.fates.network_fates` has the same."""
     horizon_s: float
@@ -133,11 +133,6 @@ def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
             to lose.
         ValueError: matrices whose shapes do not fit.
     """
-    if not isinstance(setting.trigger, DecayingTrigger):
-        from cosim.batch.others import run_others
-
-        _check(setting, population)
-        return run_others(setting, population)
     rows, _ = _run(setting, population, 0)
     return rows
 
@@ -158,28 +153,23 @@ def run_events(setting: Setting, population: Population) -> Events:
 
 def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[np.void], Any]:
     from cosim.batch import lanes, run
+    from cosim.batch.rule import rule_of
+    from cosim.batch.squares import squares_of
     from cosim.batch.taylor import DEGREES, HIGHEST
 
     _check(setting, population)
     n, m = len(setting.H), len(setting.K)
-    trigger, terms = setting.trigger, HIGHEST + 1
-    if not isinstance(trigger, DecayingTrigger):
-        raise TypeError("only the paper's trigger is compiled")
-    floor_from_s = math.inf
-    if trigger.floor > 0:
-        floor_from_s = math.log(trigger.beta / trigger.floor) / trigger.alpha_per_s
+    guards, terms = setting.trigger.guards(n), HIGHEST + 1
     system = run.System(
         H=_columns(setting.H),
         K=_columns(setting.K),
-        weight=_columns(trigger.weight),
+        weight=_columns(setting.trigger.weight),
         Q=_columns(setting.Q),
         R=_columns(setting.R),
         inverse=np.append(0.0, 1.0 / np.arange(1.0, 2 * terms + 1)),
         H_k=np.empty((terms + 1) * n * n),
-        beta=float(trigger.beta),
-        alpha_per_s=float(trigger.alpha_per_s),
-        floor=float(trigger.floor),
-        floor_from_s=floor_from_s,
+        rule=rule_of(guards),
+        fading_per_s=0.0 if guards.from_event else float(guards.rate_per_s),
         horizon_s=float(setting.horizon_s),
         known_start=bool(setting.known_start),
         first_delivered=setting.link.first_delivered,
@@ -202,14 +192,16 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         measured_s=np.empty(len(DEGREES)),
         u=np.empty(terms * m),
         u_scaled=np.empty(terms * m),
+        squares=np.empty(2 * terms),
         sizes=np.empty(terms + 1),
         **{name: np.empty(terms * max(n, m)) for name in states},
     )
     rows = np.zeros(len(population.A), ROW)
     log = run.Log(np.empty(room), np.empty(room, np.bool_))
     _compiled()(
-        lanes.width(n), lanes.width(m), system, draws, _network(setting.link), space, rows, log
-    )
+        lanes.width(n), lanes.width(m), system, draws, _network(setting.link), space,
+        squares_of(setting.trigger, n), rows, log,
+    )  # fmt: skip
     return rows, log
 
 
@@ -226,10 +218,12 @@ def _network(link: LinkSettings) -> Any:
 
 @cache
 def _compiled() -> Any:
-    from cosim.batch import crossing, lanes, measures, run, status, taylor
+    from cosim.batch import crossing, lanes, measures, roots, rule, run, squares, status, taylor
     from netem.engine.compiled import compile_kept, prepare
 
-    modules: tuple[ModuleType, ...] = (status, lanes, taylor, crossing, measures, run)
+    modules: tuple[ModuleType, ...] = (
+        forecast, status, lanes, taylor, crossing, roots, rule, squares, measures, run,
+    )  # fmt: skip
     return compile_kept(run.run_many, prepare("batch", modules))
 
 
@@ -265,11 +259,15 @@ def _check(setting: Setting, population: Population) -> None:
             "network.impairments: a batch knows losses and corruption only; "
             "leave out what takes time"
         )
-    trigger = setting.trigger
-    if not isinstance(trigger, DecayingTrigger):
+    guards = setting.trigger.guards(n)
+    for form in (guards.form, *([guards.reserve.gain] if guards.reserve else [])):
+        for part in form:
+            if part.shape[1] != 2 * n:
+                raise ValueError(f"trigger: expected {2 * n} columns, found {part.shape[1]}")
+    if guards.from_event or guards.rate_per_s == 0 or guards.floor >= _SMALLEST_THRESHOLD:
         return
-    vanishes_s = math.log(trigger.beta / _SMALLEST_THRESHOLD) / trigger.alpha_per_s
-    if trigger.floor < _SMALLEST_THRESHOLD and vanishes_s < setting.horizon_s:
+    vanishes_s = math.log(guards.level / _SMALLEST_THRESHOLD) / guards.rate_per_s
+    if vanishes_s < setting.horizon_s:
         raise CallerError(
             f"trigger: from {vanishes_s:g} s on the threshold is below "
             f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "

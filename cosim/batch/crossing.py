@@ -19,8 +19,12 @@ it much smaller. Nothing is sampled. What remains is rounding: where h is below 
 that, steps have about 1e-8 of the curve's own time, and a tangency in floating point is passed or
 met. Backwards from the end the same holds for s ↦ y(end − s).
 
-Only |y| is known here. A policy with another quadratic event function, |y|² replaced by yᵀ S y with
-a diagonal S of signs, needs another φ; the way along the curve stays.
+How it ends. Each step leads on, or is too short to be one in floating point, which ends it. A curve
+that stays just below its threshold may still take very many; after MOST_STEPS it is UNRESOLVED. A
+chord of φ is above φ, so that Newton's method may be left at any time, for a step that is shorter
+and as safe. Where h ascends it may take NEWTON_STEPS; then its bracket is halved, to the last bit.
+
+Only |y| is known here. Other quadratic event functions are :mod:`cosim.batch.squares`.
 """
 
 import math
@@ -29,16 +33,23 @@ from cosim.batch.lanes import Lanes, Width, dot, filled, load
 from cosim.batch.taylor import Array, bend, value_and_slope
 
 NONE = -1.0
-_CLOSE = 1e-8
+UNRESOLVED = -2.0
+MOST_STEPS = 1_000_000
+"""Some 50 ms."""
+CLOSE = 1e-8
 """Newton's last step, as a share of the way; its square is below rounding."""
 _AHEAD = 3.0
 _NEARER = 0.6
+NEWTON_STEPS = 60
+TURNS = NEWTON_STEPS + 1100
+"""More halvings than there are between any two numbers."""
 
 
 def first_exit(
-    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, n: Width
-) -> float:
-    """The first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}; or NONE.
+    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, most_steps: int,
+    n: Width,
+) -> float:  # fmt: skip
+    """The first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
 
     Args:
         curve: coefficients of y.
@@ -47,7 +58,11 @@ def first_exit(
         rate: r ≥ 0, per second; 0 if ``backward``.
         end_s: where to stop.
         backward: look at y(``end_s`` − s) instead.
+        most_steps: give up after so many.
         n: how many numbers y has.
+
+    Returns:
+        The time; NONE; or UNRESOLVED.
     """
     s, ahead_s = 0.0, end_s
     most = bend(curve, p, end_s, n)
@@ -55,12 +70,14 @@ def first_exit(
         y, dy = look(curve, p, s, end_s, backward, n)
     else:
         y, dy = load(curve, 0, n), load(curve, len(n), n)
-    while True:
+    for _ in range(most_steps):
         square, mixed, speed = dot(y, y), dot(y, dy), dot(dy, dy)
         limit = level * math.exp(-rate * s) if rate > 0.0 else level
         size = math.sqrt(square)
         if size >= limit:
             return s
+        if s >= end_s:
+            return NONE
         slope = rate * limit + (mixed / size if size > 0.0 else math.sqrt(speed))
         if slope > (most + rate * rate * limit) * (ahead_s - s):
             s = ascent(curve, p, level, rate, s, size - limit, slope, ahead_s, end_s, backward, n)
@@ -81,6 +98,7 @@ def first_exit(
             ahead_s = end_s
             most = bend(curve, p, ahead_s, n)
         y, dy = look(curve, p, s, end_s, backward, n)
+    return UNRESOLVED
 
 
 def safe(
@@ -98,7 +116,8 @@ def safe(
         span: a − s.
     """
     length, below = span, limit - math.sqrt(square)
-    while True:
+    above = 0.0
+    for _ in range(NEWTON_STEPS):
         straight = math.sqrt(max(square + length * (2.0 * mixed + length * speed), 0.0))
         above = straight + limit * (rate * length - 1.0) + 0.5 * most * length * length
         if above <= 0.0:
@@ -112,6 +131,7 @@ def safe(
         if not 0.0 < following < length:
             return 0.0
         length = following
+    return length * (below / (below + above))
 
 
 def ascent(
@@ -134,14 +154,11 @@ def ascent(
         n: how many numbers.
     """
     low_s, high_s, beyond = s, ahead_s, False
-    while True:
+    for turn in range(TURNS):
         following = s - excess / slope if slope > 0.0 else math.inf
-        if abs(following - s) <= _CLOSE * s:
+        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
             return following if following < ahead_s or beyond else NONE
-        if following >= high_s:
-            following = 0.5 * (low_s + high_s) if beyond else high_s
-        elif following <= low_s:
-            following = 0.5 * (low_s + high_s)
+        following = bracketed(following, turn, low_s, high_s, beyond)
         if following == s:
             return s
         s = following
@@ -156,6 +173,24 @@ def ascent(
             return NONE
         else:
             low_s = s
+    return s
+
+
+def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
+    """Newton's next point if it is within the bracket, and not too many came before; or a safe one.
+
+    Args:
+        following: Newton's.
+        turn: how many came before.
+        low_s: below the root, if there is one.
+        high_s: above it, if ``beyond``; else the end.
+        beyond: there is one.
+    """
+    if turn < NEWTON_STEPS and low_s < following < high_s:
+        return following
+    if not beyond and (turn >= NEWTON_STEPS or following >= high_s):
+        return high_s
+    return 0.5 * (low_s + high_s)
 
 
 def look(
@@ -169,6 +204,6 @@ def look(
 
 
 def last_entry(curve: Array, p: int, level: float, end_s: float, n: Width) -> float:
-    """The last s in [0, ``end_s``] up to which |y(s)| ≥ ``level``; or NONE."""
-    back_s = first_exit(curve, p, level, 0.0, end_s, True, n)
-    return NONE if back_s == NONE else end_s - back_s
+    """The last s in [0, ``end_s``] up to which |y(s)| ≥ ``level``; or NONE, or UNRESOLVED."""
+    back_s = first_exit(curve, p, level, 0.0, end_s, True, MOST_STEPS, n)
+    return back_s if back_s < 0.0 else end_s - back_s

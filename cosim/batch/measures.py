@@ -6,9 +6,10 @@ crossings with a level (:mod:`cosim.batch.crossing`), so that nothing between tw
 
 import math
 
-from cosim.batch.crossing import NONE, first_exit, last_entry
+from cosim.batch.crossing import NONE, UNRESOLVED, first_exit, last_entry
 from cosim.batch.lanes import Lanes, Width, dot, filled, fma, load, store, times
-from cosim.batch.taylor import Array, largest, value_and_slope
+from cosim.batch.roots import first_root
+from cosim.batch.taylor import Array, largest, squared, value, value_and_slope
 
 CERTAINTY = 1e-10
 """The true supremum is at most by this share above the one that is returned."""
@@ -16,6 +17,10 @@ _SMALL_SHARE = 1e-27
 _LEAST = 1e-150
 _LARGEST = 1e150
 _CLIMBS = 12
+_HALVINGS = 60
+_FEW_STEPS = 50
+_RISES = 10_000
+"""Each passes a maximum, of which a polynomial of degree 24 has few, or rises by CERTAINTY."""
 
 
 def square_integrals(
@@ -73,21 +78,41 @@ def square_integrals(
 
 
 def raised(
-    best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, n: Width
-) -> float:
+    best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, squares: Array,
+    n: Width,
+) -> float:  # fmt: skip
     """The larger of ``best`` and the supremum of |y(s)| e^{rate s} ``growth`` in [0, ``end_s``].
 
     It is a value that is taken, and the true supremum is larger by a share of CERTAINTY at most
-    (or below 1e-150, or infinite beyond 1e150).
+    (or below 1e-150, or infinite beyond 1e150). A curve that stays close to one level, as an
+    oscillation does, is looked at once more as |y|², a number, where terms that cancel are gone.
+    UNRESOLVED if that does not help (:mod:`cosim.batch.roots`), or the curve rises again and again.
+
+    Args:
+        best: a value.
+        curve: coefficients of y.
+        p: the degree.
+        end_s: where to stop.
+        rate: per second.
+        growth: a factor.
+        squares: scratch, 2p + 1 numbers.
+        n: how many numbers y has.
     """
-    while best < _LARGEST:
+    for _ in range(_RISES):
+        if best >= _LARGEST:
+            return best
         level = max(best * (1.0 + CERTAINTY), _LEAST) / growth
-        s = first_exit(curve, p, level, rate, end_s, False, n)
+        s = first_exit(curve, p, level, rate, end_s, False, _FEW_STEPS, n)
+        if s == UNRESOLVED:
+            squared(curve, p, filled(1.0, n), squares, n)
+            s = first_root(squares, 2 * p, level * level, 2.0 * rate, 0.0, end_s)
         if s == NONE:
             return best
+        if s == UNRESOLVED:
+            return UNRESOLVED
         found = _climbed(curve, p, s, end_s, rate, n)
         best = max(best * (1.0 + CERTAINTY), found * growth)
-    return best
+    return UNRESOLVED
 
 
 def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: Width) -> float:
@@ -115,7 +140,7 @@ def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: 
 
 
 def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n: Width) -> float:
-    """The last s in [0, ``end_s``] at which |y(s)| > ``level``; or NONE.
+    """The last s in [0, ``end_s``] at which |y(s)| > ``level``; or NONE, or UNRESOLVED.
 
     Args:
         curve: coefficients of y.
@@ -131,3 +156,47 @@ def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n
     if largest(curve, p, end_s, n) <= square:
         return NONE
     return last_entry(curve, p, level, end_s, n)
+
+
+def passed_at(
+    x_c: Array, e_c: Array, d: Array, p: int, end_s: float, limit: float, level: float,
+    rate: float, n: Width,
+) -> float:  # fmt: skip
+    """When the size of the loop passes a limit, for it is below it at 0 and beyond at ``end_s``.
+
+    Args:
+        x_c: coefficients.
+        e_c: coefficients.
+        d: coefficients.
+        p: the degree.
+        end_s: a time.
+        limit: of the size.
+        level: and so many times ``limit``, e^{−rate s} of it; 0: this does not count.
+        rate: per second.
+        n: how many states.
+    """
+    low_s, high_s = 0.0, end_s
+    for _ in range(_HALVINGS):
+        s = 0.5 * (low_s + high_s)
+        model, error, apart = value(x_c, p, s, n), value(e_c, p, s, n), value(d, p, s, n)
+        if is_within(model, error, apart, limit, level * math.exp(-rate * s)):
+            low_s = s
+        else:
+            high_s = s
+    return high_s
+
+
+def is_within(x_c: Lanes, e_c: Lanes, d: Lanes, limit: float, level: float) -> bool:
+    """Whether ‖(x, e_s, e_c)‖ is below a limit, and below so many times a threshold if it has one.
+
+    Args:
+        x_c: the controller's model.
+        e_c: its error.
+        d: x_s − x_c.
+        limit: the limit.
+        level: the threshold, or 0.
+    """
+    x, e_s = x_c - e_c, e_c + d
+    if level > 0.0:
+        limit *= min(level, 1.0)
+    return dot(x, x) + dot(e_s, e_s) + dot(e_c, e_c) < limit * limit

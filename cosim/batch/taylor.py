@@ -95,7 +95,7 @@ def reaches(
         X_k: table.
         E: by columns.
         sizes: scratch, (HIGHEST + 2,).
-        reach_s: receives them, (len(DEGREES),).
+        reach_s: receives them, (len(DEGREES),); 0 where the tables' numbers are not finite.
         measured_s: receives them for what is measured, where a share of _MEASURED may be left out.
         n: how many states.
     """
@@ -114,8 +114,10 @@ def reaches(
     for i in range(len(reach_s)):
         p = DEGREES[i]
         left_out = 2.0 * kappa * sizes[p + 1]
-        reach_s[i], measured_s[i] = math.inf, math.inf
-        if left_out > 0.0:
+        reach_s[i], measured_s[i] = 0.0, 0.0
+        if left_out == 0.0:
+            reach_s[i], measured_s[i] = math.inf, math.inf
+        elif left_out < math.inf:
             most_s = (p + 2) / (2.0 * eta) if eta > 0.0 else math.inf
             carried_s = math.exp(math.log(_NEGLIGIBLE / left_out) / (p + 1))
             reach_s[i] = min(carried_s, most_s)
@@ -168,3 +170,17 @@ def largest(curve: Array, p: int, s: float, n: Width) -> float:
     for k in range(p - 1, -1, -1):
         total = fma(total, s, magnitude(load(curve, k * len(n), n)))
     return _ROUNDED_UP * dot(total, total)
+
+
+def squared(curve: Array, p: int, signs: Lanes, out: Array, n: Width) -> None:
+    """The coefficients of yᵀ S y, S diagonal: of degree 2p, Σ_{i+j=k} c_i · S c_j."""
+    size = len(n)
+    for k in range(2 * p + 1):
+        total = filled(0.0, n)
+        for i in range(max(0, k - p), (k + 1) // 2):
+            total = fma(load(curve, i * size, n), load(curve, (k - i) * size, n), total)
+        total = total + total
+        if k % 2 == 0:
+            middle = load(curve, (k // 2) * size, n)
+            total = fma(middle, middle, total)
+        out[k] = dot(total, signs)

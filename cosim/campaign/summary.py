@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cosim.batch.api import ROW
-from cosim.batch.status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.batch.status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.campaign.grid import Point
 from cosim.campaign.metrics import Metric, measured
 from cosim.campaign.plan import Campaign, label_of
@@ -15,7 +15,10 @@ from cosim.campaign.store import Store
 from noack.linear import Vector
 
 _ROUNDING = 1e-9
-_ENDED = {OK: "finished", DIVERGED: "diverged", TOO_MANY_EVENTS: "too_many_events"}
+_ENDED = {
+    OK: "finished", DIVERGED: "diverged", TOO_MANY_EVENTS: "too_many_events",
+    UNDECIDED: "undecided",
+}  # fmt: skip
 
 
 class Found(NamedTuple):

@@ -20,6 +20,10 @@ not leave it (convex hull); in every other one the roots of 1 − |y|² are isol
 (:mod:`cosim.exact.bernstein`).
 Nothing is sampled. What remains is rounding: an excursion above the threshold by less than about
 1e-15 ‖z‖/threshold of it may be taken for a tangency, which is no event.
+
+When a run has diverged: when ‖z‖ passes 1e100, or so many times the threshold that e_s or x is
+compared with. This is looked at where windows and the time up to an event end, and the time of the
+passing is found by bisection between there and the last event.
 """
 
 import math
@@ -43,6 +47,7 @@ _LONGEST_CELL_S = 1e3
 _GRID_SLACK = 1e-9
 """Of a period: so far may an event be off the grid for rounding."""
 _GRID_BLOCK = 256
+_BISECTIONS = 60
 
 
 class LoopState(NamedTuple):
@@ -95,7 +100,8 @@ class ContinuousLoop:
         self.generator[n : 2 * n, 2 * n :] = -BK
         self.generator[2 * n :, :n] = -mismatch
         self.generator[2 * n :, 2 * n :] = H - BK
-        guard = trigger.guard(0.0, loop.x0)
+        self._guards = trigger.guards(n)
+        guard = self._guards.after(0.0, loop.x0)
         scaled = self.generator + guard.rate_per_s * np.eye(3 * n)
         rate_per_s = max(growth_rate(self.generator), growth_rate(scaled))
         if guard.reserve is not None:
@@ -148,8 +154,9 @@ class ContinuousLoop:
 
     def guard(self, state: LoopState) -> Guard:
         """The rule after an event at a state."""
-        return self.trigger.guard(state.t_s * 1e9, state.x)
+        return self._guards.after(state.t_s * 1e9, state.x)
 
+    @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
     def next_crossing(
         self, state: LoopState, until_s: float, guard: Guard, reserve: float = 0.0
     ) -> tuple[LoopState, float] | None:
@@ -160,9 +167,46 @@ class ContinuousLoop:
             until_s: how far to look.
             guard: the rule until then.
             reserve: η at ``state``.
+
+        Raises:
+            DivergedError: with the time of the passing.
         """
+        try:
+            found = self._next_crossing(state, until_s, guard, reserve)
+        except DivergedError as error:
+            raise DivergedError(self._passed_s(state, error.t_s, guard)) from None
+        end = self.propagate(state, max(until_s, state.t_s)) if found is None else found[0]
+        if not self._is_within(end, guard):
+            raise DivergedError(self._passed_s(state, end.t_s, guard))
+        return found
+
+    def _is_within(self, state: LoopState, guard: Guard) -> bool:
+        """Whether a state is one that can be computed with."""
+        threshold, begins_ns = 0.0, min(guard.earliest_ns, guard.latest_ns)
+        if len(guard.form.up) and state.t_s * 1e9 >= begins_ns:
+            threshold = guard.threshold(state.t_s * 1e9)
+        limit = LARGEST * (min(threshold, 1.0) if threshold > 0 else 1.0)
+        return float(np.linalg.norm(np.concatenate(state[1:]))) < limit
+
+    def _passed_s(self, state: LoopState, until_s: float, guard: Guard) -> float:
+        """When the loop passes what can be computed with, for it has at ``until_s``."""
+        low_s, high_s = state.t_s, until_s
+        if not self._is_within(state, guard):
+            return low_s
+        for _ in range(_BISECTIONS):
+            middle_s = (low_s + high_s) / 2
+            if self._is_within(self.propagate(state, middle_s), guard):
+                low_s = middle_s
+            else:
+                high_s = middle_s
+        return high_s
+
+    def _next_crossing(
+        self, state: LoopState, until_s: float, guard: Guard, reserve: float
+    ) -> tuple[LoopState, float] | None:
         t_s, z = state.t_s, np.concatenate(state[1:])
-        begin_s, latest_s = guard.earliest_ns * 1e-9, guard.latest_ns * 1e-9
+        latest_s = guard.latest_ns * 1e-9
+        begin_s = min(guard.earliest_ns * 1e-9, latest_s)
         end_s = max(min(until_s, latest_s), t_s)
         if begin_s > t_s:
             if begin_s > until_s:
@@ -270,12 +314,15 @@ class ContinuousLoop:
         for begin in range(first, last + 1, _GRID_BLOCK):
             points_s = np.arange(begin, min(begin + _GRID_BLOCK, last + 1)) * grid_s
             states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
-            if not np.abs(states).max() < LARGEST:
-                raise DivergedError(float(points_s[0]))
-            exceeds = np.flatnonzero(guard.exceeds(points_s * 1e9, states[:, : 2 * n]))
+            beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
+            known = len(states) if not len(beyond) else int(beyond[0])
+            seen = states[:known, : 2 * n]
+            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, seen))
             if len(exceeds):
                 k = int(exceeds[0])
                 return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
+            if len(beyond):
+                raise DivergedError(float(points_s[beyond[0]]))
         return Reached(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:

@@ -73,7 +73,7 @@ class BallWatch:
         while True:
             begin_s = window * window_s
             scale = math.exp(self._rate_per_s * begin_s) / threshold
-            largest = float(np.abs(z).max())
+            largest = float(np.linalg.norm(z))
             if not largest * max(scale, 1.0) < LARGEST:
                 raise DivergedError(t_s + begin_s)
             cells = max(min(CELLS, math.ceil((span_s - begin_s) / width_s)), 1)
@@ -113,7 +113,7 @@ class FormWatch:
     Args:
         flow: of the state z, with cells of at most 1/(λ + ρ).
         generator: G, shape (N, N).
-        form: P and N, on the first 2n entries of z.
+        form: P and N, on the first 2n entries of z; without P nothing is looked at, and η goes on.
         rate_per_s: ρ of the threshold c e^{−ρt}; 0 where there is an η.
         gain: P_η and N_η, if there is an η.
         decay_per_s: λ.
@@ -138,6 +138,7 @@ class FormWatch:
         self._cells = terms[None] @ (flow.powers[:CELLS] * self._growth[:, None, None])[:, None]
         """Taylor coefficients of the scaled z in all cells of a window, (cells, p + 1, N, N)."""
         self._form = _Squares(form, self._cells)
+        self._looks = len(form.up) > 0
         self._gain = None if gain is None else _Squares(gain, self._cells)
         self._faded, self._gathered = _reserve_series(decay_per_s, flow.width_s)
 
@@ -158,7 +159,7 @@ class FormWatch:
         """
         width_s, begin_s = self._flow.width_s, 0.0
         while True:
-            largest = float(np.abs(z).max())
+            largest = float(np.linalg.norm(z))
             level = threshold * math.exp(-self._rate_per_s * begin_s)
             if not largest < LARGEST or (level > 0 and not largest / level < LARGEST):
                 raise DivergedError(t_s + begin_s)
@@ -168,7 +169,7 @@ class FormWatch:
             if saved is not None:
                 inside += saved @ curve_basis(2 * DEGREE).from_taylor.T
             last = min(int((span_s - begin_s) / width_s), CELLS)
-            for cell in np.flatnonzero(inside.min(axis=1) < 0):
+            for cell in np.flatnonzero(inside.min(axis=1) < 0) if self._looks else ():
                 u = self._basis.first_negative(inside[cell]) if cell <= last else None
                 if u is not None and begin_s + (cell + u) * width_s <= span_s:
                     return self._reached(begin_s, z, int(cell), u, saved, scale, exceeds=True)

@@ -6,8 +6,9 @@ inter-event time is positive for bounded states, as e_s grows from 0 at a bounde
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Form, Guard, nothing, of_error
+from noack.linear import Matrix
+from noack.trigger.guard import Form, nothing, of_error
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,6 @@ class AbsoluteTrigger:
     weight: Matrix | None = None
     first_reserve = 0.0
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The same after every event."""
-        n = len(x)
-        return Guard(Form(of_error(n, self.weight), nothing(n)), floor=self.delta)
+        return Guards(Form(of_error(n, self.weight), nothing(n)), floor=self.delta)

@@ -6,8 +6,8 @@ then tells the controller something. What the rule keeps below its threshold sta
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Guard
+from noack.linear import Matrix
+from noack.trigger.guards import Guards
 from noack.trigger.policy import Policy
 
 
@@ -28,7 +28,10 @@ class DeadlineTrigger:
         """That of the rule."""
         return self.rule.first_reserve
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The rule's, and the deadline."""
-        guard = self.rule.guard(t_ns, x)
-        return guard._replace(latest_ns=min(guard.latest_ns, t_ns + self.interval_ns))
+        guards = self.rule.guards(n)
+        return guards._replace(
+            longest_ns=min(guards.longest_ns, self.interval_ns),
+            shortest_ns=min(guards.shortest_ns, self.interval_ns),
+        )

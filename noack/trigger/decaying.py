@@ -9,7 +9,8 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 import math
 
 from noack.linear import Matrix, Vector, norm
-from noack.trigger.guard import Form, Guard, nothing, of_error
+from noack.trigger.guard import Form, nothing, of_error
+from noack.trigger.guards import Guards
 
 
 class DecayingTrigger:
@@ -32,10 +33,10 @@ class DecayingTrigger:
         self.floor = floor
         self.weight = weight
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The same after every event: eq:thre counts from the run's start."""
-        form = Form(of_error(len(x), self.weight), nothing(len(x)))
-        return Guard(form, self.beta, self.alpha_per_s, 0.0, self.floor)
+        form = Form(of_error(n, self.weight), nothing(n))
+        return Guards(form, self.beta, self.alpha_per_s, self.floor)
 
     def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""

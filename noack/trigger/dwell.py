@@ -6,8 +6,8 @@ threshold may exceed it for as long.
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Guard
+from noack.linear import Matrix
+from noack.trigger.guards import Guards
 from noack.trigger.policy import Policy
 
 
@@ -28,9 +28,11 @@ class DwellTrigger:
         """That of the rule."""
         return self.rule.first_reserve
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The rule's, after the dwell time; what is due before then is due at its end."""
-        guard, end_ns = self.rule.guard(t_ns, x), t_ns + self.interval_ns
-        return guard._replace(
-            earliest_ns=max(guard.earliest_ns, end_ns), latest_ns=max(guard.latest_ns, end_ns)
+        guards = self.rule.guards(n)
+        return guards._replace(
+            idle_ns=max(guards.idle_ns, self.interval_ns),
+            longest_ns=max(guards.longest_ns, self.interval_ns),
+            shortest_ns=max(guards.shortest_ns, self.interval_ns),
         )

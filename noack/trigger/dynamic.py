@@ -13,8 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Form, Guard, Reserve, split
+from noack.linear import Matrix
+from noack.trigger.guard import Form, Reserve, split
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class DynamicTrigger:
         w[n:, :n] = -cross.T
         return split(-self.theta_s * w), split(w)
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The same after every event; η goes on."""
         spent, gained = self._forms
-        return Guard(spent, reserve=Reserve(self.decay_per_s, gained))
+        return Guards(spent, reserve=Reserve(self.decay_per_s, gained))

@@ -11,10 +11,9 @@ dwell time.
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from noack.linear import Matrix, Vector, norm
-from noack.trigger.guard import Form, Guard, nothing, of_state
+from noack.linear import Matrix
+from noack.trigger.guard import Form, nothing, of_state
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,7 @@ class LyapunovTrigger:
     weight: Matrix | None = None
     first_reserve = 0.0
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The envelope that begins at the event."""
-        n = len(x)
         form = Form(of_state(n, self.factor), nothing(n))
-        # To the last bit what it is compared with, so that the event itself is not above it.
-        level = norm(form.up @ np.concatenate([x, np.zeros(n)]))
-        return Guard(form, level=level, rate_per_s=self.rate_per_s / 2, since_ns=t_ns)
+        return Guards(form, rate_per_s=self.rate_per_s / 2, from_event=True)

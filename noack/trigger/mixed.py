@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Form, Guard, of_error, of_state
+from noack.linear import Matrix
+from noack.trigger.guard import Form, of_error, of_state
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,7 @@ class MixedTrigger:
     weight: Matrix | None = None
     first_reserve = 0.0
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The same after every event."""
-        n = len(x)
         down: Matrix = self.sigma * of_state(n, self.weight)
-        return Guard(Form(of_error(n, self.weight), np.asarray(down)), floor=self.epsilon)
+        return Guards(Form(of_error(n, self.weight), np.asarray(down)), floor=self.epsilon)

@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Form, Guard, nothing
+from noack.linear import Matrix
+from noack.trigger.guard import Form, nothing
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -14,6 +15,6 @@ class PeriodicTrigger:
     weight: Matrix | None = None
     first_reserve = 0.0
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """A period after the event."""
-        return Guard(Form(nothing(len(x)), nothing(len(x))), latest_ns=t_ns + self.period_ns)
+        return Guards(Form(nothing(n), nothing(n)), longest_ns=self.period_ns)

@@ -7,23 +7,19 @@ from numpy.typing import NDArray
 
 from noack.linear import Matrix, Vector
 from noack.trigger.guard import Guard
+from noack.trigger.guards import Guards
 
 
 class Policy(Protocol):
-    """An event-triggering policy: after each event it says what the next one waits for."""
+    """An event-triggering policy: what each event makes the next one wait for."""
 
     @property
     def weight(self) -> Matrix | None:
         """W of the norm in which errors are shown, (n, n); None is the identity."""
         ...
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
-        """The rule after an event, or from the start on.
-
-        Args:
-            t_ns: time of the event.
-            x: the plant's state there, shape (n,).
-        """
+    def guards(self, n: int) -> Guards:
+        """The rules after events, for n states."""
         ...
 
     @property
@@ -59,12 +55,12 @@ class Trigger:
 
     def start(self, t_ns: int, x: Vector) -> None:
         """Begin, or begin anew after an event, at a state of shape (n,)."""
-        self._guard = self._policy.guard(t_ns, x)
+        self._guard = self._policy.guards(len(x)).after(t_ns, x)
         self._see(t_ns, x, np.zeros_like(x))
 
     def renew(self, t_ns: int, x: Vector) -> None:
         """Take the rule that follows an event of the past, known now to have reset the model."""
-        self._guard = self._policy.guard(t_ns, x)
+        self._guard = self._policy.guards(len(x)).after(t_ns, x)
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> Verdict:
         """Say of a measurement whether it is an event; :meth:`start` comes first.

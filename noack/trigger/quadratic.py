@@ -9,8 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import NEVER_NS, Form, Guard, split
+from noack.linear import Matrix
+from noack.trigger.guard import NEVER_NS, Form, split
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,9 @@ class QuadraticTrigger:
         """Q as a difference of squares."""
         return split(self.Q)
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """On the grid, later than the event."""
-        latest_ns = t_ns + self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS
-        return Guard(
+        return Guards(
             self.form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
-            latest_ns=latest_ns,
+            longest_ns=self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS,
         )  # fmt: skip

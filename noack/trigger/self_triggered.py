@@ -10,15 +10,12 @@ without being watched. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010
 Gronwall's.)
 """
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
-
-from noack.linear import Matrix, Vector
-from noack.trigger.guard import Form, Guard, nothing
-
-_HALVINGS = 80
+from noack.linear import Matrix
+from noack.trigger.forecast import Forecast
+from noack.trigger.guard import Form, nothing
+from noack.trigger.guards import Guards
 
 
 @dataclass(frozen=True)
@@ -48,29 +45,13 @@ class SelfTrigger:
     weight: Matrix | None = None
     first_reserve = 0.0
 
-    def guard(self, t_ns: float, x: Vector) -> Guard:
+    def guards(self, n: int) -> Guards:
         """The time of the next event, from the state at this one."""
-        form = Form(nothing(len(x)), nothing(len(x)))
-        return Guard(form, latest_ns=t_ns + self._interval_ns(t_ns * 1e-9, x))
-
-    def _interval_ns(self, t_s: float, x: Vector) -> float:
-        size = float(np.linalg.norm(x if self.weight is None else self.weight @ x))
-        speed, L = self.mismatch_per_s * size + self.disturbance_per_s, self.growth_per_s
-
-        def reached(tau_s: float) -> bool:
-            exponent = min(L * tau_s, 700.0)
-            # The first two terms of the series where the third is below rounding.
-            grown = math.expm1(exponent) / L if exponent > 1e-8 else tau_s * (1 + exponent / 2)
-            faded = self.beta * math.exp(-self.alpha_per_s * (t_s + tau_s))
-            return speed * grown >= max(faded, self.floor)
-
-        low_s, high_s = self.shortest_ns * 1e-9, self.longest_ns * 1e-9
-        if reached(low_s):
-            return self.shortest_ns
-        if not reached(high_s):
-            return self.longest_ns
-        # The left side grows and the right one does not: they meet once.
-        for _ in range(_HALVINGS):
-            middle_s = (low_s + high_s) / 2
-            low_s, high_s = (low_s, middle_s) if reached(middle_s) else (middle_s, high_s)
-        return math.floor(low_s * 1e9)
+        forecast = Forecast(
+            self.beta, self.alpha_per_s, self.floor,
+            self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
+        )  # fmt: skip
+        return Guards(
+            Form(nothing(n), nothing(n)), longest_ns=self.longest_ns, shortest_ns=self.shortest_ns,
+            forecast=forecast, weight=self.weight,
+        )  # fmt: skip

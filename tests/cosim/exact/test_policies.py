@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
+from scipy.linalg import expm
 
 from cosim.exact.loop import ContinuousLoop
 from cosim.exact.run import ContinuousRun, TooManyEventsError, simulate_continuous
@@ -131,6 +132,23 @@ def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> N
         following = next((one.t_s for one in run.before if one.t_s > start.t_s), run.horizon_s)
         assert following == pytest.approx(expected_s, abs=1e-7)
         eta = float(found.y[6, -1])
+
+
+@pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
+def test_time_goes_on_while_the_rule_is_not_looked_at(decay_per_s: float) -> None:
+    """Even when η is used up meanwhile; and what is due before the dwell time ends is sent."""
+    dynamic = DynamicTrigger(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
+    for policy, times_s in (
+        (DwellTrigger(dynamic, 500 * MS), None),
+        (DeadlineTrigger(DwellTrigger(dynamic, 500 * MS), 200 * MS), 0.2 * np.arange(1, 30)),
+    ):
+        run = run_of(policy, zoh=True, lost=1, horizon_s=5.9)
+        assert len(run.before) >= 5
+        for state, following in zip((run.start, *run.after), run.before, strict=False):
+            z = expm(run.system.generator * (following.t_s - state.t_s)) @ np.concatenate(state[1:])
+            np.testing.assert_allclose(np.concatenate(following[1:]), z, rtol=1e-9, atol=1e-9)
+        if times_s is not None:
+            np.testing.assert_allclose(run.event_s, times_s, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", POLICIES)

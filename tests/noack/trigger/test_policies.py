@@ -169,7 +169,7 @@ def test_a_self_triggered_error_stays_below_the_threshold(
 ) -> None:
     """The extreme error d|e|/dt = L|e| + a|x| + b reaches it at the event, and not before."""
     policy = SelfTrigger(0.5, 0.25, floor, L, a, b, shortest_ns=1000, longest_ns=10 * S)
-    event_s = policy.guard(t_s * 1e9, x).latest_ns * 1e-9
+    event_s = policy.guards(len(x)).after(t_s * 1e9, x).latest_ns * 1e-9
     tau_s = event_s - t_s
 
     def error(tau: float) -> float:
