@@ -60,6 +60,13 @@ class ControllerTrack(NamedTuple):
         return ControllerTrack(self.model_ns[index:], self.x_c[index:], self.received[index:])
 
 
+def in_common(scenario: Scenario, joined: Joined) -> NDArray[np.bool_]:
+    """Where x_c is on record, and sensor and controller have something in common, (k,)."""
+    known = scenario.network.initial_sync == "known_state"
+    common = known | (joined.received != NO_SEQUENCE)
+    return np.asarray(~np.isnan(joined.x_c).any(axis=1) & common)
+
+
 def initial_track(scenario: Scenario) -> ControllerTrack:
     """The controller's state before its first input."""
     loop = loop_of(scenario)

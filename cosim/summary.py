@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.crossing import Crossing, crossing
-from cosim.join import Joined, identity_residual, join_all
+from cosim.join import identity_residual, in_common, join_all
 from cosim.record import (
     Rows,
     RunRecord,
@@ -61,7 +61,7 @@ def _summarise(
     joined = join_all(record)
     residual = identity_residual(record, joined)
     residual = residual[~np.isnan(residual)]
-    in_common = _in_common(record, joined)
+    common = in_common(record.scenario, joined)
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
     diverged_at_s = _diverged_at_s(record[PLANT_STEP])
@@ -101,7 +101,7 @@ def _summarise(
         "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
         "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
-        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[in_common]),
+        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[common]),
         "identity_residual_max": _or_none(np.max, residual),
         "identity_residual_relative": _or_none(
             lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),
@@ -117,13 +117,6 @@ def _summarise(
         summary["acknowledgements"] = _acknowledgements(record)
     finite: Summary = _finite(summary)
     return finite
-
-
-def _in_common(record: RunRecord, joined: Joined) -> NDArray[np.bool_]:
-    """Where x_c is on record, and sensor and controller have something in common."""
-    known = record.scenario.network.initial_sync == "known_state"
-    common = known | (joined.received != NO_SEQUENCE)
-    return np.asarray(~np.isnan(joined.x_c).any(axis=1) & common)
 
 
 def _acknowledgements(record: RunRecord) -> dict[str, int]:

@@ -169,7 +169,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         inverse=np.append(0.0, 1.0 / np.arange(1.0, 2 * terms + 1)),
         H_k=np.empty((terms + 1) * n * n),
         rule=rule_of(guards),
-        fading_per_s=0.0 if guards.from_event else float(guards.rate_per_s),
+        fading_per_s=float(guards.fading_per_s),
         horizon_s=float(setting.horizon_s),
         known_start=bool(setting.known_start),
         first_delivered=setting.link.first_delivered,

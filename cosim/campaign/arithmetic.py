@@ -51,7 +51,8 @@ def _code() -> str:
             name = path.relative_to(root)
             if package is not cosim or name.parts[0] not in _NO_CODE_OF_RUNS:
                 digest.update(path.read_bytes())
-    digest.update(Path(__file__).with_name("draws.py").read_bytes())
+    for module in ("draws.py", "sampled.py"):
+        digest.update(Path(__file__).with_name(module).read_bytes())
     return digest.hexdigest()
 
 

@@ -15,6 +15,7 @@ from cosim.batch.api import Setting, run_batch, setting_of
 from cosim.campaign.draws import Box, box_of
 from cosim.campaign.metrics import certified_error
 from cosim.campaign.plan import Campaign, Value
+from cosim.campaign.sampled import SampledWork, in_virtual_time
 from cosim.exact.fates import timeless
 from cosim.shipped import find_shipped
 from noack import toml_file
@@ -44,11 +45,12 @@ class Point:
     certified_error: float | None
     """Δβ, or None."""
     work: "Work"
+    """Runs its draws."""
 
 
 @dataclass(frozen=True)
-class Work:
-    """What a worker needs to know of a point; the same for all its chunks."""
+class ContinuousWork:
+    """What a worker needs to know of a point in continuous time; the same for all its chunks."""
 
     setting: Setting
     box: Box
@@ -57,6 +59,14 @@ class Work:
     def run(self, draws: range) -> NDArray[np.void]:
         """Run some successive draws; one row each."""
         return run_batch(self.setting, self.box.population(self.seed, draws))
+
+
+Work = ContinuousWork | SampledWork
+
+
+def run_draws(work: Work, draws: range) -> NDArray[np.void]:
+    """Run some successive draws; one row of :data:`cosim.batch.api.ROW` each, (k,)."""
+    return work.run(draws)
 
 
 def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
@@ -139,16 +149,30 @@ def _point(
     n, m = scenario.model.dimensions
     try:
         resolved = resolve(scenario)
-        _require_timeless(resolved)
         Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
         R = _weight(metrics.R, "metrics.R", m, "one row per input")
-        setting = replace(
-            setting_of(resolved), Q=Q, R=R, settle=metrics.settle, most_events=metrics.most_events
-        )
+        work, certified = _work(campaign, scenario, resolved, Q, R)
     except (CallerError, ValueError) as error:
         raise CallerError(f"{source}: {error}") from None
-    work = Work(setting, box_of(scenario), campaign.seed)
-    return Point(number, place, labels, values, scenario, certified_error(resolved), work)
+    return Point(number, place, labels, values, scenario, certified, work)
+
+
+def _work(
+    campaign: Campaign, scenario: Scenario, resolved: Scenario, Q: Matrix | None, R: Matrix | None
+) -> tuple[Work, float | None]:
+    """Who runs the draws, and the bound Δβ that no run may exceed, or None."""
+    settle, most_events = campaign.metrics.settle, campaign.metrics.most_events
+    if campaign.time == "sampled":
+        alone = in_virtual_time(scenario)
+        return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
+    if resolved.is_acknowledged:
+        raise CallerError(
+            'network.protocol: continuous time is for the loop without acknowledgements, "none"; '
+            'with time = "sampled" a campaign runs both'
+        )
+    _require_timeless(resolved)
+    setting = replace(setting_of(resolved), Q=Q, R=R, settle=settle, most_events=most_events)
+    return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
 
 
 def _require_timeless(scenario: Scenario) -> None:
@@ -157,8 +181,9 @@ def _require_timeless(scenario: Scenario) -> None:
     taking_time = [one.kind for one in network.link.impairments if one not in kept]
     if taking_time:
         raise CallerError(
-            f"network.impairments: {', '.join(taking_time)}: in a campaign the network takes "
-            'no time; leave it out, e.g. settings = { "network.impairments" = [] }'
+            f"network.impairments: {', '.join(taking_time)}: in continuous time the network takes "
+            'no time; leave it out, e.g. settings = { "network.impairments" = [] }, '
+            'or let time = "sampled"'
         )
 
 

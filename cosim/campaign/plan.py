@@ -222,6 +222,10 @@ class Campaign(Section):
     """What all runs start from: a scenario file beside this one, or the name of a shipped one."""
     settings: dict[str, JsonValue] = Field({})
     """Settings of all runs, in place of the scenario's."""
+    time: Literal["continuous", "sampled"] = "continuous"
+    """continuous: the trigger watches all the time and the network takes none, exactly, compiled.
+    sampled: the machines of a live run in virtual time, with the schedule's sampling, delays and
+    acknowledgements; a thousand times slower."""
     draws: Annotated[int, Field(ge=1, le=100_000_000)]
     """Runs at each grid point: plants from the box, initial states, losses."""
     seed: Seed = 0

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.campaign.arithmetic import arithmetic, difference
-from cosim.campaign.grid import Point, Work
+from cosim.campaign.grid import Point, Work, run_draws
 from cosim.campaign.store import Chunk
 from cosim.pool import interrupts_held, processes
 from noack.errors import CallerError, PeerError
@@ -47,7 +47,7 @@ class LostWorkersError(PeerError):
 def alone(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
     """Run chunks in this process."""
     for chunk in chunks:
-        yield chunk, points[chunk.point].work.run(chunk.draws)
+        yield chunk, run_draws(points[chunk.point].work, chunk.draws)
 
 
 @contextmanager
@@ -103,7 +103,7 @@ def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np
         raise OtherArithmeticError(
             f"a worker on {socket.gethostname()} would give other results: {other}"
         )
-    return work.run(draws)
+    return run_draws(work, draws)
 
 
 @contextmanager
@@ -122,7 +122,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         import distributed
     except ImportError:
         raise CallerError(
-            "--scheduler needs Dask, which is not installed: pip install 'noack[cluster]'"
+            "--scheduler needs Dask, which is not installed: python -m pip install distributed"
         ) from None
     _require_address(address)
     for name in list(logging.root.manager.loggerDict):
@@ -212,7 +212,7 @@ def _windowed(
             task = (points[chunk.point].work, chunk.draws)
             with interrupts_held():
                 future = (
-                    executor.submit(Work.run, *task) if wanted is None
+                    executor.submit(run_draws, *task) if wanted is None
                     else executor.submit(run_alike, *task, wanted)
                 )  # fmt: skip
             under_way[future] = chunk

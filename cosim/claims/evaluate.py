@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.claims.observed import Left, Observed, observe
 from cosim.claims.theorem_one import theorem_one
-from cosim.join import Joined, identity_residual, join_all
+from cosim.join import Joined, identity_residual, in_common, join_all
 from cosim.record import RunRecord
 from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario import Scenario
@@ -172,8 +172,7 @@ class Claims:
     @cached_property
     def _in_common(self) -> NDArray[np.bool_]:
         """Where sensor and controller have something in common: from the first delivery on."""
-        known = self.record.scenario.network.initial_sync == "known_state"
-        common = known | (self.joined.received != NO_SEQUENCE)
+        common = in_common(self.record.scenario, self.joined)
         return np.asarray(np.isfinite(self.joined.e_c_norm) & common)
 
     @cached_property

@@ -38,6 +38,11 @@ class Guards(NamedTuple):
     weight: Matrix | None = None
     """W of the ‖x‖_W that the forecast begins with, (n, n); None is the identity."""
 
+    @property
+    def fading_per_s(self) -> float:
+        """α of a threshold that decays from the run's start on; of others 0."""
+        return 0.0 if self.from_event else self.rate_per_s
+
     def after(self, t_ns: float, x: Vector) -> Guard:
         """The guard after an event, or from the start on.
 

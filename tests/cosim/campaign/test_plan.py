@@ -29,7 +29,7 @@ def test_the_grid_is_all_combinations_and_the_last_axis_varies_fastest(
     ]  # fmt: skip
     assert [point.scenario.mode for point in points] == ["model", "model", "zoh", "zoh"]
     assert [point.scenario.trigger.beta for point in points] == [0.1, 0.3, 0.1, 0.3]
-    assert all(point.work.setting.trigger.beta == point.values["beta"] for point in points)
+    assert all(point.scenario.decaying.beta == point.values["beta"] for point in points)
     assert points[0].scenario.plant.initial_state_halfwidth == (0.5, 0.5)
 
 
