@@ -26,6 +26,8 @@ from noack.triggers import AnyTrigger, Decaying, require_on_grid
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
+_LEAST_RATE_HZ = 1e-9
+"""Its period in nanoseconds fits into 64 bits."""
 _TIMEOUT_PERIODS = 5
 
 
@@ -35,6 +37,8 @@ def period_ns(rate_hz: float) -> int:
 
 
 def _require_whole_period(rate_hz: float, key: str) -> None:
+    if rate_hz < _LEAST_RATE_HZ:
+        raise ValueError(f"{key}: must be at least {_LEAST_RATE_HZ:g}")
     whole_ns = period_ns(rate_hz)
     if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
         raise ValueError(
