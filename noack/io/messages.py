@@ -3,6 +3,7 @@
 Whatever else reaches the plane, or a damaged file, is none of it and must not end a process.
 """
 
+import re
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
@@ -84,5 +85,5 @@ def heard(kind: type[M], payload: bytes | str) -> dict[str, Any]:
     try:
         return kind.model_validate_json(payload).model_dump(exclude_unset=True)
     except ValidationError as error:
-        name = kind.__name__.lower()
+        name = re.sub("(?<=[a-z])(?=[A-Z])", " ", kind.__name__).strip("_").lower()
         raise PeerError(f"no {name} of this version of noack: {brief(error)}") from None
