@@ -11,7 +11,15 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.clock import NS_PER_S
 from noack.errors import CallerError
-from noack.impairments import Impairment, LinkSettings, Loss, Lossless, LossOf, require_scores
+from noack.impairments import (
+    Impairment,
+    LinkSettings,
+    Loss,
+    Lossless,
+    LossOf,
+    Mansd,
+    require_scores,
+)
 from noack.matrices import (
     Row,
     Rows,
@@ -203,7 +211,7 @@ class Acknowledgements(Section):
 class Network(Section):
     """The lossy network between sensor and controller."""
 
-    mansd: Annotated[int, Field(ge=0, le=1_000_000)]
+    mansd: Mansd
     """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
     loss: Loss
     """What is lost, before the cap."""

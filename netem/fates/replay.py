@@ -14,6 +14,7 @@ from netem.engine.api import DIRECTIONS, Direction
 from netem.fates.trace import FORMAT, METADATA, SCHEMA
 from netem.records import Decision
 from noack.errors import CallerError, one_line
+from noack.impairments import Mansd
 from noack.records import Fate
 
 _LONGEST_NS = 2**62
@@ -90,7 +91,7 @@ def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
 
 
 class _Direction(BaseModel):
-    mansd: Annotated[int, Field(ge=0)] | None
+    mansd: Mansd | None
 
 
 class _Link(BaseModel):

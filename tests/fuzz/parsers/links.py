@@ -9,6 +9,7 @@ from unittest.mock import patch
 import tomli_w
 
 from netem.words.links import json_schema, load_links
+from netem.words.parser import settings_of
 from netem.words.text import text_of
 from noack.impairments import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
@@ -17,6 +18,7 @@ from tests.fuzz.files import NAMED, quoted, write_named
 from tests.fuzz.harness import refusal, workspace
 from tests.fuzz.parsers.words import WORDS as TOKENS
 from tests.fuzz.parsers.words import sentence
+from tests.netem.any_settings import words_can_say
 
 _SCHEMA = vocabulary(json_schema(), dates=True)
 KNOWN = _SCHEMA._replace(
@@ -68,4 +70,5 @@ def one_input(data: bytes) -> None:
         for spec in load_links(path):
             for settings in (spec.forward, spec.back):
                 assert LinkSettings.model_validate_json(settings.model_dump_json()) == settings
-                text_of(settings)
+                if words_can_say(settings):
+                    assert settings_of(text_of(settings)) == settings

@@ -48,6 +48,7 @@ def test_what_is_spoilt_below_is_right(tmp_path: Path) -> None:
         DOCUMENT | {"links": [DOCUMENT["links"][0] | {"name": ["up"]}]},
         DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": "2"}}]},
         DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": 1_000_001}}]},
     ],
 )  # fmt: skip
 def test_a_document_is_the_programs(document: object, tmp_path: Path) -> None:
