@@ -187,7 +187,7 @@ class Acknowledgements(Section):
 
     loss: Loss = Lossless()
     """What is lost of the acknowledgements."""
-    mansd: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    mansd: Mansd | None = None
     """At most so many successive acknowledgements are lost; without it, any number."""
     impairments: tuple[Impairment, ...] = ()
     """What else happens to them, in this order, after the loss."""
