@@ -14,6 +14,7 @@ SCENARIO ?= scenarios/lane_following.toml
 CAMPAIGN ?= mb_vs_zoh
 SETTLING ?= 14
 SESSION ?= default
+MINUTES ?= 10
 ARGS ?=
 LIVE ?=
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
@@ -86,13 +87,16 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test check format bench schema lock clean
+.PHONY: setup setup-dev test fuzz check format bench schema lock clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
 
 test: setup-dev check ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile)
+
+fuzz: setup-dev ## Fuzz every parser, MINUTES=10 in all; exit status 1 if something is found
+	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules
 	$(BIN)/ruff check .

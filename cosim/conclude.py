@@ -13,18 +13,9 @@ from cosim.launch import Ending
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
 from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
+from cosim.shown import can_be_shown
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus
-
-_SHOWN = {
-    "scenario", "mode", "mansd", "horizon_s", "reached_s", "events", "deliveries", "drops",
-    "forced_deliveries", "longest_drop_run", "assumption_violations", "assumptions",
-    "missing_samples", "missing_by_table", "lost_outside_netem", "lost_by_leg",
-    "rejected_datagrams", "inter_event_min_s", "inter_event_median_s", "inter_delivery_median_s",
-    "initial_state_norm", "final_state_norm", "sup_e_s_norm", "sup_e_c_norm",
-    "identity_residual_relative", "lateness_us", "latency_us", "realtime",
-}  # fmt: skip
-"""What a summary needs to be shown; one of an earlier version may lack it."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +83,7 @@ def reopen(run_dir: Path) -> Outcome:
     summary = _read_summary(run_dir)
     ending = _ending(run_dir, summary)
     # It is of an earlier version or damaged; or a process woke up after the end.
-    if not summary.keys() >= _SHOWN or (run_dir / SPOOL).is_dir():
+    if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
         return conclude(ending)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
@@ -135,6 +126,6 @@ def _read_summary(run_dir: Path) -> Summary:
     """The run's summary; empty if there is none, or a damaged one, which is then written anew."""
     try:
         found = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -1,6 +1,5 @@
 """The coordinator: admits the processes to a run, starts them together, and names who dies."""
 
-import json
 import time
 from collections.abc import Iterable
 from typing import Any
@@ -8,6 +7,8 @@ from typing import Any
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from noack.errors import PeerError
+from noack.io.messages import Hello, Progress, heard
 from noack.io.plane import Plane
 from noack.io.ticket import Ticket
 from noack.topology import COORDINATOR, LOOP_ROLES, ROLES
@@ -55,13 +56,16 @@ class Coordinator:
             if self._stopped is not None:
                 self.plane.refuse(query, self._stopped)
                 continue
-            payload = query.payload.to_string() if query.payload is not None else "{}"
-            if role in ROLES and self.epoch_ns is None:
-                self._waiting[role] = (query, json.loads(payload))
-            else:
+            if role not in ROLES or self.epoch_ns is not None:
                 self.plane.refuse(query, f"{role} cannot join: the run has begun without it")
+                continue
+            try:
+                self._waiting[role] = (query, _hello(role, query))
+            except PeerError as error:
+                self.plane.refuse(query, f"{role} cannot join: {error}")
         while (leave := self._leaves.try_recv()) is not None:
-            self.left[_role(leave.key_expr)] = leave.payload.to_string()
+            reason = leave.payload.to_bytes().decode(errors="replace")
+            self.left[_role(leave.key_expr)] = reason
         while (life := self._lives.try_recv()) is not None:
             role = _role(life.key_expr)
             if life.kind == zenoh.SampleKind.DELETE:
@@ -95,8 +99,10 @@ class Coordinator:
         sample = self._progress.try_recv()
         if sample is None:
             return None
-        account: dict[str, Any] = json.loads(sample.payload.to_string())
-        return account
+        try:
+            return heard(Progress, sample.payload.to_bytes())
+        except PeerError:  # whoever says so is not the recorder
+            return None
 
     def _start(self) -> None:
         self.epoch_ns = time.monotonic_ns() + _START_DELAY_NS
@@ -106,6 +112,13 @@ class Coordinator:
         }
         for query, _ in self._waiting.values():
             self.plane.answer(query, start)
+
+
+def _hello(role: str, query: zenoh.Query) -> dict[str, Any]:
+    hello = heard(Hello, b"" if query.payload is None else query.payload.to_bytes())
+    if (hello["address"] is None) == (role in LOOP_ROLES):
+        raise PeerError("no address, or one too many")
+    return hello
 
 
 def _role(key_expr: object) -> str:

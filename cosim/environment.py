@@ -57,7 +57,8 @@ def read_environment(run_dir: Path) -> dict[str, Any]:
 def changed_since(run_dir: Path) -> list[str]:
     """Return what the arithmetic of a run may depend on and is not what it was, in words."""
     then, now = read_environment(run_dir), environment("live")
-    packages = then.get("packages") or {}
+    said = then.get("packages")
+    packages = said if isinstance(said, dict) else {}
     pairs = [
         *((key, then.get(key), now[key]) for key in ("python", "machine", "processor")),
         *((name, packages.get(name), now["packages"][name]) for name in _ARITHMETIC),

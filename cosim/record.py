@@ -4,9 +4,10 @@
 are stored one column per entry (``x_0``, ``x_1``, …) so that any reader of Parquet takes them.
 """
 
+import contextlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.environment import Kind, kind_of
 from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
-from noack.errors import CallerError, MachineError
+from noack.errors import CallerError, MachineError, PeerError, one_line
+from noack.io.messages import LogLine, Report, heard
 from noack.io.spool import read_chunks
 from noack.io.telemetry import notices_of
 from noack.records import OWNER, tables
@@ -30,6 +32,10 @@ from noack.wire import VERSION, Flow, read_header
 Rows = NDArray[np.void]
 
 _NOTICES_FILE = "notices.jsonl"
+
+
+class _Notice(LogLine):
+    process: str
 
 
 class RunRecord:
@@ -92,7 +98,8 @@ def load_record(run_dir: Path) -> RunRecord:
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables_of(scenario).items()
     }
-    return RunRecord(scenario, rows, _read_notices(folder), _reports(run_dir), kind_of(run_dir))
+    notices, reports = _read_notices(folder), _reports(run_dir, rows)
+    return RunRecord(scenario, rows, notices, reports, kind_of(run_dir))
 
 
 def write_record(record: RunRecord, run_dir: Path) -> None:
@@ -124,7 +131,7 @@ def finish_record(run_dir: Path) -> RunRecord:
         for table, dtype in tables_of(scenario).items()
     }
     notices = _notices(folder, spool)
-    record = RunRecord(scenario, rows, notices, _reports(run_dir), kind_of(run_dir))
+    record = RunRecord(scenario, rows, notices, _reports(run_dir, rows), kind_of(run_dir))
     try:
         write_record(record, run_dir)
         if spool.is_dir():  # dropped in one step, so that nobody ever takes half a spool for all
@@ -183,14 +190,18 @@ def _recorded(folder: Path, table: str, dtype: np.dtype[np.void]) -> Rows:
 
 def _spooled(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     for _, data in read_chunks(spool, table):
-        yield np.frombuffer(data, dtype)
+        if len(data) % dtype.itemsize == 0:  # of a damaged one nobody knows where its rows begin
+            yield np.frombuffer(data, dtype)
 
 
 def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
     notices = _read_notices(folder)
     for role in LOOP_ROLES:
         for _, data in read_chunks(spool, notices_of(role)):
-            notice = json.loads(data) | {"process": role}
+            try:
+                notice = heard(LogLine, data) | {"process": role}
+            except PeerError:  # damaged
+                continue
             if notice not in notices:
                 notices.append(notice)
     return sorted(notices, key=lambda notice: int(notice["t_ns"]))
@@ -199,18 +210,38 @@ def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
 def _read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
     try:
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        return [json.loads(line) for line in lines]
-    except (OSError, ValueError) as error:
+        lines = path.read_bytes().splitlines() if path.is_file() else []
+        return [heard(_Notice, line) for line in lines]
+    except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None
 
 
-def _reports(run_dir: Path) -> dict[str, dict[str, Any]]:
-    path = run_dir / REPORTS_FILE
+def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, Any]:
+    """Return a process's final report from its JSON.
+
+    Args:
+        role: the process.
+        said: what it said.
+        tables: the run's.
+
+    Raises:
+        PeerError: it is no report, or does not account for every table of the process.
+    """
+    report = heard(Report, said)
+    if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
+        raise PeerError("the report does not say how many rows there are")
+    return report
+
+
+def _reports(run_dir: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
     try:
-        reports: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # a dead recorder wrote none, or half of one
+        said = json.loads((run_dir / REPORTS_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # a dead recorder wrote none, or half of one
         return {}
+    reports: dict[str, dict[str, Any]] = {}
+    for role in LOOP_ROLES:
+        with contextlib.suppress(PeerError, LookupError, TypeError):  # what is none, is as lost
+            reports[role] = report_of(role, json.dumps(said[role]), tables)
     return reports
 
 
@@ -239,21 +270,33 @@ def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:
     scratch.replace(path)
 
 
-def _columns(dtype: np.dtype[np.void]) -> Iterator[str]:
-    """Yield the names of a table's columns in its file."""
+def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
+    """Yield the names of a table's columns in its file, and their types."""
     for name in dtype.names or ():
-        shape = dtype[name].shape
-        yield from (f"{name}_{i}" for i in range(shape[0])) if shape else (name,)
+        field = dtype[name]
+        kind = pa.binary(field.itemsize) if field.kind == "V" else pa.from_numpy_dtype(field.base)
+        if field.shape:
+            yield from (
+                (f"{name}_{i}", pa.from_numpy_dtype(field.base)) for i in range(field.shape[0])
+            )
+        else:
+            yield name, kind
 
 
 def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
     try:
         table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise CallerError(f"{path}: cannot be read: {error}") from None
-    for column in _columns(dtype):
-        if column not in table.column_names:
+        table.validate(full=True)
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise CallerError(f"{path}: cannot be read: {one_line(error)}") from None
+    for column, kind in _columns(dtype):
+        found = table.schema.get_all_field_indices(column)
+        if not found:
             raise CallerError(f"{path}: has no column {column}, which this scenario's runs have")
+        if len(found) > 1 or table.schema.field(found[0]).type != kind:
+            raise CallerError(f"{path}: column {column} is not one of {kind}")
+        if table.column(found[0]).null_count:
+            raise CallerError(f"{path}: column {column} has holes")
     rows = np.zeros(table.num_rows, dtype)
     for name in dtype.names or ():
         field = dtype[name]

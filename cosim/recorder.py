@@ -12,13 +12,14 @@ import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.environment import Kind
-from cosim.record import RunRecord, finish_record, tables_of, updates_in
+from cosim.record import RunRecord, finish_record, report_of, tables_of, updates_in
 from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
 from cosim.viewer.recording import RunView, ViewError
 from noack.clock import NS_PER_S
-from noack.errors import ExitStatus
+from noack.errors import ExitStatus, PeerError
+from noack.io.messages import LogLine, heard
 from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
 from noack.io.process import run_process
@@ -27,6 +28,7 @@ from noack.io.telemetry import NOTICES, first_row, missing_ranges, notices_of
 from noack.records import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
+    OWNER,
     SENSOR_MEASUREMENT,
     effective,
 )
@@ -76,6 +78,7 @@ class Recorder:
         self._reports: dict[str, Any] = {}
         self._gone: set[str] = set()
         self._out_of_order = False
+        self._junk = 0
         self._account: dict[str, Any] = {
             "t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None,
             "live": live,
@@ -136,15 +139,32 @@ class Recorder:
     def _take(self, sample: zenoh.Sample) -> None:
         role, table = str(sample.key_expr).split("/")[-2:]
         payload = sample.payload.to_bytes()
-        first = first_row(sample.attachment.to_bytes()) if sample.attachment is not None else 0
-        if table == NOTICES:
+        try:
+            header = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._keep(role, table, first_row(header), payload)
+        except (PeerError, ValueError) as error:
+            if not self._junk:
+                print(f"noack recorder: ignored what is no telemetry: {error}", file=sys.stderr)
+            self._junk += 1
+
+    def _keep(self, role: str, table: str, first: int, payload: bytes) -> None:
+        """Keep a batch, and show it.
+
+        Raises:
+            PeerError: it is none of a process of this run.
+            ValueError: its rows are not whole.
+        """
+        if table == NOTICES and role in LOOP_ROLES:
+            notice = heard(LogLine, payload)
             self._spool.append(notices_of(role), first, payload)
             if self._feed is not None:
-                self._feed.log(json.loads(payload) | {"process": role})
+                self._feed.log(notice | {"process": role})
             return
-        if table not in self._types:
-            return
+        if table not in self._types or OWNER[table] != role:
+            raise PeerError(f"{role} has no table {table}")
         rows = np.frombuffer(payload, self._types[table])
+        if not len(rows):
+            raise PeerError("a batch without rows")
         self._spool.append(table, first, payload)
         got = self._got.setdefault(table, [])
         following = got[-1][1] if got else 0
@@ -156,6 +176,7 @@ class Recorder:
             if self._feed is not None:
                 self._feed.add(table, rows)
 
+    @np.errstate(all="ignore")  # a run may diverge
     def _count(self, table: str, rows: np.ndarray[Any, np.dtype[np.void]]) -> None:
         account = self._account
         if table == SENSOR_MEASUREMENT:
@@ -176,13 +197,23 @@ class Recorder:
 
     def _goodbye(self, query: zenoh.Query) -> None:
         role = str(query.key_expr).rpartition("/")[2]
-        report = json.loads(query.payload.to_string()) if query.payload is not None else {}
+        try:
+            report = self._report(role, query)
+        except PeerError as error:
+            self._plane.refuse(query, str(error))
+            return
         # Telemetry travels at lower priority: what was sent before may still be under way.
         self._await_rows(report["rows"])
         missing = self._missing(report["rows"])
         if not missing:
             self._reports[role] = report
         self._plane.answer(query, missing)
+
+    def _report(self, role: str, query: zenoh.Query) -> dict[str, Any]:
+        if role not in LOOP_ROLES:
+            raise PeerError(f"{role} has nothing to report")
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        return report_of(role, payload, self._types)
 
     def _await_rows(self, totals: dict[str, int]) -> None:
         deadline_s = time.monotonic() + 0.3

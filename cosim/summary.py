@@ -109,7 +109,9 @@ def _summarise(
         ),
         "lateness_us": {role: _lateness(record, role) for role in LOOP_ROLES if live},
         "latency_us": _latency(record) if live else None,
-        "realtime": {role: report["realtime"] for role, report in record.reports.items() if live},
+        "realtime": {
+            role: report.get("realtime") or {} for role, report in record.reports.items() if live
+        },
         "diverged_at_s": diverged_at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }

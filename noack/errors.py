@@ -14,9 +14,16 @@ class ExitStatus(IntEnum):
 
 
 class NoackError(Exception):
-    """An error that is reported to a person as one line, without a traceback."""
+    """An error that is reported to a person as one line, without a traceback.
+
+    Of several mistakes each has a line. What was wrong is quoted, and may be anything: what cannot
+    be printed is escaped.
+    """
 
     exit_status = ExitStatus.FAILED
+
+    def __str__(self) -> str:
+        return "\n".join(map(printable, super().__str__().split("\n")))
 
 
 class CallerError(NoackError):
@@ -39,3 +46,17 @@ class NeverStartedError(NoackError):
     def __init__(self, message: str, exit_status: ExitStatus) -> None:
         super().__init__(message)
         self.exit_status = exit_status
+
+
+def one_line(error: BaseException) -> str:
+    """Return what an error of somebody else's says, which may be of several lines, as one."""
+    return " ".join(str(error).split())
+
+
+def printable(text: str) -> str:
+    r"""Return a text as one line in which what cannot be printed is escaped (``\x1b``, ``\n``)."""
+    if text.isprintable():
+        return text
+    return "".join(
+        one if one.isprintable() else one.encode("unicode_escape").decode() for one in text
+    )

@@ -18,6 +18,7 @@ MOST_DELAY_S = 3600.0
 """So that a few delays together, drawn from a Pareto distribution, fit into 64 bits of ns."""
 
 DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
+Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 FileName = Annotated[str, Field(min_length=1)]
 
 
@@ -334,7 +335,7 @@ class LinkSettings(Section):
 
     impairments: tuple[Impairment, ...] = ()
     """Applied in this order."""
-    mansd: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    mansd: Mansd | None = None
     """M − 1: at most so many successive datagrams of a flow are not effectively delivered."""
     first_delivered: bool = False
     """The first datagram of each flow is delivered, whatever the impairments say."""

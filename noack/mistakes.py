@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from noack.errors import printable
+
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
     "or digit, at most 64",
@@ -31,10 +33,18 @@ def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[
     mistakes = error.errors()
     places = [mistake["loc"] for mistake in mistakes]
     return [
-        f"{source}: {_explain(mistake, root)}"
+        printable(f"{source}: {_explain(mistake, root)}")
         for mistake in mistakes
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
     ]
+
+
+def brief(error: ValidationError) -> str:
+    """Return the first mistake, ``key: what is wrong``, without the value, which may be secret."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return printable(f"{place}: {message}" if place else message)
 
 
 def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:

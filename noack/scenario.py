@@ -11,7 +11,15 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.clock import NS_PER_S
 from noack.errors import CallerError
-from noack.impairments import Impairment, LinkSettings, Loss, Lossless, LossOf, require_scores
+from noack.impairments import (
+    Impairment,
+    LinkSettings,
+    Loss,
+    Lossless,
+    LossOf,
+    Mansd,
+    require_scores,
+)
 from noack.matrices import (
     Row,
     Rows,
@@ -26,6 +34,8 @@ from noack.triggers import AnyTrigger, Decaying, require_on_grid
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
+_LEAST_RATE_HZ = 1e-9
+"""Its period in nanoseconds fits into 64 bits."""
 _TIMEOUT_PERIODS = 5
 
 
@@ -35,6 +45,8 @@ def period_ns(rate_hz: float) -> int:
 
 
 def _require_whole_period(rate_hz: float, key: str) -> None:
+    if rate_hz < _LEAST_RATE_HZ:
+        raise ValueError(f"{key}: must be at least {_LEAST_RATE_HZ:g}")
     whole_ns = period_ns(rate_hz)
     if whole_ns < 1 or abs(NS_PER_S / whole_ns - rate_hz) > 1e-12 * rate_hz:
         raise ValueError(
@@ -175,7 +187,7 @@ class Acknowledgements(Section):
 
     loss: Loss = Lossless()
     """What is lost of the acknowledgements."""
-    mansd: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    mansd: Mansd | None = None
     """At most so many successive acknowledgements are lost; without it, any number."""
     impairments: tuple[Impairment, ...] = ()
     """What else happens to them, in this order, after the loss."""
@@ -199,7 +211,7 @@ class Acknowledgements(Section):
 class Network(Section):
     """The lossy network between sensor and controller."""
 
-    mansd: Annotated[int, Field(ge=0, le=1_000_000)]
+    mansd: Mansd
     """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
     loss: Loss
     """What is lost, before the cap."""

@@ -8,7 +8,7 @@ from typing import Any
 import tomli_w
 
 from noack import toml_file
-from noack.errors import CallerError
+from noack.errors import CallerError, printable
 from noack.impairment_files import read_impairment, read_loss
 from noack.scenario import Acknowledgements, Network, Scenario
 
@@ -84,13 +84,14 @@ def json_schema() -> dict[str, Any]:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        raise CallerError(f"--set {override}: write it as key=value, e.g. trigger.beta=0.3")
+        shown = printable(override)
+        raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text  # a bare word is taken as a string
     except (ValueError, RecursionError) as error:
-        raise CallerError(f"--set {key}: not valid TOML: {error}") from None
+        raise CallerError(printable(f"--set {key}: not valid TOML: {error}")) from None
     put(content, key.strip(), value, f"--set {override}")
 
 
@@ -111,5 +112,5 @@ def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
     for part in path:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise CallerError(f"{source}: {part} is not a table")
+            raise CallerError(printable(f"{source}: {part} is not a table"))
     table[last] = value

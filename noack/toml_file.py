@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from noack.errors import CallerError
+from noack.errors import CallerError, printable
 from noack.mistakes import explain
 
 M = TypeVar("M", bound=BaseModel)
@@ -29,7 +29,7 @@ def read(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise CallerError(f"{path}: not valid TOML: {error}") from None
+        raise CallerError(printable(f"{path}: not valid TOML: {error}")) from None
 
 
 def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
@@ -42,7 +42,7 @@ def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
         # Through JSON, because strict validation takes arrays for tuples only there.
         return model.model_validate_json(json.dumps(content, default=_unfit))
     except TypeError as error:
-        raise CallerError(f"{source}: {error}") from None
+        raise CallerError(printable(f"{source}: {error}")) from None
     except ValidationError as error:
         raise CallerError("\n".join(explain(error, source, model))) from None
 

@@ -48,6 +48,7 @@ from noack.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments import Delay, LinkSettings, LossOf, Trace
 from noack.io.plane import cause_of, star_config
 from noack.io.udp import LOOPBACK, free_tcp_port
+from noack.mistakes import brief
 
 USER = "netem"
 _TOKEN_BYTES = 32
@@ -203,7 +204,7 @@ class ControlServer:
         try:
             change = Change.model_validate_json(json.dumps(content))
         except ValidationError as error:
-            raise CallerError(_one_line(error)) from None
+            raise CallerError(brief(error)) from None
         settings = change.settings
         if settings is None:
             settings = settings_of(change.words or [])
@@ -239,10 +240,3 @@ def _require_read(settings: LinkSettings) -> None:
         else:
             continue
         raise CallerError(f"{file}: read the file first, and send what it says as settings")
-
-
-def _one_line(error: ValidationError) -> str:
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"]))
-    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    return f"{place}: {message}" if place else message

@@ -13,8 +13,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from pydantic import TypeAdapter, ValidationError
+
 from noack.errors import CallerError, PeerError
 from noack.io.private import make_private, private_folder, require_name, require_private
+from noack.mistakes import brief
 
 
 class Session(NamedTuple):
@@ -25,6 +28,9 @@ class Session(NamedTuple):
     """zenoh endpoint, e.g. ``tcp/127.0.0.1:7447``."""
     token: str
     """The secret; see :mod:`netem.control.server`."""
+
+
+_SESSION = TypeAdapter(Session)
 
 
 def _folder() -> Path:
@@ -138,6 +144,7 @@ def find(name: str | None) -> Session:
     elif name not in names:
         raise CallerError(f"no emulator {name!r} runs; there are {', '.join(names)}")
     try:
-        return Session(**json.loads(_path_of(name).read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        raise PeerError(f"emulator {name!r}: its session file cannot be read: {error}") from None
+        return _SESSION.validate_json(_path_of(name).read_bytes(), strict=True)
+    except (OSError, ValidationError) as error:
+        what = brief(error) if isinstance(error, ValidationError) else error.strerror
+        raise PeerError(f"emulator {name!r}: its session file cannot be read: {what}") from None

@@ -1,21 +1,24 @@
 """Reads fate traces back, as the decisions that a link takes again in a replay."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
 
 from netem.engine.api import DIRECTIONS, Direction
 from netem.fates.trace import FORMAT, METADATA, SCHEMA
 from netem.records import Decision
-from noack.errors import CallerError
+from noack.errors import CallerError, one_line
+from noack.impairments import Mansd
 from noack.records import Fate
 
+_LONGEST_NS = 2**62
+"""No delay is longer; added to a time it stays within 64 bits."""
 _LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 
 
@@ -57,14 +60,14 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             here = (columns["link"] == link) & (columns["direction"] == direction)
             rows = {name: column[here] for name, column in columns.items()}
             found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
-            cap = settings[link][direction]["mansd"]
+            cap = getattr(settings[link], direction).mansd
             # It may have been changed on the way.
             kept = cap is not None and rows["run"].max(initial=0) <= cap
             caps[link, direction] = cap if kept else None
     return Fates(found, caps)
 
 
-def _read(path: Path) -> tuple[pa.Table, Mapping[str, Any]]:
+def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
     """Return a trace's table, and what its links did at its start, by name."""
     try:
         with pq.ParquetFile(path) as file:
@@ -72,29 +75,51 @@ def _read(path: Path) -> tuple[pa.Table, Mapping[str, Any]]:
             if not file.schema_arrow.equals(SCHEMA):
                 raise CallerError(f"{path}: is no fate trace: its columns are others")
             table = file.read()
+            table.validate(full=True)
     except pa.ArrowInvalid:
         raise CallerError(
             f"{path}: is no fate trace, or one that was not finished as the emulator was killed"
         ) from None
-    except OSError as error:
-        raise CallerError(f"{path}: cannot be read ({error})") from None
-    if document["missing_events"]:
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise CallerError(f"{path}: cannot be read ({one_line(error)})") from None
+    if document.missing_events or any(column.null_count for column in table.columns):
         raise CallerError(
-            f"{path}: {document['missing_events']} events are missing; "
+            f"{path}: {document.missing_events or 'some'} events are missing; "
             "a trace with holes cannot be replayed"
         )
-    return table, {link["name"]: link for link in document["links"]}
+    return table, {link.name: link for link in document.links}
 
 
-def _document(path: Path, text: bytes | None) -> Mapping[str, Any]:
+class _Direction(BaseModel):
+    mansd: Mansd | None
+
+
+class _Link(BaseModel):
+    name: str
+    forward: _Direction
+    back: _Direction
+
+
+class _Header(BaseModel):
+    format: int
+    version: str
+
+
+class _Document(_Header):
+    """What is needed of a trace's metadata."""
+
+    missing_events: Annotated[int, Field(ge=0)]
+    links: list[_Link]
+
+
+def _document(path: Path, text: bytes | None) -> _Document:
     try:
-        document: Mapping[str, Any] = json.loads(text or b"")
-        written_by, kind = document["version"], document["format"]
-    except (ValueError, LookupError, TypeError):
+        header = _Header.model_validate_json(text or b"", strict=True)
+        if header.format != FORMAT:
+            raise CallerError(f"{path}: is of another format, that of noack {header.version}")
+        return _Document.model_validate_json(text or b"", strict=True)
+    except ValidationError:
         raise CallerError(f"{path}: is no fate trace of this program") from None
-    if kind != FORMAT:
-        raise CallerError(f"{path}: is of another format, that of noack {written_by}")
-    return document
 
 
 def _flows(
@@ -133,6 +158,7 @@ def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> Non
         & (rows["flow"] < most_flows)
         & np.where(lost, (delay == -1) & (copy == -1), delay >= 0)
         & ((copy == -1) | (copy >= delay))
+        & (np.maximum(delay, copy) <= _LONGEST_NS)
         & (rows["bit"] >= -1)
         & (rows["copy_bit"] >= -1)
     )

@@ -95,9 +95,10 @@ def _time_s(text: str) -> float:
 @_exact
 def _own_time_s(text: str) -> float:
     number, unit = _split(text)
-    if unit == "" and number != 0:
+    scale = _TIME_UNITS.get(unit.lower())
+    if scale is None and (unit or number != 0):
         raise ValueError
-    return _float(number * _TIME_UNITS[unit.lower()]) if unit else 0.0
+    return 0.0 if scale is None else _float(number * scale)
 
 
 @_exact

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import NoReturn, TypeVar
 
 from netem.words.quantities import Quantity
-from noack.errors import CallerError
+from noack.errors import CallerError, printable
 
 T = TypeVar("T")
 
@@ -34,7 +34,7 @@ class Reader:
     @property
     def clause(self) -> str:
         """What has been taken of this clause, for messages."""
-        text = shlex.join(self._clause)
+        text = printable(shlex.join(self._clause))
         return text if len(text) <= 80 else text[:77] + "..."
 
     def wrong(self, expected: str) -> NoReturn:
@@ -126,4 +126,4 @@ def _split(text: str) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError:
-        raise CallerError(f"{text}: a quotation is not closed") from None
+        raise CallerError(f"{printable(text)}: a quotation is not closed") from None

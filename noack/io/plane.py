@@ -107,7 +107,8 @@ class Plane:
         if self._stop_reason is None:
             sample = self._stops.try_recv()
             if sample is not None:
-                self._stop_reason = sample.payload.to_string() or "stopped"
+                reason = sample.payload.to_bytes().decode(errors="replace")
+                self._stop_reason = reason or "stopped"
         return self._stop_reason
 
     def coordinator_gone(self) -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
+from noack.io.messages import BatchHeader, heard
 from noack.machine import Notice, Record
 
 _BATCH_ROWS = 256
@@ -98,8 +99,13 @@ def _header(first: int, rows: int) -> bytes:
 
 
 def first_row(header: bytes) -> int:
-    """Number of a batch's first row, from its header."""
-    return int(json.loads(header)["first"])
+    """Number of a batch's first row, from its header.
+
+    Raises:
+        PeerError: it is no header of a batch.
+    """
+    first: int = heard(BatchHeader, header)["first"]
+    return first
 
 
 def notices_of(role: str) -> str:

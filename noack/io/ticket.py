@@ -14,14 +14,29 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, ValidationError
 
 from noack.errors import CallerError, PeerError
 from noack.io.private import make_private, private_folder, require_name, require_private
+from noack.mistakes import brief
 from noack.scenario import Scenario
+from noack.section import Section, Seed
 from noack.wire import KEY_BYTES
 
 DEFAULT_SESSION = "default"
+
+
+class _Fields(Section):
+    """A ticket as JSON."""
+
+    run_id: Seed
+    key: Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * KEY_BYTES}}}$")]
+    endpoint: str
+    run_dir: str
+    launched: bool
+    scenario: Scenario
 
 
 class Ticket(NamedTuple):
@@ -64,12 +79,10 @@ def loads(text: str) -> Ticket:
         CallerError: the text is not a ticket.
     """
     try:
-        fields: dict[str, Any] = json.loads(text)
-        fields["key"] = bytes.fromhex(fields["key"])
-        fields["scenario"] = Scenario.model_validate_json(json.dumps(fields["scenario"]))
-        return Ticket(**fields)
-    except (ValueError, TypeError, KeyError) as error:
-        raise CallerError(f"not a ticket of this version of noack: {error}") from None
+        fields = _Fields.model_validate_json(text)
+    except ValidationError as error:
+        raise CallerError(f"not a ticket of this version of noack: {brief(error)}") from None
+    return Ticket(**dict(fields) | {"key": bytes.fromhex(fields.key)})
 
 
 def ticket_path(session: str) -> Path:

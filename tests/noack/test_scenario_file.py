@@ -215,6 +215,8 @@ LANE_MISTAKES = [
     ("network.loss.probability=-0.5", "network.loss.probability = -0.5: ", "or equal to 0"),
     ("plant.measure_every=0", "plant.measure_every = 0: ", "greater than or equal to 1"),
     ("plant.rate_hz=0", "plant.rate_hz = 0: ", "should be greater than 0"),
+    ("plant.rate_hz=5e-324", "plant.rate_hz = 5e-324: ", "must be at least 1e-09"),
+    ("controller.rate_hz=1e-10", "controller.rate_hz = 1e-10: ", "must be at least 1e-09"),
     ("plant.rate_hz=1e6", "plant.rate_hz = 1000000.0: ", "less than or equal to 100000"),
     ("controller.phase=1", "controller.phase = 1: ", "should be less than 1"),
     ("seeds.plant=-1", "seeds.plant = -1: ", "greater than or equal to 0"),

@@ -250,6 +250,8 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("rate 1mbit queue 0", "rate 1mbit queue 0: queue should be greater than or equal to 1"),
         ("queue 5", "queue: goes right after rate RATE"),
         ("blackout 2-3", "blackout 2-3: expected a time in s, ms, us or ns, e.g. 10ms"),
+        ("delay 1ms samples 1%,2ms", "delay 1ms samples 1%,2ms: expected delays with their units"),
+        ("loss trace 'a\nb", r"loss trace 'a\nb: a quotation is not closed"),
         ("blackout 2s", "blackout 2s: expected intervals of time, e.g. 2s-3s,5s-5500ms"),
         ("blackout 3s-2s", "blackout 3s-2s: intervals_s: each must end after it begins"),
         ("blackout 1s-3s every 2s", "every_s: the intervals last longer, until 3 s"),

@@ -1,0 +1,132 @@
+"""What a summary needs to be shown; one of an earlier version may lack it, a damaged one does."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+Reals = dict[str, float]
+Number = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Counts = dict[str, Number]
+
+
+class _Part(BaseModel):
+    """Part of a summary; it may hold more."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+
+class _Assumption(_Part):
+    what: str
+    source: str
+    verdict: str
+    why: str
+
+
+class _Violation(_Part):
+    t_s: float
+    process: str
+    what: str
+
+
+class _Quantiles(_Part):
+    p50: float | None
+    p99: float | None
+    p999: float | None
+    max: float | None
+
+
+class _Lateness(_Quantiles):
+    steps: Number
+    late_steps: Number
+
+
+class _Latency(_Quantiles):
+    updates: Number
+
+
+class _Acknowledgements(_Part):
+    sent: Number
+    lost: Number
+    longest_loss_run: Number
+
+
+class _Place(_Part):
+    table: str
+    row: Number
+    column: str
+
+
+class _Replay(_Part):
+    bit_exact: bool | None
+    inputs: Number = 0
+    complete: bool = True
+    first_difference: _Place | None = None
+
+
+class _Compared(_Part):
+    reason: None
+    rms_x: float
+    rms_x_live: float
+    explained_relative: float
+    shares: Reals
+
+
+class _NotCompared(_Part):
+    reason: str
+
+
+class _Claim(_Part):
+    what: str
+    source: str
+    bound: str
+    ratio: float | None
+    verdict: Literal["held", "violated", "void"]
+    since_s: float | None
+    why: str
+
+
+class _Shown(_Part):
+    kind: Literal["live", "simulated"] = "live"
+    scenario: str
+    mode: str
+    mansd: Number
+    horizon_s: float
+    reached_s: float
+    events: Number
+    deliveries: Number
+    drops: Number
+    drops_by_cause: Counts | None = None
+    forced_deliveries: Number
+    longest_drop_run: Number
+    assumption_violations: list[_Violation]
+    assumptions: list[_Assumption]
+    missing_samples: Number
+    missing_by_table: Counts
+    lost_outside_netem: Number
+    lost_by_leg: Counts
+    rejected_datagrams: dict[str, Counts]
+    inter_event_min_s: float | None
+    inter_event_median_s: float | None
+    inter_delivery_median_s: float | None
+    initial_state_norm: float | None
+    final_state_norm: float | None
+    sup_e_s_norm: float | None
+    sup_e_c_norm: float | None
+    identity_residual_relative: float | None
+    lateness_us: dict[str, _Lateness]
+    latency_us: _Latency | None
+    realtime: dict[str, dict[str, str]]
+    acknowledgements: _Acknowledgements | None = None
+    replay: _Replay | None = None
+    fidelity: _Compared | _NotCompared | None = None
+    claims: list[_Claim] | None = None
+
+
+def can_be_shown(summary: Mapping[str, Any]) -> bool:
+    """Whether a summary has all that is shown of it, and of the right kind."""
+    try:
+        shown = _Shown.model_validate(summary)
+    except ValidationError:
+        return False
+    return shown.latency_us is not None or not shown.lateness_us

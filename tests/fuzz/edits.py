@@ -1,0 +1,113 @@
+"""Valid content, edited: the parser's own keys and values, where they do not belong."""
+
+import copy
+import datetime
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from tests.fuzz.choices import Choices
+
+
+class Vocabulary(NamedTuple):
+    """What edits put in."""
+
+    keys: Sequence[str]
+    words: Sequence[str]
+    dates: bool = False
+    """Whether the format has dates, and no null, as TOML."""
+
+
+def vocabulary(schema: Mapping[str, Any], *, dates: bool = False) -> Vocabulary:
+    """The keys and the constant strings of a JSON Schema, in order."""
+    keys, words = dict[str, None](), dict[str, None]()
+    parts: list[Any] = [schema]
+    while parts:
+        part = parts.pop(0)
+        if isinstance(part, Mapping):
+            keys |= dict.fromkeys(part.get("properties", {}))
+            constants = [part.get("const"), part.get("default"), *part.get("enum", ())]
+            words |= dict.fromkeys(one for one in constants if isinstance(one, str))
+            parts += part.values()
+        elif isinstance(part, list):
+            parts += part
+    return Vocabulary(tuple(keys), tuple(words), dates)
+
+
+def edited(choices: Choices, tree: Any, known: Vocabulary, most: int = 6) -> Any:
+    """A copy of a tree of dicts and lists with some edits."""
+    root = {"": copy.deepcopy(tree)}
+    for _ in range(choices.below(most)):
+        _edit(choices, root[""], known)
+    return root[""]
+
+
+def value(choices: Choices, known: Vocabulary, depth: int = 0) -> Any:
+    """Any value."""
+    match choices.below(9 if depth < 3 else 6):
+        case 0:
+            return choices.integer()
+        case 1:
+            return choices.real()
+        case 2:
+            return choices.flag()
+        case 3:
+            return choices.one(known.words) if known.words else ""
+        case 4:
+            return choices.text()
+        case 5:
+            return datetime.date(1970, 1, 1) if known.dates else None
+        case 6:
+            return [value(choices, known, depth + 1) for _ in range(choices.below(4))]
+        case 7:
+            return {
+                key(choices, known): value(choices, known, depth + 1)
+                for _ in range(choices.below(4))
+            }
+        case _:
+            nested: Any = value(choices, known, depth + 1)
+            for _ in range(choices.below(20)):
+                nested = [nested]
+            return nested
+
+
+def key(choices: Choices, known: Vocabulary) -> str:
+    """A key that the format has, or any."""
+    return choices.one(known.keys) if known.keys and choices.below(8) else choices.text()
+
+
+def _edit(choices: Choices, tree: Any, known: Vocabulary) -> None:
+    places = list(_containers(tree))
+    if not places:
+        return
+    container = choices.one(places)
+    at: Any
+    if isinstance(container, dict):
+        at = choices.one(list(container)) if container and choices.below(3) else key(choices, known)
+    elif container:
+        at = choices.below(len(container))
+    else:
+        container.append(value(choices, known))
+        return
+    match choices.below(5):
+        case 0 | 1:
+            container[at] = value(choices, known)
+        case 2:
+            container[at] = copy.deepcopy(choices.one(places))
+        case 3 if isinstance(container, list):
+            container.insert(at, copy.deepcopy(container[at]))
+        case _ if isinstance(container, dict):
+            container.pop(at, None)
+        case _:
+            del container[at]
+
+
+def _containers(tree: Any) -> Any:
+    """Tables and lists of a tree; of a long list the first entries only."""
+    if isinstance(tree, dict):
+        yield tree
+        for one in tree.values():
+            yield from _containers(one)
+    elif isinstance(tree, list):
+        yield tree
+        for one in tree[:4]:
+            yield from _containers(one)

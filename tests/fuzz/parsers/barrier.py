@@ -1,0 +1,57 @@
+"""What the coordinator takes: joins, words of leave and progress, from anybody on the plane."""
+
+import json
+from typing import Any
+from unittest.mock import patch
+
+from cosim import coordinator
+from noack.topology import ROLES
+from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.parsers.ticket import _TICKET
+from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.fuzz.tables import damaged
+
+HELLO = {"pid": 1, "address": ["127.0.0.1", 47001]}
+PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None}
+KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
+
+
+def one_input(data: bytes) -> None:
+    choices = Choices(data)
+    plane = FakePlane()
+    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+        barrier = coordinator.Coordinator(_TICKET)
+    queries: dict[str, list[Query]] = {}
+    for _ in range(choices.below(12)):
+        role = choices.one([*ROLES, "nobody", ""])
+        match choices.below(4):
+            case 0:
+                plane.put("left", Sample(f"noack/0/left/{role}", _bytes(choices, "gone")))
+            case 1:
+                plane.put("progress", Sample("noack/0/progress", _bytes(choices, PROGRESS)))
+                account = barrier.progress()
+                assert account is None or account.keys() >= PROGRESS.keys()
+            case _:
+                query = Query(f"noack/0/join/{role}", _bytes(choices, HELLO))
+                queries.setdefault(role, []).append(query)
+                plane.put("join", query)
+        barrier.poll()
+    for role, asked in queries.items():
+        if barrier.epoch_ns is not None or role not in ROLES:
+            # Who asks again has given up the question before.
+            assert asked[-1].answered, "who asks to join waits for an answer"
+    for answer in plane.answers:
+        for host, port in answer["addresses"].values():
+            assert isinstance(host, str)
+            assert 0 < port <= 65_535
+    barrier.stop("the end")
+    assert all(asked[-1].answered for asked in queries.values())
+
+
+def _bytes(choices: Choices, content: Any) -> bytes | None:
+    if choices.flag():
+        return json.dumps(content).encode()
+    if choices.below(8) == 1:
+        return None
+    return damaged(choices, json.dumps(edited(choices, content, KNOWN)).encode())

@@ -1,0 +1,53 @@
+"""Campaign files: text as it stands, or, after a zero byte, valid ones edited."""
+
+from unittest.mock import patch
+
+import tomli_w
+
+from cosim.campaign.grid import grid
+from cosim.campaign.plan import json_schema, load
+from noack.errors import NoackError
+from tests.fuzz.choices import EDITS, Choices
+from tests.fuzz.edits import Vocabulary, edited, vocabulary
+from tests.fuzz.files import bases, quoted, write_named
+from tests.fuzz.harness import FOLDER, refusal, workspace
+
+_SCHEMA = vocabulary(json_schema(), dates=True)
+KNOWN = Vocabulary(
+    (*_SCHEMA.keys, "network.mansd", "trigger.beta", "trigger", "network.loss", "plant.rate_hz"),
+    (*_SCHEMA.words, "lane_following", "decaying", "network.mansd", "beta", "policy"),
+    dates=True,
+)
+SEEDS = [
+    *EDITS,
+    *(path.read_bytes() for path in sorted((FOLDER.parents[1] / "campaigns").glob("*.toml"))),
+]
+WORDS = quoted(KNOWN)
+BASES = bases("campaigns")
+_MOST_POINTS = 8
+"""Of which scenarios are made; more of them would be more of the same."""
+
+
+def one_input(data: bytes) -> None:
+    if data[:1] == b"\0":
+        choices = Choices(data[1:])
+        data = tomli_w.dumps(edited(choices, choices.one(BASES), KNOWN)).encode()
+    path = write_named(workspace(), "campaign.toml", data)
+    with refusal(str(path), lines=True):
+        campaign = load(path)
+        chosen = list(campaign.selected({}))[:_MOST_POINTS]
+        shorter = campaign.model_copy()
+        # The guarantee of a point is a computation, not part of reading the file.
+        with (
+            patch("cosim.campaign.grid.certified_error", return_value=None),
+            patch.object(type(campaign), "selected", lambda *_: iter(chosen)),
+        ):
+            try:
+                grid(shorter, path)
+            except NoackError as error:
+                # What the scenario itself says stands in another file.
+                if not str(error).startswith(str(path)):
+                    with refusal(lines=True):
+                        raise
+                    return
+                raise

@@ -1,0 +1,86 @@
+"""What a running emulator is asked over zenoh, by who knows the secret and who does not."""
+
+import json
+from typing import Any
+
+from netem.control.server import Change, ControlServer
+from netem.engine.api import DIRECTIONS
+from noack.impairments import LinkSettings
+from tests.fuzz.choices import EDITS, Choices
+from tests.fuzz.edits import Vocabulary, edited, vocabulary
+from tests.fuzz.parsers.words import EXAMPLES, sentence
+from tests.fuzz.plane import Query
+from tests.fuzz.tables import damaged
+from tests.netem.control.relays import FakeRelay
+
+TOKEN = "00" * 32
+_SCHEMA = vocabulary(Change.model_json_schema())
+KNOWN = Vocabulary(("token", *_SCHEMA.keys), (*_SCHEMA.words, TOKEN, "up", "down", *EXAMPLES))
+BASES: list[dict[str, Any]] = [
+    {"token": TOKEN, "link": "up", "direction": "both", "words": "loss 5% mansd 4"},
+    {"token": TOKEN, "link": "down", "words": ["delay", "10ms", "2ms"]},
+    {
+        "token": TOKEN, "link": "up",
+        "settings": {
+            "mansd": 3,
+            "impairments": [
+                {"kind": "loss", "loss": {"model": "gilbert_elliott", "mean_loss": 0.1,
+                                          "mean_burst": 3.0}},
+                {"kind": "delay", "delay_s": 0.1, "jitter_s": 0.1, "distribution": "normal"},
+                {"kind": "rate", "rate_bps": 1000},
+            ],
+        },
+    },
+]  # fmt: skip
+SEEDS = [*EDITS, *(json.dumps(base).encode() for base in BASES)]
+WORDS = [json.dumps(word).encode() for word in (*KNOWN.keys, *KNOWN.words)]
+
+
+class _AtOnce:
+    """Errands that are done at once, in this thread."""
+
+    def __init__(self) -> None:
+        self.relay = FakeRelay("up", "down")
+
+    @property
+    def links(self) -> list[str]:
+        return [spec.name for spec in self.relay.specs]
+
+    def change(self, link: str, directions: Any, settings: LinkSettings) -> None:
+        for direction in directions:
+            self.relay.change(link, direction, settings)
+
+    def snapshot(self) -> Any:
+        return _Links(self.relay.report())
+
+
+class _Links:
+    def __init__(self, links: Any) -> None:
+        self.links = links
+
+
+def one_input(data: bytes) -> None:
+    if data[:1] == b"\0":
+        choices = Choices(data[1:])
+        base = json.loads(json.dumps(choices.one(BASES)))
+        if "words" in base and choices.flag():
+            base["words"] = sentence(choices)
+        data = damaged(choices, json.dumps(edited(choices, base, KNOWN)).encode())
+    errands = _AtOnce()
+    server = ControlServer("test", errands)  # type: ignore[arg-type]
+    server._token = TOKEN
+    before = dict(errands.relay.settings)
+    query = Query("netem/test/change", data)
+    server._reply(query, server._change)  # type: ignore[arg-type]
+    assert query.answered == 1
+    if query.error is not None:
+        assert "an error of the emulator's own" not in query.error
+        assert query.error.isprintable()
+        assert errands.relay.settings == before, "what is refused changes nothing"
+    else:
+        assert TOKEN.encode() in data, "nobody changes anything without the secret"
+        said = json.loads(query.replies[0])["links"]
+        for link in said:
+            for direction in DIRECTIONS:
+                settings = LinkSettings.model_validate_json(json.dumps(link[direction]["settings"]))
+                assert settings == errands.relay.settings[link["name"], direction]

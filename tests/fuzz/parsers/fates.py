@@ -1,0 +1,72 @@
+"""Fate traces: a valid one with its table, its document or its bytes edited."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from netem.engine.api import LinkSpec
+from netem.fates.replay import read_fates
+from netem.fates.trace import METADATA, SCHEMA, description
+from netem.link import Link
+from netem.words.parser import settings_of
+from noack.impairments import LinkSettings
+from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.harness import refusal, workspace
+from tests.fuzz.tables import edited_table, written
+
+_LATEST_NS = 2**62
+"""Beyond every arrival: a century of Unix time."""
+SPECS = [
+    LinkSpec("up", ("127.0.0.1", 9000), ("127.0.0.1", 9001), settings_of("loss 5% mansd 2"),
+             LinkSettings()),
+    LinkSpec("down", ("127.0.0.1", 9002), ("127.0.0.1", 9003), LinkSettings(), LinkSettings()),
+]  # fmt: skip
+DOCUMENT: dict[str, Any] = json.loads(description(SPECS, 0)[METADATA])
+KNOWN = Vocabulary((*DOCUMENT, "name", "forward", "back", "mansd", "seed"), ("up", "down", "1", ""))
+
+
+def _rows() -> pa.Table:
+    """What a relay may have recorded: lost, delivered, late, duplicated, corrupted, overflowed."""
+    rows = [
+        # link, direction, flow, packet, arrival, size, fate, run, delay, copy, bit, bit, held
+        ("up", "forward", 0, 0, 10, 100, 0, 0, 5, -1, -1, -1, 0),
+        ("up", "forward", 0, 1, 20, 100, 1, 1, -1, -1, -1, -1, 0),
+        ("up", "forward", 1, 0, 21, 100, 4, 1, -1, -1, -1, -1, 0),
+        ("up", "forward", 0, 2, 30, 100, 3, 2, 7, 9, 13, -1, 0),
+        ("up", "back", 0, 0, 35, 100, 0, 0, 0, -1, -1, -1, 0),
+        ("up", "forward", 0, 3, 40, 100, 2, 0, 5, -1, -1, -1, 3),
+    ]
+    columns = zip(*rows, strict=True)
+    return pa.table([pa.array(c, f.type) for c, f in zip(columns, SCHEMA, strict=True)], SCHEMA)
+
+
+TABLE = _rows()
+
+
+def one_input(data: bytes) -> None:
+    choices = Choices(data)
+    document: Any = edited(choices, DOCUMENT, KNOWN) if choices.flag() else DOCUMENT
+    text = json.dumps(document)
+    if choices.below(8) == 1:
+        text = choices.one(["", "[]", "null", "{", text[:-1]])
+    metadata = {METADATA: text} if choices.below(8) != 1 else {}
+    path = workspace() / "fates.parquet"
+    links = choices.one([None, ["up"], ["up", "nobody"], ["down"]])
+    path.write_bytes(written(choices, edited_table(choices, TABLE), metadata))
+    with refusal(str(path)):
+        _replay(path, links)
+
+
+def _replay(path: Path, links: list[str] | None) -> None:
+    """Take the decisions of what was read again, which must be possible."""
+    fates = read_fates(path, links)
+    for place, flows in fates.decisions.items():
+        link = Link(LinkSettings(mansd=fates.caps[place]), 0, *place, decisions=flows)
+        for flow, decisions in enumerate(flows):
+            for decision in decisions:
+                # In 64 bits with a sign, as the compiled relay adds.
+                assert _LATEST_NS + max(decision.delay_ns, decision.copy_delay_ns) < 2**63
+                link.decide(flow, 100, 0)

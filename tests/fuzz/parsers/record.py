@@ -1,0 +1,180 @@
+"""Run directories: a short run's files, some of them edited, damaged or gone."""
+
+import io
+import json
+import shutil
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pyarrow.parquet as pq
+from rich.console import Console
+
+from cosim.conclude import Outcome, reopen
+from cosim.environment import changed_since, environment
+from cosim.launch import Ending
+from cosim.record import finish_record, load_record, write_record
+from cosim.replay import replay
+from cosim.run_dir import ENVIRONMENT_FILE, RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.summary import dumps as summary_text
+from cosim.summary import summarise
+from cosim.tables import print_outcome
+from cosim.virtual import simulate
+from noack.io.spool import SpoolWriter
+from noack.io.telemetry import notices_of
+from noack.resolve import resolve
+from noack.scenario_file import dumps, validate
+from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.harness import refusal, workspace
+from tests.fuzz.tables import damaged, edited_table, written
+
+SCENARIO = {
+    "name": "short", "horizon_s": 0.05, "model": {"name": "double_integrator"},
+    "plant": {"initial_state": [1.0, 0.0], "rate_hz": 200.0},
+    "controller": {"rate_hz": 200.0},
+    "trigger": {"beta": 0.01, "alpha_per_s": 0.25},
+    "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.5}},
+}  # fmt: skip
+NOTICE = {"t_ns": 10_000_000, "level": "violation", "text": "MANSD violated", "process": "netem"}
+CLAIM = {
+    "what": "the error is bounded", "source": "Theorem 1", "bound": "‖e‖ ≤ 1", "certified": 1.0,
+    "observed": 0.5, "ratio": 0.5, "verdict": "void", "since_s": 0.01, "why": "late",
+}  # fmt: skip
+FIDELITY = {
+    "reason": None, "rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.01,
+    "shares": {"sampling": 1.0, "unexplained": 0.0},
+}  # fmt: skip
+KNOWN = Vocabulary(
+    ("rows", "ended", "channel", "rejected", "acknowledgements", "realtime", "pid", "plant",
+     "netem", "plant_step", "netem_packet", "t_ns", "level", "text", "process", "kind"),
+    ("horizon", "violation", "live", "simulated", "plant", "tag", ""),
+)  # fmt: skip
+
+
+@cache
+def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
+    """The files of a run that was recorded, by their names."""
+    content: dict[str, Any] = json.loads(json.dumps(SCENARIO))
+    if acknowledged:
+        content["network"]["protocol"] = "ack"
+    resolved = resolve(validate(content, "short"))
+    record = simulate(resolved)
+    record.notices.append(dict(NOTICE))
+    folder = workspace() / f"short-{acknowledged}-{live}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    (folder / SCENARIO_FILE).write_text(dumps(resolved))
+    reports = {
+        role: {**report, "pid": 1, "realtime": {"sched_fifo": "granted"}} if live else report
+        for role, report in record.reports.items()
+    }
+    (folder / REPORTS_FILE).write_text(json.dumps(reports))
+    kind = "live" if live else "simulated"
+    summary = summarise(record, 0, "finished")
+    summary |= {"replay": replay(record).verdict(), "claims": [CLAIM], "fidelity": FIDELITY}
+    (folder / SUMMARY_FILE).write_text(summary_text(summary))
+    (folder / ENVIRONMENT_FILE).write_text(json.dumps(environment(kind) | {"command": []}))
+    write_record(record, folder)
+    writer = SpoolWriter(folder / SPOOL, "recorder")
+    for table in record.tables:
+        rows = record[table]
+        for begin in range(0, len(rows), 4):
+            writer.append(table, begin, rows[begin : begin + 4].tobytes())
+    for number in range(2):
+        writer.append(notices_of("netem"), number, json.dumps(NOTICE).encode())
+    writer.close()
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+
+def one_input(data: bytes) -> None:
+    choices = Choices(data)
+    content = dict(files(choices.flag(), choices.flag()))
+    spooled = choices.below(3)  # recorded, cut short, or recorded with some more in the spool
+    for name in list(content):
+        if (name.startswith(RECORD) and spooled == 1) or (name.startswith(SPOOL) and spooled == 0):
+            del content[name]
+    whole = list(content)
+    for _ in range(choices.below(4)):
+        whole.remove(name := choices.one(whole))
+        changed = _changed(choices, name, content[name])
+        if changed is None:
+            del content[name]
+        else:
+            content[name] = changed
+    run_dir = workspace() / "run"
+    shutil.rmtree(run_dir, ignore_errors=True)
+    for name, data in content.items():
+        (run_dir / name).parent.mkdir(parents=True, exist_ok=True)
+        (run_dir / name).write_bytes(data)
+    with refusal(lines=True):
+        _show(run_dir)
+        _read(run_dir)
+
+
+def _changed(choices: Choices, name: str, data: bytes) -> bytes | None:
+    """The content of a file, changed; None to remove it."""
+    kind = choices.below(4)
+    if kind == 0 and name != SCENARIO_FILE:
+        return None if choices.flag() else damaged(choices, data)
+    if name.endswith(".parquet"):
+        return written(choices, edited_table(choices, _table(data)), {})
+    if name.endswith((".json", ".jsonl")) and kind != 1:
+        lines = data.splitlines() if name.endswith("l") else [data]
+        lines = [edited(choices, json.loads(line), KNOWN) for line in lines]
+        return b"".join(json.dumps(line).encode() + b"\n" for line in lines)
+    if name.startswith(SPOOL) and kind != 1:
+        return _spool(choices, name, data)
+    return damaged(choices, data) if name != SCENARIO_FILE else data
+
+
+def _table(data: bytes) -> Any:
+    path = workspace() / "base.parquet"
+    path.write_bytes(data)
+    return pq.read_table(path)
+
+
+def _spool(choices: Choices, name: str, data: bytes) -> bytes:
+    """A file of the spool with numbers of its rows changed, or a chunk more."""
+    if "notices" in name:
+        payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
+    else:
+        numbers = np.frombuffer(bytearray(data[16:]), "<i8").copy()
+        for _ in range(choices.below(4)):
+            numbers[choices.below(len(numbers))] = int(np.int64(choices.integer() % 2**63))
+        payload = numbers.tobytes()[: choices.one([len(data) - 16, 0, 8, 33])]
+    head = choices.integer() % 2**64, choices.one([len(payload), choices.integer() % 2**64])
+    chunk = np.array(head, "<u8").tobytes() + payload
+    return data + chunk if choices.flag() else chunk
+
+
+def _show(run_dir: Path) -> None:
+    """What `noack summary` does with a summary that is there."""
+
+    def conclude(ending: Ending) -> Outcome:
+        assert isinstance(ending.reason, str)
+        return Outcome(run_dir, ending.status, ending.reason, {})
+
+    with patch("cosim.conclude.conclude", conclude):
+        outcome = reopen(run_dir)
+    changed_since(run_dir)
+    if outcome.summary:
+        print_outcome(Console(file=io.StringIO(), width=80), outcome)
+
+
+def _read(run_dir: Path) -> None:
+    """What the commands on runs do with a run directory."""
+    cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
+    record = finish_record(run_dir) if cut_short else load_record(run_dir)
+    json.loads(summary_text(summarise(record, 0, "finished")))
+    found = replay(record)
+    json.dumps(found.verdict())
+    json.dumps(found.document())
+    if cut_short:
+        again = load_record(run_dir)  # what was finished can be read
+        assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)
+        assert record.notices == again.notices

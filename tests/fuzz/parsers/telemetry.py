@@ -1,0 +1,88 @@
+"""What the recorder takes: batches, notices and goodbyes, from anybody who reaches the plane."""
+
+import io
+import json
+import shutil
+from contextlib import redirect_stderr
+from typing import Any
+
+import numpy as np
+
+from cosim.record import tables_of
+from cosim.recorder import Recorder
+from cosim.run_dir import SCENARIO_FILE
+from noack.io.telemetry import NOTICES
+from noack.records import OWNER
+from noack.resolve import resolve
+from noack.scenario_file import dumps, validate
+from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.harness import workspace
+from tests.fuzz.parsers.record import NOTICE, SCENARIO
+from tests.fuzz.plane import FakePlane, Query, Sample
+from tests.fuzz.tables import damaged
+
+RESOLVED = resolve(validate(SCENARIO, "short"))
+REPORT = {
+    "pid": 1, "ended": "horizon", "realtime": {},
+    "channel": {"accepted": 1, "rejected": {"tag": 1}},
+    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1},
+}  # fmt: skip
+_TYPES = tables_of(RESOLVED)
+HEADER = {"first": 0, "rows": 4}
+KNOWN = Vocabulary(
+    (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
+)
+
+
+def one_input(data: bytes) -> None:
+    choices = Choices(data)
+    run_dir = workspace() / "telemetry"
+    shutil.rmtree(run_dir, ignore_errors=True)
+    run_dir.mkdir()
+    (run_dir / SCENARIO_FILE).write_text(dumps(RESOLVED))
+    plane = FakePlane()
+    recorder = Recorder(RESOLVED, run_dir, plane, view=None)
+    queries = []
+    for _ in range(1 + choices.below(6)):
+        match choices.below(5):
+            case 0:
+                queries.append(_goodbye(choices))
+                plane.put("goodbye", queries[-1])
+            case 1:
+                plane.put("alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}"))
+            case _:
+                plane.put("telemetry", _batch(choices))
+    with redirect_stderr(io.StringIO()) as told:
+        recorder.poll()
+    assert told.getvalue().count("\n") <= 1, "junk must not fill the log"
+    recorder.show()
+    assert isinstance(recorder.finished, bool)
+    assert all(query.answered == 1 for query in queries), "who says goodbye waits for an answer"
+    # Whatever came, what was good of it is on record.
+    record = recorder.finish()
+    assert set(record.tables) >= {"plant_step"}
+
+
+def _batch(choices: Choices) -> Sample:
+    table = choices.one([*OWNER, NOTICES, "", "nothing"])
+    role = choices.one([OWNER.get(table, "plant"), "nobody"])
+    if table == NOTICES:
+        payload = json.dumps(edited(choices, NOTICE, KNOWN)).encode()
+    else:
+        count = choices.below(3)
+        numbers = [choices.integer() % 2**63 if choices.below(4) == 0 else 0 for _ in range(8)]
+        payload = np.resize(np.array(numbers, "<i8"), 64 * count).tobytes()
+        types = _TYPES.get(table)
+        if types is not None and choices.below(4):
+            payload = payload[: types.itemsize * choices.below(4)]
+    header = json.dumps(edited(choices, HEADER, KNOWN)).encode()
+    attachment = None if choices.below(8) == 1 else damaged(choices, header)
+    payload = damaged(choices, payload) if payload else payload
+    return Sample(f"noack/0/telemetry/{role}/{table}", payload, attachment)
+
+
+def _goodbye(choices: Choices) -> Query:
+    report: Any = edited(choices, REPORT, KNOWN)
+    payload = None if choices.below(8) == 1 else damaged(choices, json.dumps(report).encode())
+    return Query(f"noack/0/goodbye/{choices.one([*OWNER.values(), 'nobody'])}", payload)

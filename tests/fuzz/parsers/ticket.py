@@ -1,0 +1,53 @@
+"""Tickets, and the session files of emulators: text as it stands, or valid ones edited."""
+
+import fcntl
+import json
+import os
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from netem.control import session
+from noack.io import ticket
+from noack.resolve import resolve
+from noack.scenario_file import json_schema, validate
+from tests.fuzz.choices import EDITS, Choices
+from tests.fuzz.edits import Vocabulary, edited, vocabulary
+from tests.fuzz.files import bases
+from tests.fuzz.harness import refusal, workspace
+
+_TICKET = ticket.new_ticket(
+    resolve(validate(bases("scenarios")[0], "base")), "tcp/127.0.0.1:7447", Path("run"),
+    launched=True,
+)._replace(run_id=7, key=bytes(32))  # fmt: skip
+TICKET: dict[str, Any] = json.loads(_TICKET.dumps())
+SESSION = {"name": "up", "endpoint": "tcp/127.0.0.1:7447", "token": "00" * 32}
+_SCENARIO = vocabulary(json_schema())
+KNOWN = Vocabulary(
+    (*TICKET, *SESSION, *_SCENARIO.keys), (*_SCENARIO.words, "00" * 31, "0g", "tcp/", "tcp/x:y")
+)
+SEEDS = [json.dumps(TICKET).encode(), json.dumps(SESSION).encode(), *EDITS]
+WORDS = [json.dumps(word).encode() for word in (*TICKET, *SESSION)]
+
+
+def one_input(data: bytes) -> None:
+    if data[:1] == b"\0":
+        choices = Choices(data[1:])
+        content = edited(choices, choices.one([TICKET, SESSION]), KNOWN)
+        data = json.dumps(content).encode()
+    with refusal("not a ticket"):
+        found = ticket.loads(data.decode("utf-8", "replace"))
+        assert ticket.loads(found.dumps()) == found
+        assert len(found.key) == 32
+        assert 0 <= found.run_id < 2**64
+        assert isinstance(found.endpoint, str)
+        assert isinstance(found.run_dir, str)
+        assert isinstance(found.launched, bool)
+    with patch.dict(os.environ, {"XDG_RUNTIME_DIR": str(workspace())}):
+        path = session.make_folder() / "up.json"
+        path.write_bytes(data)
+        with path.open() as lock:  # as the emulator has it
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            with refusal("emulator 'up'"):
+                one = session.find("up")
+                assert all(isinstance(field, str) for field in one)

@@ -1,0 +1,27 @@
+"""Files that settings name: loss traces, observed delays, tables of ``tc``."""
+
+import json
+
+from noack.impairment_files import read_files
+from noack.impairments import Delay, LinkSettings, LossOf, Trace
+from tests.fuzz.harness import refusal, workspace
+
+SEEDS = [
+    b"\x0000 1\n1", b"\x010.01\n12.5ms\n-5ns\n# one", b"\x02-8192 0\n8192 99999", b"\x0301",
+]  # fmt: skip
+WORDS = [b"1e-3", b"1e400", b"ms", b"us", b"ns", b"#", b"\n", b"\xff", b"-", b"3600.1"]
+
+
+def one_input(data: bytes) -> None:
+    kind, content = data[:1], data[1:]
+    name = "any.dist" if kind == b"\2" else "any.txt"
+    (workspace() / name).write_bytes(content)
+    impairment = {
+        b"\1": Delay(distribution="empirical", file=name),
+        b"\2": Delay(jitter_s=0.5, distribution="empirical", file=name),
+    }.get(kind, LossOf(loss=Trace(file=name, repeat=kind == b"\0")))
+    settings = LinkSettings(impairments=(impairment,))
+    with refusal("links.toml: forward.impairments.0"):
+        read = read_files(settings, workspace(), "links.toml: forward")
+        # What was read is held to all that settings are held to.
+        assert LinkSettings.model_validate_json(json.dumps(read.model_dump(mode="json"))) == read

@@ -1,0 +1,94 @@
+"""A control plane without zenoh: what arrives on it is what a test puts there."""
+
+import json
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class Payload:
+    """Bytes, as zenoh hands them over."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+
+    def to_bytes(self) -> bytes:
+        return self._data
+
+    def to_string(self) -> str:
+        return self._data.decode()  # zenoh raises the same error
+
+
+class Sample:
+    """A publication."""
+
+    def __init__(self, key: str, payload: bytes | None = b"", attachment: bytes | None = None):
+        self.key_expr = key
+        self.payload = Payload(payload or b"")
+        self.attachment = None if attachment is None else Payload(attachment)
+        self.kind = None
+
+
+@dataclass
+class Query:
+    """A question, and what was answered."""
+
+    key_expr: str
+    data: bytes | None
+    replies: list[str] = field(default_factory=list)
+    error: str | None = None
+    answered: int = 0
+
+    @property
+    def payload(self) -> Payload | None:
+        return None if self.data is None else Payload(self.data)
+
+    def reply(self, key: object, content: str) -> None:
+        self.answered += 1
+        self.replies.append(content)
+
+    def reply_err(self, message: str) -> None:
+        self.answered += 1
+        self.error = message
+
+    def drop(self) -> None:
+        pass
+
+
+class _Channel(deque[Any]):
+    def try_recv(self) -> Any:
+        return self.popleft() if self else None
+
+
+class FakePlane:
+    """What the recorder and the coordinator use of the plane, and of its session."""
+
+    def __init__(self) -> None:
+        self.session = self
+        self.answers: list[Any] = []
+        self._channels: dict[str, _Channel] = {}
+
+    def key(self, *parts: str) -> str:
+        return "/".join(parts)
+
+    def declare_subscriber(self, key: str, handler: object = None) -> _Channel:
+        return self._channels.setdefault(key.partition("/")[0], _Channel())
+
+    declare_queryable = declare_subscriber
+
+    def liveliness(self) -> "FakePlane":
+        return self
+
+    def put(self, key: str, content: Any) -> None:
+        if not isinstance(content, str):
+            self._channels[key].append(content)
+
+    def answer(self, query: Query, content: Any) -> None:
+        self.answers.append(content)
+        query.reply(query.key_expr, json.dumps(content))
+
+    def refuse(self, query: Query, reason: str) -> None:
+        query.reply_err(reason)
+
+    def request_stop(self, reason: str) -> None:
+        pass

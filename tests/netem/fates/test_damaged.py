@@ -1,0 +1,74 @@
+"""Fate traces that no emulator wrote, or that are damaged: one line, whatever is wrong."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from netem.fates.replay import read_fates
+from netem.fates.trace import METADATA
+from noack.errors import CallerError
+from tests.fuzz.parsers.fates import DOCUMENT, TABLE
+
+
+def write(path: Path, table: pa.Table, document: object = DOCUMENT) -> Path:
+    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(document)}), path)
+    return path
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(CallerError) as caught:
+        read_fates(path)
+    line = str(caught.value)
+    assert line.startswith(f"{path}")
+    assert "\n" not in line
+    return line
+
+
+def with_values(column: str, values: Callable[[list[Any]], list[Any]]) -> pa.Table:
+    at = TABLE.column_names.index(column)
+    field = TABLE.schema.field(at)
+    return TABLE.set_column(at, field, pa.array(values(TABLE[column].to_pylist()), field.type))
+
+
+def test_what_is_spoilt_below_is_right(tmp_path: Path) -> None:
+    assert len(read_fates(write(tmp_path / "a", TABLE)).decisions["up", "forward"]) == 2
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        [], None, {}, *({k: v for k, v in DOCUMENT.items() if k != key} for key in DOCUMENT),
+        DOCUMENT | {"missing_events": "0"}, DOCUMENT | {"missing_events": -1},
+        DOCUMENT | {"links": 1}, DOCUMENT | {"links": [1]}, DOCUMENT | {"links": [{"name": "up"}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"name": ["up"]}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": "2"}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": 1_000_001}}]},
+    ],
+)  # fmt: skip
+def test_a_document_is_the_programs(document: object, tmp_path: Path) -> None:
+    assert "is no fate trace of this program" in refused(write(tmp_path / "a", TABLE, document))
+
+
+@pytest.mark.parametrize("column", ["delay_ns", "copy_delay_ns"])
+def test_a_delay_can_be_added_to_a_time(column: str, tmp_path: Path) -> None:
+    table = with_values(column, lambda values: [2**62 + 1, *values[1:]])
+    assert "no emulator did this" in refused(write(tmp_path / "a", table))
+
+
+@pytest.mark.parametrize("column", TABLE.column_names)
+def test_no_value_is_missing(column: str, tmp_path: Path) -> None:
+    table = with_values(column, lambda values: [*values[:-1], None])
+    assert "a trace with holes cannot be replayed" in refused(write(tmp_path / "a", table))
+
+
+def test_a_file_that_lost_bytes_gets_one_line(tmp_path: Path) -> None:
+    whole = write(tmp_path / "a", TABLE).read_bytes()
+    for size in range(0, len(whole), 37):
+        (tmp_path / "b").write_bytes(whole[:size])
+        refused(tmp_path / "b")

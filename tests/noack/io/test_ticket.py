@@ -1,0 +1,55 @@
+"""Tickets: what is one, and that what is none keeps the key to itself."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from noack.errors import CallerError
+from noack.io.ticket import loads, new_ticket
+from noack.resolve import resolve
+from noack.scenario_file import validate
+
+KEY = "ab" * 32
+
+
+@pytest.fixture
+def fields(content: dict[str, Any]) -> dict[str, Any]:
+    scenario = resolve(validate(content, "small"))
+    ticket = new_ticket(scenario, "tcp/127.0.0.1:7447", Path("run"), launched=True)
+    told: dict[str, Any] = json.loads(ticket._replace(key=bytes.fromhex(KEY)).dumps())
+    return told
+
+
+def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
+    ticket = loads(json.dumps(fields))
+    assert ticket.key.hex() == KEY
+    assert json.loads(ticket.dumps()) == fields
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("run_id", -1), ("run_id", 2**64), ("run_id", "7"), ("key", KEY[:-2]), ("key", KEY + "00"),
+        ("key", KEY.replace("a", "g")), ("key", f"{KEY} "), ("key", [KEY]), ("key", {KEY: KEY}),
+        ("endpoint", None), ("run_dir", 3), ("launched", 1), ("launched", "yes"),
+        ("scenario", None), ("scenario", {}), ("more", 0),
+    ],
+)  # fmt: skip
+def test_what_is_no_ticket_gets_a_line_without_the_key(
+    fields: dict[str, Any], key: str, value: object
+) -> None:
+    with pytest.raises(CallerError) as caught:
+        loads(json.dumps(fields | {key: value}))
+    line = str(caught.value)
+    assert line.startswith(f"not a ticket of this version of noack: {key}")
+    assert "\n" not in line
+    assert KEY[:8] not in line
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", f'{{"key": "{KEY}"', "[" * 100_000])
+def test_neither_is_other_text(text: str) -> None:
+    with pytest.raises(CallerError) as caught:
+        loads(text)
+    assert KEY[:8] not in str(caught.value)
