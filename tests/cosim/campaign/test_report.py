@@ -199,7 +199,7 @@ def test_a_campaign_that_is_not_there_is_one_line() -> None:
     assert done.exit_code == 2
     assert done.stderr == (
         "noack: mb_vs_zho: no such file, nor a shipped campaign; "
-        "there are mansd_sweep, mb_vs_zoh, policies_under_loss\n"
+        "there are acknowledgements, mansd_sweep, mb_vs_zoh, policies_under_loss\n"
     )
 
 
