@@ -108,7 +108,7 @@ def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
             nonlocal before
             before = done if before < 0 else before
             rate = (done - before) / max(time.monotonic() - began_s, 1e-3)
-            text = f"{rate:,.0f}/s" if done > before else ""
+            text = f"{rate:,.0f}/s" if done > before else "starting; the first time it compiles"
             progress.update(task, completed=done, total=total, rate=text)
 
         yield update
