@@ -1,5 +1,6 @@
 """Where compiled code is kept from one run to the next: in the user's cache, or nowhere."""
 
+import fcntl
 import hashlib
 import importlib
 import os
@@ -7,6 +8,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -71,9 +73,24 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
 
     def compile_and_keep(function: Callable[..., Any]) -> Any:
         _numba().config.CACHE_DIR = str(folder)
-        return _numba().njit(function, cache=True, **options)
+        dispatcher = _numba().njit(function, cache=True, **options)
+        dispatcher.compile = _one_at_a_time(dispatcher.compile, folder / ".lock")
+        return dispatcher
 
     return compile_and_keep
+
+
+def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any], Any]:
+    """Let one process at a time compile; the others find what it kept."""
+
+    def compile_alone(signature: Any) -> Any:
+        with ExitStack() as stack:
+            with suppress(OSError):  # where files cannot be locked all of them compile
+                file = stack.enter_context(lock.open("w"))
+                fcntl.flock(file, fcntl.LOCK_EX)
+            return compiling(signature)
+
+    return compile_alone
 
 
 def _numba() -> Any:

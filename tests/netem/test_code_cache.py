@@ -1,11 +1,15 @@
 """Where compiled code is kept, and what happens where it cannot be."""
 
 import errno
+import fcntl
 import os
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numba
 import pytest
 
 from netem.code_cache import cache_folder, compiler
@@ -42,6 +46,35 @@ def test_what_is_compiled_is_kept_there(home: Path) -> None:
     assert compiler(folder)(doubled)(21) == 42
     assert list(folder.rglob("*.doubled-*.nbi"))
     assert home in folder.parents
+
+
+COMPILED_LATER = """
+import sys
+from pathlib import Path
+from netem.code_cache import compiler
+from tests.netem.test_code_cache import doubled
+function = compiler(Path(sys.argv[1]))(doubled)
+print("began", flush=True)
+assert function(21) == 42
+print(len(function.stats.cache_hits), flush=True)
+"""
+
+
+def test_who_comes_while_another_compiles_waits_and_takes_what_is_kept(home: Path) -> None:
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        later = subprocess.Popen(
+            [sys.executable, "-c", COMPILED_LATER, str(folder)],
+            cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert later.stdout is not None
+        assert later.stdout.readline() == "began\n"
+        # What the other compiles meanwhile, without asking for the lock that we hold.
+        numba.config.CACHE_DIR = str(folder)
+        assert numba.njit(doubled, cache=True)(21) == 42
+    assert later.communicate(timeout=60)[0] == "1\n"
 
 
 def test_what_a_power_failure_left_empty_is_compiled_anew(home: Path) -> None:

@@ -147,7 +147,9 @@ relay.close()
 """
 
 
-def test_first_starts_at_the_same_time_both_compile_and_later_ones_do_not(tmp_path: Path) -> None:
+def test_first_starts_at_the_same_time_both_say_so_and_later_ones_do_not(
+    tmp_path: Path,
+) -> None:
     def start() -> subprocess.Popen[str]:
         return subprocess.Popen(
             [sys.executable, "-c", FIRST_START],
