@@ -15,6 +15,7 @@ CAMPAIGN ?= mb_vs_zoh
 SETTLING ?= 14
 SESSION ?= default
 MINUTES ?= 10
+N ?= 1000000
 ARGS ?=
 LIVE ?=
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
@@ -87,16 +88,24 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test fuzz check format bench schema lock clean
+.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema lock clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
 
-test: setup-dev check ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
-	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile)
+test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
+
+pytest: setup-dev
+	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=4 --dist=loadfile)
 
 fuzz: setup-dev ## Fuzz every parser, MINUTES=10 in all; exit status 1 if something is found
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)
+
+attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes); 1 if any gets in
+	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)
+
+soak: setup-dev ## Watch a run for an hour, then a day at speed 24; MINUTES=5 is a short one
+	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules
 	$(BIN)/ruff check .
@@ -111,6 +120,10 @@ format: setup-dev ## Format the code
 bench: setup-dev ## Measure against the alternatives, in one run; prints tables
 	$(BIN)/python -m benchmarks $(ARGS)
 
+screenshots: setup ## Make docs/run.png from a run that ends with the controller misled; needs Chromium
+	@$(BIN)/noack demo --set horizon_s=4.1
+	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png
+
 schema: setup ## Write the JSON Schemas of scenario, campaign and links files to docs/
 	$(BIN)/noack schema > docs/scenario.schema.json
 	$(BIN)/noack schema --campaign > docs/campaign.schema.json
@@ -118,7 +131,7 @@ schema: setup ## Write the JSON Schemas of scenario, campaign and links files to
 
 lock: setup-dev ## Pin the dependencies anew
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --group build -o requirements.lock
+		--no-header pyproject.toml --extra vehicle --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --group build --group dev -c requirements.lock -o requirements-dev.lock
 

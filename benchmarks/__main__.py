@@ -6,9 +6,12 @@ from benchmarks import (
     batch,
     campaign,
     demo_run,
+    flood,
     latency,
     lateness,
     machines,
+    plants,
+    recovery,
     relay_delay,
     relay_flows,
     relay_soak,
@@ -19,8 +22,8 @@ from benchmarks import (
 from benchmarks._report import run
 
 MODULES = (
-    demo_run, latency, lateness, startup, machines, simulation, batch, campaign,
-    relays, relay_delay, relay_flows, relay_soak,
+    demo_run, flood, latency, lateness, startup, recovery, machines, plants, simulation, batch,
+    campaign, relays, relay_delay, relay_flows, relay_soak,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ from typing import Any, NamedTuple
 
 from benchmarks._report import MeasurementError
 
-_PROGRESS = re.compile(r"^t\s+([0-9.]+) s\b")
+_PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
+_ROUNDING_S = 0.05
+"""A progress line shows tenths of a second."""
 
 FREE_PORTS = tuple(
     argument
@@ -70,13 +72,13 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
     """Upper bound of the time from ``begun_s`` to the first control step of a run at speed 1.
 
     A progress line that shows simulated time t and is read at time s proves that the run's epoch
-    was at s − t or before: s − t is the epoch plus the line's way through the recorder to us, some
-    hundredths of a second. The least over all lines is the best bound. The first control step
-    follows the epoch by half a control period, 1 ms, which is far less than what the bound gives
-    away. None if there was no progress line.
+    was at s − t or before, to the line's rounding: s − t is the epoch plus the line's way through
+    the recorder to us, some hundredths of a second. The least over all lines is the best bound. The
+    first control step follows the epoch by half a control period, 1 ms, which is far less than what
+    the bound gives away. None if there was no progress line.
     """
     bounds_s = [
-        line.at_s - float(found[1]) - begun_s
+        line.at_s - (float(found[1]) - _ROUNDING_S) - begun_s
         for line in lines
         if (found := _PROGRESS.match(line.text)) is not None
     ]

@@ -87,12 +87,13 @@ class _Silence:
 
     def __init__(self) -> None:
         self._endpoint = bind(0, "benchmark", "port")
+        self.watched = (self._endpoint.fileno(),)
 
-    def fileno(self) -> int:
-        return self._endpoint.fileno()
-
-    def receive(self) -> Record | None:
+    def receive(self, readable: int) -> Record | None:
         return None
+
+    def tend(self, now_ns: int) -> tuple[Notice, ...]:
+        return ()
 
     def send(self, message: Record) -> None: ...
 

@@ -65,11 +65,11 @@ class Inputs:
         self.rows: list[Record] = []
         plant = plant_of(self.scenario)
         for step in range(CALLS):
-            measurement, record = plant.on_timer(step * self.period_ns)
-            assert isinstance(measurement, Message)
-            assert isinstance(record, Record)
-            self.measurements.append(measurement)
-            self.rows.append(record)
+            for output in plant.on_timer(step * self.period_ns):
+                if isinstance(output, Message):
+                    self.measurements.append(output)
+                elif isinstance(output, Record):
+                    self.rows.append(output)
 
 
 def each(calls: Callable[..., object], *inputs: Iterable[object]) -> Batch:

@@ -11,7 +11,9 @@ from noack.io import process
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
     return process.main(
-        "controller", lambda member: member.run_messages(controller_of(member.scenario)), arguments
+        "controller",
+        lambda member: member.run_messages(controller_of(member.scenario, member.start)),
+        arguments,
     )
 
 

@@ -2,20 +2,23 @@
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from cosim.claims.evaluate import Claims, as_json
+from cosim.claims.evaluate import as_json
+from cosim.claims.parts import RunClaims
 from cosim.fidelity import fidelity_for_summary
 from cosim.launch import Ending
+from cosim.linearisation import linearisation
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
 from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
 from cosim.shown import can_be_shown
 from cosim.summary import Summary, dumps, summarise
-from noack.errors import CallerError, ExitStatus
+from noack.errors import CallerError, ExitStatus, MachineError, why
 
 
 @dataclass(frozen=True)
@@ -29,8 +32,8 @@ class Outcome:
 
 
 @np.errstate(all="ignore")
-def conclude(ending: Ending) -> Outcome:
-    """Finish what a dead recorder left undone; write summary and report."""
+def conclude(ending: Ending, *, report: bool = True) -> Outcome:
+    """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
     run_dir = ending.run_dir
     with concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
@@ -42,13 +45,14 @@ def conclude(ending: Ending) -> Outcome:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
-        (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+        _write_summary(run_dir, summary)
         # Written once more, so that nothing that is found out afterwards can cost a summary.
-        claims = Claims(record)
-        summary |= _found_out(record, claims)
-        (run_dir / SUMMARY_FILE).write_text(dumps(summary), encoding="utf-8")
+        claims = RunClaims(record)
+        summary |= _found_out(record, claims, summary)
+        _write_summary(run_dir, summary)
         try:
-            _report(record, summary, run_dir, claims)
+            if report:
+                _report(record, summary, run_dir, claims)
         except Exception as error:  # whatever it is: a run is none the worse for it
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
@@ -56,7 +60,21 @@ def conclude(ending: Ending) -> Outcome:
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
 
-def _found_out(record: RunRecord, claims: Claims) -> Summary:
+def _write_summary(run_dir: Path, summary: Summary) -> None:
+    path = run_dir / SUMMARY_FILE
+    scratch = path.with_suffix(".partial")
+    try:
+        scratch.write_text(dumps(summary), encoding="utf-8")
+        scratch.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise MachineError(
+            f"{path}: cannot be written: {why(error)}; `noack summary {run_dir}` does it later"
+        ) from None
+
+
+def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
     """What needs more than the record's own numbers; a failure of it is a line in the summary."""
     found: Summary = {}
     if record.kind == "live":
@@ -66,9 +84,29 @@ def _found_out(record: RunRecord, claims: Claims) -> Summary:
             found["replay"] = {"bit_exact": None, "error": repr(error)}
         found["fidelity"] = fidelity_for_summary(record)
     try:
+        if (near := linearisation(record.scenario)) is not None:
+            found["linearisation"] = near
+    except Exception as error:  # likewise
+        print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
+    try:
         found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+        found |= _lost_by_others(claims, summary)
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+    return found
+
+
+def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
+    """Runs of losses that neither the network nor the controller knows of, as somebody was away."""
+    longest = int(claims.conditions["dropouts"] or 0)
+    if not summary["lost_outside_netem"] or longest <= summary["longest_drop_run"]:
+        return {}
+    found: Summary = {"longest_drop_run": longest}
+    if (beyond := claims.beyond_mansd) is not None and not summary["assumption_violations"]:
+        at_s, what = beyond
+        found["assumption_violations"] = [
+            {"t_s": at_s, "process": "recorder", "what": f"MANSD violated: {what}"}
+        ]
     return found
 
 
@@ -109,10 +147,10 @@ def report_anew(run_dir: Path) -> Path:
     """
     outcome = reopen(run_dir)
     record = load_record(run_dir)
-    return _report(record, outcome.summary, run_dir, Claims(record))
+    return _report(record, outcome.summary, run_dir, RunClaims(record))
 
 
-def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: Claims) -> Path:
+def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
     from cosim.report.write import write_report  # imports matplotlib, which no process needs sooner
 
     try:

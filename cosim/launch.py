@@ -17,8 +17,10 @@ from typing import Any
 
 from cosim.coordinator import Coordinator
 from cosim.environment import write_environment
-from cosim.run_dir import SCENARIO_FILE, new_run_dir, point_to_latest, under_way
-from noack.errors import ExitStatus, MachineError, NeverStartedError
+from cosim.room import require_room
+from cosim.run_dir import new_run_dir, point_to_latest, under_way, write_scenario
+from noack.errors import CallerError, ExitStatus, MachineError, NeverStartedError
+from noack.io import open_runs
 from noack.io.node import HORIZON
 from noack.io.process import TICKET_ON_STDIN
 from noack.io.signals import Signals
@@ -26,8 +28,7 @@ from noack.io.ticket import Ticket, new_ticket, published
 from noack.io.udp import LOOPBACK, free_tcp_port, require_free_tcp_port
 from noack.resolve import resolve
 from noack.scenario import Scenario
-from noack.scenario_file import dumps as scenario_toml
-from noack.topology import RECORDER, ROLES
+from noack.topology import PLANT, RECORDER, ROLES
 
 _MODULES = {
     "recorder": "cosim.recorder",
@@ -39,7 +40,9 @@ _MODULES = {
 _POLL_S = 0.01
 _START_PATIENCE_S = 30.0
 _STOP_PATIENCE_S = 15.0
-_OVERTIME_S = 20.0
+_OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
+"""After the horizon: the recorder puts the rows in order, of which a long run has many."""
+_REJOIN_BY_HAND_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,8 @@ class Watcher:
 
     waiting: Callable[[Sequence[str]], None] = lambda roles: None
     started: Callable[[Path], None] = lambda run_dir: None
+    lost: Callable[[str, float, str | None], None] = lambda why, t_s, by_hand: None
+    back: Callable[[str, float], None] = lambda role, t_s: None
     progress: Callable[[dict[str, Any]], None] = lambda account: None
 
 
@@ -87,12 +92,13 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     resolved = resolve(scenario)
+    require_room(resolved, runs)
     control = resolved.ports.control
     if control:
         require_free_tcp_port(control, "ports.control")
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
-    (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved), encoding="utf-8")
+    resolved = write_scenario(resolved, run_dir)
     write_environment(run_dir, "live")
     ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
     run = _Run(ticket, run_dir, spawn, watcher or Watcher())
@@ -102,12 +108,32 @@ def launch(
         stack.callback(coordinator.close)
         if session is not None:
             stack.enter_context(published(ticket._replace(launched=False), session))
+        _publish(stack, ticket, session)
         stack.enter_context(run.children(live=live))
         status, reason = run.watch(coordinator, signals)
     if coordinator.epoch_ns is None:
         raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
     startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
     return Ending(run_dir, ticket.run_id, status, reason, startup_s)
+
+
+def _publish(stack: contextlib.ExitStack, ticket: Ticket, session: str | None) -> None:
+    """Let `noack set` find the run; one that it cannot find goes on all the same."""
+    try:
+        stack.enter_context(open_runs.published(ticket, session))
+    except (CallerError, OSError) as error:
+        print(f"noack: warning: `noack set` cannot reach this run: {error}", file=sys.stderr)
+
+
+@dataclass(frozen=True)
+class _Lost:
+    """A process of the loop that is gone, and may be followed by another."""
+
+    why: str
+    status: ExitStatus
+    until_s: float
+    """Reading of the monotonic clock until which it is waited for."""
+    within_s: float
 
 
 class _Run:
@@ -119,6 +145,7 @@ class _Run:
         self._spawn = spawn
         self._watcher = watcher
         self._children: dict[str, subprocess.Popen[str]] = {}
+        self._lost: dict[str, _Lost] = {}
 
     @contextlib.contextmanager
     def children(self, *, live: bool) -> Iterator[None]:
@@ -130,12 +157,7 @@ class _Run:
             yield
         finally:
             for child in self._children.values():
-                if child.poll() is None:
-                    child.kill()
-                child.wait()
-                if child.stdin is not None:
-                    with contextlib.suppress(OSError):
-                        child.stdin.close()
+                _end(child)
 
     def watch(self, coordinator: Coordinator, signals: Signals) -> tuple[ExitStatus, str]:
         """Follow the run to its end; return its exit status and why it ended."""
@@ -150,18 +172,18 @@ class _Run:
             now_s = time.monotonic()
             if coordinator.epoch_ns is None:
                 missing = tuple(r for r in coordinator.missing() if r not in self._spawn)
-                if missing != told:
+                if missing != told and verdict is None:
                     told = missing
                     self._tell(self._watcher.waiting, missing)
             elif not started:
                 started = True
                 point_to_latest(self._run_dir)
                 self._tell(self._watcher.started, self._run_dir)
-                patience_s = now_s + scenario.horizon_s / scenario.speed + _OVERTIME_S
+                patience_s = now_s + longest_s(scenario.horizon_s / scenario.speed)
             if (account := coordinator.progress()) is not None:
                 self._tell(self._watcher.progress, account)
             if verdict is None:
-                verdict = self._trouble(coordinator, signals)
+                verdict = self._stopped(signals) or self._trouble(coordinator)
                 if verdict is None and now_s > patience_s:
                     verdict = (ExitStatus.FAILED, _overdue(coordinator))
                 if verdict is not None:
@@ -170,7 +192,13 @@ class _Run:
             elif now_s > patience_s:
                 break
             time.sleep(_POLL_S)
-        return verdict or self._trouble(coordinator, signals) or (ExitStatus.OK, HORIZON)
+        return (
+            verdict
+            or self._stopped(signals)
+            or self._trouble(coordinator)
+            or self._never_back()
+            or (ExitStatus.OK, HORIZON)
+        )
 
     def _tell(self, callback: Callable[..., None], *arguments: object) -> None:
         try:
@@ -187,9 +215,12 @@ class _Run:
             TICKET_ON_STDIN: "1",
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUTF8": "1",
+            # What the view's libraries took in a busy moment goes back to the system.
+            "MIMALLOC_PURGE_DELAY": "0",
+            "ARROW_DEFAULT_MEMORY_POOL": "system",
         }
         try:
-            with (self._run_dir / "logs" / f"{role}.log").open("w") as log:
+            with (self._run_dir / "logs" / f"{role}.log").open("a") as log:
                 child = subprocess.Popen(
                     command,
                     stdin=subprocess.PIPE,
@@ -210,27 +241,85 @@ class _Run:
     def _over(self, coordinator: Coordinator, *, stopping: bool) -> bool:
         if any(child.poll() is None for child in self._children.values()):
             # A frozen process never exits; it is not waited for.
+            gone = coordinator.gone()
             return stopping and all(
-                child.poll() is not None or role in set(coordinator.vanished())
-                for role, child in self._children.items()
+                child.poll() is not None or role in gone for role, child in self._children.items()
             )
         others = [role for role in ROLES if role not in self._spawn]
-        gone = set(coordinator.vanished()) | set(coordinator.left)
-        return stopping or all(role in gone for role in others)
+        return stopping or all(coordinator.finished(role) for role in others)
 
-    def _trouble(self, coordinator: Coordinator, signals: Signals) -> tuple[ExitStatus, str] | None:
-        if signals.received is not None:
-            return signals.status, f"stopped by {_name(signals.received)}"
-        for role, child in self._children.items():
-            code = child.poll()
-            if code is not None and code != 0:
-                return self._died(role, code)
-        for role in coordinator.vanished():
-            return ExitStatus.FAILED, f"{role} stopped answering"
-        for role, why in coordinator.left.items():
-            if why != HORIZON and role != RECORDER:
-                return ExitStatus.FAILED, f"{role} ended early: {why}"
+    def _stopped(self, signals: Signals) -> tuple[ExitStatus, str] | None:
+        if signals.received is None:
+            return None
+        return signals.status, f"stopped by {_name(signals.received)}"
+
+    def _trouble(self, coordinator: Coordinator) -> tuple[ExitStatus, str] | None:
+        """Why the run must end; None if it need not. Who died may be followed by another."""
+        for role, lost in list(self._lost.items()):
+            if coordinator.incarnation(role) is not None:
+                del self._lost[role]
+                self._tell(self._watcher.back, role, coordinator.now_ns() * 1e-9)
+            elif (again := self._exited(role)) is not None:
+                return again[0], f"{lost.why}; started anew, {again[1]}"
+            elif time.monotonic() > lost.until_s:
+                return lost.status, f"{lost.why}; no other came within {lost.within_s:g} s"
+        for role, (status, why) in self._casualties(coordinator).items():
+            within_s = self._rejoin_within_s(role)
+            over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+            if coordinator.epoch_ns is None or over or role == PLANT or not within_s:
+                return status, why
+            if self._gave_up(role):  # so would another
+                return status, why
+            self._lost[role] = _Lost(why, status, time.monotonic() + within_s, within_s)
+            spawned = role in self._spawn
+            coordinator.expect(role, why, dead=spawned)
+            self._tell(
+                self._watcher.lost, why, coordinator.now_ns() * 1e-9, None if spawned else role
+            )
+            if spawned:
+                _end(self._children[role])
+                try:
+                    self._children[role] = self._start(role, live=False)
+                except MachineError as error:
+                    return status, f"{why}; {error}"
         return None
+
+    def _casualties(self, coordinator: Coordinator) -> dict[str, tuple[ExitStatus, str]]:
+        """Who is gone that is not waited for, and why."""
+        gone = dict(coordinator.gone())
+        if self._over_its_record(coordinator):
+            gone.pop(RECORDER, None)
+        found = {role: (ExitStatus.FAILED, why) for role, why in gone.items()}
+        found |= {role: how for role in self._children if (how := self._exited(role)) is not None}
+        return {role: how for role, how in found.items() if role not in self._lost}
+
+    def _over_its_record(self, coordinator: Coordinator) -> bool:
+        """Whether the recorder may be busy with a long record's end, and not hear its peers."""
+        recorder = self._children.get(RECORDER)
+        over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+        return over and recorder is not None and recorder.poll() is None
+
+    def _rejoin_within_s(self, role: str) -> float:
+        given_s = self._ticket.scenario.recovery.rejoin_within_s
+        if given_s is None:
+            return 0.0 if role in self._spawn else _REJOIN_BY_HAND_S
+        return given_s
+
+    def _never_back(self) -> tuple[ExitStatus, str] | None:
+        for lost in self._lost.values():
+            return lost.status, f"{lost.why}; no other came before the end"
+        return None
+
+    def _exited(self, role: str) -> tuple[ExitStatus, str] | None:
+        """How a process of ours failed; None if it did not."""
+        child = self._children.get(role)
+        code = None if child is None else child.poll()
+        return None if not code else self._died(role, code)
+
+    def _gave_up(self, role: str) -> bool:
+        """Whether a process of ours ended itself, and said why."""
+        child = self._children.get(role)
+        return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
 
     def _died(self, role: str, code: int) -> tuple[ExitStatus, str]:
         if code < 0:
@@ -238,16 +327,34 @@ class _Run:
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
             return ExitStatus.FAILED, f"{role} ended early: {_name(code - 128)}"
         log = self._run_dir / "logs" / f"{role}.log"
-        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        try:
+            lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        except OSError:  # somebody took the run's folder away
+            lines = []
         said = lines[-1].removeprefix(f"noack {role}: ") if lines else f"exit status {code}"
         known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
         return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {said}"
+
+
+def longest_s(run_s: float) -> float:
+    """How long a run of some wall time may take until everyone has left."""
+    return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S
 
 
 def _overdue(coordinator: Coordinator) -> str:
     if coordinator.epoch_ns is None:
         return f"{', '.join(coordinator.missing())} did not come to the start"
     return "the run did not end at its horizon"
+
+
+def _end(child: subprocess.Popen[str]) -> None:
+    """See a process off."""
+    if child.poll() is None:
+        child.kill()
+    child.wait()
+    if child.stdin is not None:
+        with contextlib.suppress(OSError):
+            child.stdin.close()
 
 
 def _name(number: int) -> str:

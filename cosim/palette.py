@@ -1,28 +1,29 @@
 """The colours of a run, in its view and in its report: one colour, one meaning everywhere.
 
-All are readable on a light and on a dark background, and where two of them are hard to tell apart
-for a colour-blind eye, what is drawn also differs in width, dash or marker.
+All stand out from a light and from a dark background, 3 to 1, and the first five from each other
+for colour-blind eyes as well; a test computes both. What they show also differs in width, dash or
+shape.
 """
 
 Colour = tuple[int, int, int]
 
-PLANT: Colour = (150, 150, 158)
-SENSOR: Colour = (38, 132, 255)
-CONTROLLER: Colour = (255, 128, 14)
-NETWORK: Colour = (40, 165, 90)
-THRESHOLD: Colour = (225, 60, 75)
-FORCED: Colour = (200, 70, 200)
-DROPPED: Colour = (225, 60, 75)
-BOUND: Colour = (150, 110, 80)
-CERTIFIED: Colour = (40, 165, 90)
+PLANT: Colour = (155, 142, 159)
+SENSOR: Colour = (51, 93, 213)
+CONTROLLER: Colour = (255, 86, 10)
+THRESHOLD: Colour = (193, 43, 105)
+CERTIFIED: Colour = (51, 162, 78)
+FORCED: Colour = (222, 90, 218)
+BOUND: Colour = (180, 100, 40)
+NETWORK: Colour = CERTIFIED
+DROPPED: Colour = THRESHOLD
 SERIES: tuple[Colour, ...] = (
-    (38, 132, 255),
-    (255, 128, 14),
-    (40, 165, 90),
-    (200, 70, 200),
-    (150, 110, 80),
-    (20, 175, 190),
-    (150, 150, 158),
+    SENSOR,
+    CONTROLLER,
+    CERTIFIED,
+    FORCED,
+    BOUND,
+    (12, 161, 180),
+    PLANT,
 )
 """For what has no colour of its own."""
 PROCESSES: dict[str, Colour] = {

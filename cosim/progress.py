@@ -2,16 +2,18 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cosim.launch import Watcher
 from noack.clock import NS_PER_S
+from noack.io.ticket import DEFAULT_SESSION
 from noack.scenario import Scenario
 
 _PLAIN_LINES = 10
@@ -26,12 +28,15 @@ class PatientConsole(Console):
 
 
 @contextmanager
-def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
+def progress_line(
+    console: Console, scenario: Scenario, session: str | None = None
+) -> Iterator[Watcher]:
     """Show a run's progress while the context lasts."""
     live = console.is_terminal
+    there = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     shown = 0
-    live_told = False
+    live_told, void_told, changes_told = False, 0, 0
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
         task: TaskID | None = None
 
@@ -43,12 +48,33 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
             nonlocal task
             task = progress.add_task(scenario.name, total=scenario.horizon_s)
 
+        def lost(why: str, t_s: float, by_hand: str | None) -> None:
+            remedy = (
+                "another is started"
+                if by_hand is None
+                else f"start it again: noack {by_hand}{there}"
+            )
+            console.print(
+                f"{why} at {t_s:.1f} s; the run goes on, {remedy}", highlight=False, soft_wrap=True
+            )
+
+        def back(role: str, t_s: float) -> None:
+            console.print(f"{role} is back at {t_s:.1f} s", highlight=False)
+
         def account(account: dict[str, Any]) -> None:
-            nonlocal shown, live_told
+            nonlocal shown, live_told, void_told, changes_told
             if account["live"] and not live_told:
                 live_told = True
                 console.print(account["live"], highlight=False, soft_wrap=True)
-            text = _account(account, scenario.horizon_s)
+            why = account.get("void", [])
+            for text in why[void_told:]:
+                console.print(f"[yellow]{escape(text)}[/]", highlight=False, soft_wrap=True)
+            void_told = max(void_told, len(why))
+            changes = account.get("changes", [])
+            for text in changes[changes_told:]:
+                console.print(f"changed: {text}", markup=False, highlight=False, soft_wrap=True)
+            changes_told = max(changes_told, len(changes))
+            text = account_line(account, scenario.horizon_s)
             if task is not None:
                 progress.update(task, completed=account["t_s"], description=text)
             due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
@@ -56,7 +82,7 @@ def progress_line(console: Console, scenario: Scenario) -> Iterator[Watcher]:
                 shown = due
                 console.print(text, highlight=False, soft_wrap=True)
 
-        yield Watcher(waiting, started, account)
+        yield Watcher(waiting, started, lost, back, account)
 
 
 @contextmanager
@@ -132,7 +158,8 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
         yield named
 
 
-def _account(account: dict[str, Any], horizon_s: float) -> str:
+def account_line(account: Mapping[str, Any], horizon_s: float) -> str:
+    """The recorder's account of a run under way, as a line."""
     norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.3g}"
     return (
         f"{account['t_s']:.1f}/{horizon_s:g} s  events {account['events']}  "

@@ -9,7 +9,7 @@ import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -18,20 +18,22 @@ from numpy.typing import NDArray
 
 from cosim.environment import Kind, kind_of
 from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
-from noack.errors import CallerError, MachineError, PeerError, one_line
+from noack.errors import CallerError, MachineError, PeerError, one_line, why
 from noack.io.messages import LogLine, Report, heard
 from noack.io.spool import read_chunks
 from noack.io.telemetry import notices_of
-from noack.records import OWNER, tables
-from noack.resolve import Loop, loop_of
+from noack.machine import INCARNATION, RESTART
+from noack.records import OWNER
+from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
 from noack.scenario_file import load
-from noack.topology import LOOP_ROLES
+from noack.topology import LOOP_ROLES, RECORDER
 from noack.wire import VERSION, Flow, read_header
 
 Rows = NDArray[np.void]
 
 _NOTICES_FILE = "notices.jsonl"
+_EARLIER = "earlier"
 
 
 class _Notice(LogLine):
@@ -47,6 +49,7 @@ class RunRecord:
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
+        earlier: the final reports of those whose place another took.
     """
 
     def __init__(
@@ -56,11 +59,13 @@ class RunRecord:
         notices: list[dict[str, Any]],
         reports: Mapping[str, dict[str, Any]],
         kind: Kind = "live",
+        earlier: Sequence[dict[str, Any]] = (),
     ) -> None:
         self.scenario = scenario
         self.loop: Loop = loop_of(scenario)
         self.notices = notices
         self.reports = reports
+        self.earlier = earlier
         self.kind: Kind = kind
         self._rows = rows
         self.tables = tables_of(scenario)
@@ -73,11 +78,66 @@ class RunRecord:
         """The tables that a process fills."""
         return {table: self[table] for table in self.tables if OWNER[table] == role}
 
+    def lives(self, role: str) -> list["Life"]:
+        """What there is of each process that had a role in the run, one after the other."""
+        owned, newest = self.owned_by(role), self.reports.get(role)
+        reports = {} if newest is None else {newest.get("incarnation", 0): newest}
+        reports |= {
+            one.get("incarnation", 0): one for one in self.earlier if one["process"] == role
+        }
+        again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
+        begun = incarnations(owned) if again else [0]
+        which = {  # a number out of its turn is of the process before
+            table: np.searchsorted(begun, rows["input"] // INCARNATION, side="right") - 1
+            for table, rows in owned.items()
+        }
+        return [
+            Life(
+                number,
+                {table: rows[which[table].clip(min=0) == i] for table, rows in owned.items()},
+                reports.get(number),
+            )
+            for i, number in enumerate(begun)
+        ]
 
-def tables_of(scenario: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    """The row types of the tables that runs of a resolved scenario have."""
-    loop = loop_of(scenario)
-    return tables(loop.n, loop.m, acknowledged=scenario.is_acknowledged)
+    def restarted(self) -> str | None:
+        """A role whose process another took the place of; None if there is none."""
+        return next((role for role in LOOP_ROLES if len(self.lives(role)) > 1), None)
+
+
+class Life(NamedTuple):
+    """What there is of one process of a run."""
+
+    incarnation: int
+    rows: Mapping[str, Rows]
+    """By table."""
+    report: Mapping[str, Any] | None
+
+    def hole_ns(self) -> int | None:
+        """When the last input came before rows that are missing; None if none are, as far as known.
+
+        What is missing at the end of a process that left no report, nobody knows.
+        """
+        inputs = np.concatenate([rows["input"] for rows in self.rows.values()])
+        now_ns = np.concatenate([rows["now_ns"] for rows in self.rows.values()])
+        order = np.argsort(inputs, kind="stable")
+        inputs, now_ns = inputs[order], now_ns[order]
+        holes = np.flatnonzero(np.diff(inputs, prepend=self.incarnation * INCARNATION - 1) > 1)
+        return None if not len(holes) else int(now_ns[max(holes[0] - 1, 0)])
+
+
+def incarnations(owned: Mapping[str, Rows]) -> list[int]:
+    """The processes of a role that have left rows: every one's first input has a number of its own.
+
+    If that is missing, what a later one left shows that there were others before it.
+
+    Args:
+        owned: the rows of the role's tables.
+    """
+    inputs = np.concatenate([rows["input"] for rows in owned.values()])
+    first = inputs[(inputs % INCARNATION == 0) & (inputs > 0)] // INCARNATION
+    of = np.unique(inputs // INCARNATION)
+    return [0, *of[(of > 0) & (of <= first.max(initial=0))].tolist()]
 
 
 def load_record(run_dir: Path) -> RunRecord:
@@ -98,8 +158,8 @@ def load_record(run_dir: Path) -> RunRecord:
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables_of(scenario).items()
     }
-    notices, reports = _read_notices(folder), _reports(run_dir, rows)
-    return RunRecord(scenario, rows, notices, reports, kind_of(run_dir))
+    reports, earlier = _reports(run_dir, rows)
+    return RunRecord(scenario, rows, _read_notices(folder), reports, kind_of(run_dir), earlier)
 
 
 def write_record(record: RunRecord, run_dir: Path) -> None:
@@ -130,15 +190,16 @@ def finish_record(run_dir: Path) -> RunRecord:
         table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)
         for table, dtype in tables_of(scenario).items()
     }
-    notices = _notices(folder, spool)
-    record = RunRecord(scenario, rows, notices, _reports(run_dir, rows), kind_of(run_dir))
+    notices, (reports, earlier) = _notices(folder, spool), _reports(run_dir, rows)
+    record = RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier)
     try:
         write_record(record, run_dir)
         if spool.is_dir():  # dropped in one step, so that nobody ever takes half a spool for all
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
-            f"{folder}: the record cannot be written ({error}); it is kept in {spool}"
+            f"{folder}: the record cannot be written: {why(error)}; all of it is kept in {spool}, "
+            f"and `noack summary {run_dir}` finishes it"
         ) from None
     return record
 
@@ -196,7 +257,7 @@ def _spooled(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows
 
 def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
     notices = _read_notices(folder)
-    for role in LOOP_ROLES:
+    for role in (*LOOP_ROLES, RECORDER):
         for _, data in read_chunks(spool, notices_of(role)):
             try:
                 notice = heard(LogLine, data) | {"process": role}
@@ -233,16 +294,47 @@ def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, 
     return report
 
 
-def _reports(run_dir: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
+def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
+    """Write the final reports of all processes; each says of which ``process`` it is.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    in_order = sorted(reports, key=lambda report: int(report["incarnation"]))
+    newest = {report["process"]: report for report in in_order}
+    earlier = [report for report in in_order if report is not newest[report["process"]]]
+    content = newest | ({_EARLIER: earlier} if earlier else {})
+    path = run_dir / REPORTS_FILE
+    try:
+        path.write_text(json.dumps(content, indent=2), encoding="utf-8")
+    except OSError as error:
+        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+
+
+def _reports(
+    run_dir: Path, rows: Mapping[str, Rows]
+) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
+    """Return the reports of the last process of each role, and those of the ones before."""
     try:
         said = json.loads((run_dir / REPORTS_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # a dead recorder wrote none, or half of one
-        return {}
+        entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
+        entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
+    # A dead recorder wrote none, or half of one.
+    except (OSError, ValueError, RecursionError, LookupError, TypeError, AttributeError):
+        return {}, []
     reports: dict[str, dict[str, Any]] = {}
-    for role in LOOP_ROLES:
-        with contextlib.suppress(PeerError, LookupError, TypeError):  # what is none, is as lost
-            reports[role] = report_of(role, json.dumps(said[role]), tables)
-    return reports
+    earlier: list[dict[str, Any]] = []
+    for role, entry in entries:
+        with contextlib.suppress(PeerError, TypeError):  # what is none, is as lost
+            if role not in LOOP_ROLES:
+                continue
+            report = report_of(role, json.dumps(entry), rows)
+            owned = {table: rows[table] for table in rows if OWNER[table] == role}
+            if report.get("incarnation", 0) < incarnations(owned)[-1] or role in reports:
+                earlier.append(report | {"process": role})
+            else:
+                reports[role] = report
+    return reports, earlier
 
 
 def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:

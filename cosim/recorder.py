@@ -3,7 +3,9 @@
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +13,27 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
+from cosim.claims.guard import Guard
+from cosim.claims.observed import Departure
 from cosim.environment import Kind
-from cosim.record import RunRecord, finish_record, report_of, tables_of, updates_in
-from cosim.run_dir import RECORDING_FILE, REPORTS_FILE, SPOOL, under_way
+from cosim.record import RunRecord, finish_record, report_of, updates_in, write_reports
+from cosim.run_dir import RECORDING_FILE, SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
+from cosim.viewer.pictures.choose import picture_of
+from cosim.viewer.pictures.network import LEG_S, Diagram
 from cosim.viewer.recording import RunView, ViewError
+from noack.changes import Change, said_of
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus, PeerError
 from noack.io.messages import LogLine, heard
 from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
 from noack.io.process import run_process
-from noack.io.spool import SpoolWriter
-from noack.io.telemetry import NOTICES, first_row, missing_ranges, notices_of
+from noack.io.spool import SpoolWriter, read_chunks
+from noack.io.telemetry import NOTICES, Received, first_row, notice_number, notices_of
+from noack.knobs import is_of_loss_alone
+from noack.machine import BEGINNING, INCARNATION, RESTART, Notice, Start
 from noack.records import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -32,15 +41,21 @@ from noack.records import (
     SENSOR_MEASUREMENT,
     effective,
 )
-from noack.resolve import Loop, loop_of
+from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES, RECORDER
 from noack.trigger.text import trigger_text
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
-_BATCHES_IN_WAITING = 100_000
+_TOLD_S = 5.0
+"""By then a recorder that is started anew has been told of everyone who is still there."""
+_CONFIRM_S = 1.0
+_BATCHES_IN_WAITING = 4096
+"""A minute of them; each place of the ring takes 256 bytes once it has been used."""
 _STOP_PATIENCE_S = 8.0
+_INDEXED_S = 120.0
+"""Wall time of a run whose view has an index; that of a longer one would take too much memory."""
 
 
 class Recorder:
@@ -52,6 +67,7 @@ class Recorder:
         plane: the control plane.
         view: shows the run; None does without.
         live: where the run can be watched, for the person who asked.
+        start: where in the run it takes up its work; it may find another's spool.
     """
 
     def __init__(
@@ -61,33 +77,50 @@ class Recorder:
         plane: Plane,
         view: RunView | None,
         live: str | None = None,
+        *,
+        start: Start = BEGINNING,
     ) -> None:
         self._loop: Loop = loop_of(scenario)
         self._types = tables_of(scenario)
         self._run_dir = run_dir
         self._plane = plane
-        self._spool = SpoolWriter(run_dir / SPOOL, RECORDER)
+        # The one before may have left half a batch at the end of its files.
+        self._spool = SpoolWriter(run_dir / SPOOL, plane.instance if start.again else RECORDER)
+        self._spool.prepare([*self._types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._feed = None if view is None else ViewFeed(scenario, view)
+        self._guard = Guard(scenario)
+        self._told_blind = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"), RingChannel(_BATCHES_IN_WAITING)
         )
         self._goodbyes = session.declare_queryable(key("goodbye", "*"), FifoChannel(64))
-        self._lives = session.liveliness().declare_subscriber(key("alive", "*"), RingChannel(256))
-        self._got: dict[str, list[tuple[int, int]]] = {}
-        self._reports: dict[str, Any] = {}
-        self._gone: set[str] = set()
-        self._out_of_order = False
+        self._lives = session.liveliness().declare_subscriber(
+            key("alive", "*", "*"), RingChannel(256), history=True
+        )
+        self._got: defaultdict[tuple[str, str, int], Received] = defaultdict(Received)
+        self._reports: dict[str, dict[str, Any]] = {}
+        self._alive: dict[str, set[str]] = {}
+        self._out_of_order = self._again = start.again
+        self._began_s = time.monotonic()
         self._junk = 0
         self._account: dict[str, Any] = {
             "t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None,
-            "live": live,
+            "live": live, "void": [], "changes": [],
         }  # fmt: skip
+        if start.again:
+            self._guard.give_up("the recorder was started anew")
+            self._take_over()
 
     @property
     def finished(self) -> bool:
         """Whether every process of the loop has handed over everything, or is gone."""
-        return all(role in self._reports or role in self._gone for role in LOOP_ROLES)
+        # Who left before this recorder came does not say goodbye again.
+        told = self._again and time.monotonic() - self._began_s > _TOLD_S
+        return all(
+            told if (alive := self._alive.get(role)) is None else alive <= self._reports.keys()
+            for role in LOOP_ROLES
+        )
 
     def poll(self) -> None:
         """Take everything that has arrived."""
@@ -96,12 +129,16 @@ class Recorder:
         while (query := self._goodbyes.try_recv()) is not None:
             self._goodbye(query)
         while (life := self._lives.try_recv()) is not None:
-            role = str(life.key_expr).rpartition("/")[2]
+            role, instance = str(life.key_expr).split("/")[-2:]
+            alive = self._alive.setdefault(role, set())
             if life.kind == zenoh.SampleKind.DELETE:
-                self._gone.add(role)
+                alive.discard(instance)
+            else:
+                alive.add(instance)
 
     def show(self) -> None:
         """Bring the view and the coordinator up to date."""
+        self._judge(self._guard.advance)
         self._plane.session.put(self._plane.key("progress"), json.dumps(self._account))
         if self._feed is not None:
             try:
@@ -109,16 +146,44 @@ class Recorder:
             except ViewError as error:
                 self._give_up_view(error)
 
+    def note(self, notice: Notice) -> None:
+        """Take a line of its own for the run's log."""
+        self._spool.append(notices_of(RECORDER), 0, json.dumps(notice._asdict()).encode())
+
+    def change(self, change: Change, said: Mapping[str, Any]) -> None:
+        """Take a change of the run's settings, and who said so when."""
+        notice = said_of(
+            change, f"; asked for at {said['said_ns'] / NS_PER_S:.3f} s, {said['said_at']}"
+        )
+        self.note(notice)
+        self._account["changes"].append(notice.text)
+        if not is_of_loss_alone(change.settings):
+            self._guard.end_at(change.t_ns / NS_PER_S)
+        if self._feed is not None:
+            self._feed.log(notice._asdict())
+
+    def confirm(self) -> None:
+        """Tell every process what of it is on disk, so that it need not keep it any longer."""
+        newest: dict[str, int] = {}
+        for role, _, incarnation in self._got:
+            newest[role] = max(newest.get(role, 0), incarnation)
+        for role, incarnation in newest.items():  # a process hears the last word only
+            rows = {
+                table: received.ranges
+                for (of, table, number), received in self._got.items()
+                if (of, number) == (role, incarnation)
+            }
+            self._plane.say_kept(role, {"incarnation": incarnation, "rows": rows})
+
     def finish(self) -> RunRecord:
         """Write the record; complete the view.
 
         Raises:
             MachineError: the record cannot be written; what was spooled is kept.
         """
+        self._judge(self._guard.end)
         self._spool.close()
-        (self._run_dir / REPORTS_FILE).write_text(
-            json.dumps(self._reports, indent=2), encoding="utf-8"
-        )
+        write_reports(self._run_dir, self._reports.values())
         record = finish_record(self._run_dir)
         if self._feed is not None:
             try:
@@ -141,13 +206,13 @@ class Recorder:
         payload = sample.payload.to_bytes()
         try:
             header = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            self._keep(role, table, first_row(header), payload)
+            self._keep(role, table, *first_row(header), payload)
         except (PeerError, ValueError) as error:
             if not self._junk:
                 print(f"noack recorder: ignored what is no telemetry: {error}", file=sys.stderr)
             self._junk += 1
 
-    def _keep(self, role: str, table: str, first: int, payload: bytes) -> None:
+    def _keep(self, role: str, table: str, incarnation: int, first: int, payload: bytes) -> None:
         """Keep a batch, and show it.
 
         Raises:
@@ -156,23 +221,26 @@ class Recorder:
         """
         if table == NOTICES and role in LOOP_ROLES:
             notice = heard(LogLine, payload)
-            self._spool.append(notices_of(role), first, payload)
+            self._spool.append(notices_of(role), notice_number(incarnation, first), payload)
+            self._got[role, table, incarnation].add(first, first + 1)
             if self._feed is not None:
                 self._feed.log(notice | {"process": role})
             return
         if table not in self._types or OWNER[table] != role:
             raise PeerError(f"{role} has no table {table}")
         rows = np.frombuffer(payload, self._types[table])
-        if not len(rows):
-            raise PeerError("a batch without rows")
+        if not len(rows) or int(rows["input"][0]) // INCARNATION != incarnation:
+            raise PeerError("a batch without rows, or with those of another process")
         self._spool.append(table, first, payload)
-        got = self._got.setdefault(table, [])
-        following = got[-1][1] if got else 0
-        got.append((first, first + len(rows)))
-        if first != following:
+        got = self._got[role, table, incarnation]
+        follows = first == got.end
+        got.add(first, first + len(rows))
+        if not follows:
             self._out_of_order = True
+            self._guard.give_up("telemetry is missing, or came out of turn")
         else:
             self._count(table, rows)
+            self._guard.take(table, rows)
             if self._feed is not None:
                 self._feed.add(table, rows)
 
@@ -191,6 +259,25 @@ class Recorder:
             rows = updates_in(rows)[0]
             self._see_run(rows["drop_run"][~effective(rows["fate"])])
 
+    def _judge(self, guard: Callable[[], list[Departure]]) -> None:
+        """Say that claims are void, in the record, the view and the account."""
+        try:
+            departures = guard()
+        except Exception as error:  # whatever it is, what is recorded is recorded
+            departures = []
+            self._guard.give_up(repr(error))
+        for one in departures:
+            text = f"claims that this touches are void from {one.t_s:.3f} s on: {one.text}"
+            notice = Notice(round(one.t_s * NS_PER_S), "void", text)
+            self.note(notice)
+            self._account["void"].append(text)
+            if self._feed is not None:
+                self._feed.log(notice._asdict())
+        if self._guard.blind is not None and not self._told_blind:
+            self._told_blind = True
+            text = f"whether claims are void is told after the run only: {self._guard.blind}"
+            self._account["void"].append(text)
+
     def _see_run(self, lost: np.ndarray[Any, np.dtype[np.int64]]) -> None:
         longest = int(lost.max(initial=0))
         self._account["longest_drop_run"] = max(self._account["longest_drop_run"], longest)
@@ -203,34 +290,50 @@ class Recorder:
             self._plane.refuse(query, str(error))
             return
         # Telemetry travels at lower priority: what was sent before may still be under way.
-        self._await_rows(report["rows"])
-        missing = self._missing(report["rows"])
+        self._await_rows(report)
+        missing = self._missing(report)
         if not missing:
-            self._reports[role] = report
-        self._plane.answer(query, missing)
+            self._reports[report["instance"]] = report
+        self._plane.answer(query, {"rows": missing})
 
     def _report(self, role: str, query: zenoh.Query) -> dict[str, Any]:
         if role not in LOOP_ROLES:
             raise PeerError(f"{role} has nothing to report")
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        return report_of(role, payload, self._types)
+        report = report_of(role, payload, self._types)
+        return {"incarnation": 0, "instance": ""} | report | {"process": role}
 
-    def _await_rows(self, totals: dict[str, int]) -> None:
+    def _await_rows(self, report: dict[str, Any]) -> None:
         deadline_s = time.monotonic() + 0.3
-        while self._missing(totals) and time.monotonic() < deadline_s:
+        while self._missing(report) and time.monotonic() < deadline_s:
             sample = self._batches.try_recv()
             if sample is None:
                 time.sleep(0.005)
             else:
                 self._take(sample)
 
-    def _missing(self, totals: dict[str, int]) -> dict[str, list[tuple[int, int]]]:
+    def _missing(self, report: dict[str, Any]) -> dict[str, list[tuple[int, int]]]:
+        role, incarnation = report["process"], report["incarnation"]
         missing = {
-            table: missing_ranges(self._got.get(table, ()), total)
-            for table, total in totals.items()
-            if table != NOTICES
+            table: self._got[role, table, incarnation].missing(total)
+            for table, total in report["rows"].items()
+            if table == NOTICES or OWNER.get(table) == role
         }
         return {table: ranges for table, ranges in missing.items() if ranges}
+
+    def _take_over(self) -> None:
+        """Learn from the spool what the recorder before has kept."""
+        for table, dtype in self._types.items():
+            for first, data in read_chunks(self._run_dir / SPOOL, table):
+                if len(data) and len(data) % dtype.itemsize == 0:
+                    rows = np.frombuffer(data, dtype)
+                    incarnation = int(rows["input"][0]) // INCARNATION
+                    self._got[OWNER[table], table, incarnation].add(first, first + len(rows))
+                    self._count(table, rows)
+        for role in LOOP_ROLES:
+            for number, _ in read_chunks(self._run_dir / SPOOL, notices_of(role)):
+                incarnation, first = divmod(number, INCARNATION)
+                self._got[role, NOTICES, incarnation].add(first, first + 1)
 
     def _give_up_view(self, error: ViewError) -> None:
         print(f"noack recorder: {error}; the numeric record goes on", file=sys.stderr)
@@ -244,8 +347,10 @@ def open_view(
     run_id: int,
     live: LiveView | None,
     kind: Kind = "live",
+    *,
+    at_once: bool = False,
 ) -> RunView:
-    """Create the recording of a run."""
+    """Create the recording of a run, to be written at once or while the run goes on."""
     loop = loop_of(scenario)
     return RunView(
         run_dir / RECORDING_FILE,
@@ -255,7 +360,10 @@ def open_view(
         state_names=loop.state_names,
         input_names=loop.input_names,
         processes=LOOP_ROLES if kind == "live" else (),
+        picture=picture_of(scenario),
+        diagram=Diagram(acknowledged=scenario.is_acknowledged),
         live=live,
+        indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )
 
 
@@ -279,6 +387,10 @@ Sensor and controller run **{hold}** between updates. The sensor transmits when
 The network ({network.loss.model.replace("_", "-")} loss) drops at most
 M − 1 = {network.mansd} packets in a row. {protocol}
 
+* **The picture**: the plant, solid, and in outline where the sensor's model (whole line) and the
+  controller's (dashes) believe it is. Play the run to see it move.
+* **Packets**: each update on its way; what is lost falls, what was forced through is a diamond.
+  A flight takes microseconds; it is drawn as {LEG_S:g} s a leg: x_c jumps before the dot arrives.
 * **States**: the plant's x, the sensor's model x_s (reset {x_s_is_reset}), the controller's model
   x_c (reset only by what survives). Where x_c leaves the other two, packets were lost.
 * **Intervals**: time since the last broadcast, and since the last reception.
@@ -301,32 +413,51 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 
 def _record(node: Node, *, live: bool) -> None:
-    with under_way(Path(node.ticket.run_dir)):
-        _record_run(node, live=live)
+    with under_way(Path(node.ticket.run_dir)), ExitStack() as stack:
+        live_view = None
+        if live and not node.start.again:
+            live_view = LiveView()
+            stack.callback(live_view.close)  # one that stands still would not end by itself
+        _record_run(node, live_view)
 
 
-def _record_run(node: Node, *, live: bool) -> None:
+def _record_run(node: Node, live_view: LiveView | None) -> None:
     run_dir = Path(node.ticket.run_dir)
-    live_view = LiveView() if live else None
-    view = open_view(node.scenario, run_dir, node.ticket.run_id, live_view)
+    view = None
+    if not node.start.again:  # else the recording is written anew in the end
+        view = open_view(node.scenario, run_dir, node.ticket.run_id, live_view)
     recorder = Recorder(
-        node.scenario, run_dir, node.plane, view, live_view.status if live_view else None
+        node.scenario,
+        run_dir,
+        node.plane,
+        view,
+        live_view.status if live_view else None,
+        start=node.start,
     )
+    if node.after is not None:
+        recorder.note(Notice(node.start.from_ns, RESTART, f"started anew: {node.after}"))
     node.join(None)
     shown_s = stop_s = None
+    confirmed_s = time.monotonic()
     while not recorder.finished:
         recorder.poll()
+        for change, said in node.changes():
+            recorder.change(change, said)
         now_s = time.monotonic()
         if shown_s is None or now_s - shown_s >= _SHOW_S:
             recorder.show()
             shown_s = now_s
+        if now_s - confirmed_s >= _CONFIRM_S:
+            recorder.confirm()
+            confirmed_s = now_s
         if node.stopping:
             if node.ended in ("SIGINT", "SIGTERM"):
                 break
             if node.ended == LAUNCHER_GONE:
                 # The others spool their own last rows now; `noack summary` finishes the record.
                 recorder.abandon()
-                view.close()
+                if view is not None:
+                    view.close()
                 return
             stop_s = stop_s or now_s
             if now_s - stop_s > _STOP_PATIENCE_S:
@@ -336,7 +467,8 @@ def _record_run(node: Node, *, live: bool) -> None:
     recorder.show()
     record = recorder.finish()
     try:
-        view.close()
+        if view is not None:
+            view.close()
     except ViewError as error:
         print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
     if recorder.view_is_incomplete:
@@ -345,7 +477,7 @@ def _record_run(node: Node, *, live: bool) -> None:
 
 def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
     """Write a run's recording from its finished record."""
-    with open_view(record.scenario, run_dir, run_id, None, record.kind) as view:
+    with open_view(record.scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
         feed = ViewFeed(record.scenario, view)
         for table in record.tables:
             feed.add(table, record[table])

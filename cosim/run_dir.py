@@ -8,8 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import TextIO
 
-from noack.errors import CallerError, MachineError
+from noack.errors import CallerError, MachineError, why
+from noack.scenario import Scenario
+from noack.scenario_file import dumps
+from noack.system_files import unchanged
+from noack.systems import Fmu, Python
 
 SCENARIO_FILE = "scenario.toml"
 ENVIRONMENT_FILE = "environment.json"
@@ -19,9 +24,11 @@ SUMMARY_FILE = "summary.json"
 REPORT_FILE = "report.html"
 SPOOL = "spool"
 RECORD = "record"
+PLANT = "plant"
+"""The folder of the file that the plant is made of, if it is of one."""
 LATEST = "latest"
 _LOCK = ".lock"
-_LEAST_FREE_BYTES = 16 * 1024 * 1024
+LEAST_FREE_BYTES = 16 * 1024 * 1024
 
 
 def new_run_dir(runs: Path, name: str) -> Path:
@@ -34,10 +41,10 @@ def new_run_dir(runs: Path, name: str) -> Path:
     try:
         runs.mkdir(parents=True, exist_ok=True)
         free_bytes = shutil.disk_usage(runs).free
-        if free_bytes < _LEAST_FREE_BYTES:
+        if free_bytes < LEAST_FREE_BYTES:
             raise MachineError(
                 f"{runs}: only {free_bytes // 1024} KiB are free on the disk; a run wants "
-                f"{_LEAST_FREE_BYTES // 2**20} MiB at the least"
+                f"{LEAST_FREE_BYTES // 2**20} MiB at the least"
             )
         for attempt in range(1000):
             run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
@@ -48,6 +55,36 @@ def new_run_dir(runs: Path, name: str) -> Path:
     except OSError as error:
         raise MachineError(f"{runs}: no run directory can be created: {error}") from None
     raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
+
+
+def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
+    """Write the scenario of a run into its directory, with the file that its plant is made of.
+
+    So the run can be replayed when that file has changed, and the directory be taken elsewhere.
+
+    Returns:
+        The scenario for the run's processes, who use the kept file.
+
+    Raises:
+        CallerError: the plant's file is not what it was when the scenario was loaded.
+        OSError: the directory cannot be written.
+    """
+    system, here = resolved.plant.system, resolved
+    if isinstance(system, Fmu | Python) and system.file is not None:
+        file = unchanged(system)
+        kept = run_dir / PLANT / file.name
+        kept.parent.mkdir()
+        shutil.copyfile(file, kept)
+        resolved = _with_file(resolved, f"{PLANT}/{file.name}")
+        here = _with_file(resolved, str(kept.absolute()))
+    (run_dir / SCENARIO_FILE).write_text(dumps(resolved), encoding="utf-8")
+    return here
+
+
+def _with_file(scenario: Scenario, file: str) -> Scenario:
+    system = scenario.plant.system.model_copy(update={"file": file})
+    plant = scenario.plant.model_copy(update={"system": system})
+    return scenario.model_copy(update={"plant": plant})
 
 
 def point_to_latest(run_dir: Path) -> None:
@@ -76,8 +113,12 @@ def latest_run(runs: Path) -> Path:
 
 @contextmanager
 def under_way(run_dir: Path) -> Iterator[None]:
-    """Mark a run as under way; the launcher and the recorder do, each for as long as it lives."""
-    with (run_dir / _LOCK).open("a") as lock:
+    """Mark a run as under way; the launcher and the recorder do, each for as long as it lives.
+
+    Raises:
+        MachineError: the directory cannot be written.
+    """
+    with _lock_file(run_dir) as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
         yield
 
@@ -88,10 +129,18 @@ def concluded(run_dir: Path) -> Iterator[None]:
 
     Raises:
         CallerError: the run is still under way.
+        MachineError: the directory cannot be written.
     """
-    with (run_dir / _LOCK).open("a") as lock:
+    with _lock_file(run_dir) as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise CallerError(f"{run_dir}: the run is still under way") from None
         yield
+
+
+def _lock_file(run_dir: Path) -> TextIO:
+    try:
+        return (run_dir / _LOCK).open("a")
+    except OSError as error:
+        raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.changes import changes_of
+from cosim.claims.observer import observe
 from cosim.exact.fates import network_fates
 from cosim.exact.sampled import NO_ACTUATION, Schedule
 from cosim.record import Rows, RunRecord
@@ -42,11 +44,23 @@ def live_run(record: RunRecord) -> LiveRun:
     """Read what happened in a run.
 
     Raises:
-        IncomparableError: the run diverged, or its record is too short or has gaps.
-        CallerError: its updates were acknowledged.
+        IncomparableError: the run diverged, a process was started anew, settings were changed, the
+            record is too short or has gaps, or the input was not that of the controller's model
+            throughout.
+        CallerError: it is of a scenario that exact simulation cannot take.
     """
     record.scenario.require_unacknowledged()
+    if changes_of(record):
+        raise IncomparableError(
+            "no ideal loop is like it: its settings were changed during the run"
+        )
+    record.scenario.require_unchanging()
+    record.scenario.require_exact()
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
+    if (again := record.restarted()) is not None:
+        raise IncomparableError(
+            f"no ideal loop is like it: {again} was started anew during the run"
+        )
     if len(sensor) < _LEAST_MEASUREMENTS:
         raise IncomparableError(
             f"the record holds {len(sensor)} measurements; {_LEAST_MEASUREMENTS} are needed"
@@ -58,12 +72,18 @@ def live_run(record: RunRecord) -> LiveRun:
         raise IncomparableError("steps of the plant are missing from the record")
     if (np.diff(sensor["input"], prepend=-1) != 1).any():
         raise IncomparableError("measurements are missing from the sensor's record")
+    _require_times(record)
     if not np.abs(steps["x"]).max() < _LARGEST:  # nor with NaN
         raise IncomparableError("the run diverged")
     measured = np.zeros(last + 1, dtype=np.bool_)
     measured[sensor["t_ns"] // period_ns] = True
     ticks, taken = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
     latched = _latched(steps["actuation"], ticks)
+    seen = observe(record)
+    if len(seen.watchdog.t_s) or len(seen.safe_input.t_s):
+        raise IncomparableError(
+            "for a time the input was the watchdog's, or a safe one, which no ideal loop has"
+        )
     events = sensor[sensor["event"] != NO_SEQUENCE]
     numbers, event_ns = np.arange(len(events)), events["t_ns"]
     acts_at_tick = np.searchsorted(ticks.newest, numbers)
@@ -78,6 +98,23 @@ def live_run(record: RunRecord) -> LiveRun:
         model_ns=latched.model_ns,
     )
     return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
+
+
+def _require_times(record: RunRecord) -> None:
+    """Require times that a run has; a simulation would follow others for ever.
+
+    Raises:
+        IncomparableError: some are not.
+    """
+    horizon_ns = record.scenario.horizon_ns
+    for table, column in (
+        (SENSOR_MEASUREMENT, "t_ns"),
+        (CONTROLLER_STEP, "model_t_ns"),
+        (CONTROLLER_DELIVERY, "model_t_ns"),
+    ):
+        times_ns = record[table][column]
+        if (times_ns < 0).any() or (times_ns > horizon_ns).any() or (np.diff(times_ns) < 0).any():
+            raise IncomparableError(f"the record's {table} has times that no run has")
 
 
 class _Ticks(NamedTuple):

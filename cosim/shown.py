@@ -51,6 +51,27 @@ class _Acknowledgements(_Part):
     longest_loss_run: Number
 
 
+class _Watchdog(_Part):
+    policy: str
+    trips: Number
+    first_s: float | None
+    total_s: float
+
+
+class _Estimation(_Part):
+    observer: str | None
+    rms_second_half: float | None
+    expected_rms: float | None
+    max: float | None
+    sup_e_c_norm: float | None
+
+
+class _Disturbance(_Part):
+    at: str
+    rms: float | None
+    max: float | None
+
+
 class _Place(_Part):
     table: str
     row: Number
@@ -76,6 +97,14 @@ class _NotCompared(_Part):
     reason: str
 
 
+class _Linearisation(_Part):
+    A: list[list[float]] | None
+    eigenvalues: list[list[float]] | None
+    off_A: list[list[float]] | None
+    off_B: list[list[float]] | None
+    in_box: bool | None
+
+
 class _Claim(_Part):
     what: str
     source: str
@@ -84,6 +113,13 @@ class _Claim(_Part):
     verdict: Literal["held", "violated", "void"]
     since_s: float | None
     why: str
+    from_s: float = 0.0
+    until_s: float | None = None
+
+
+class _Changed(_Part):
+    t_s: float
+    what: str
 
 
 class _Shown(_Part):
@@ -118,9 +154,14 @@ class _Shown(_Part):
     latency_us: _Latency | None
     realtime: dict[str, dict[str, str]]
     acknowledgements: _Acknowledgements | None = None
+    watchdog: _Watchdog | None = None
+    estimation: _Estimation | None = None
+    disturbances: list[_Disturbance] | None = None
     replay: _Replay | None = None
     fidelity: _Compared | _NotCompared | None = None
+    linearisation: _Linearisation | None = None
     claims: list[_Claim] | None = None
+    changes: list[_Changed] | None = None
 
 
 def can_be_shown(summary: Mapping[str, Any]) -> bool:

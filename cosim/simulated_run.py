@@ -10,13 +10,12 @@ from cosim.environment import write_environment
 from cosim.launch import Ending
 from cosim.record import RunRecord, write_record
 from cosim.recorder import write_view
-from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, new_run_dir, point_to_latest, under_way
+from cosim.run_dir import REPORTS_FILE, new_run_dir, point_to_latest, under_way, write_scenario
 from cosim.virtual import Progress, simulate
 from noack.errors import ExitStatus, MachineError
 from noack.io.node import HORIZON
 from noack.resolve import resolve
 from noack.scenario import Scenario
-from noack.scenario_file import dumps as scenario_toml
 
 
 class Simulator(Protocol):
@@ -52,7 +51,7 @@ def simulate_run(
     run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
     try:
         with under_way(run_dir):
-            (run_dir / SCENARIO_FILE).write_text(scenario_toml(resolved), encoding="utf-8")
+            resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)
             reports = json.dumps(record.reports, indent=2)

@@ -9,19 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.changes import NEVER_NS, changes_of
 from cosim.crossing import Crossing, crossing
-from cosim.join import identity_residual, in_common, join_all
-from cosim.record import (
-    Rows,
-    RunRecord,
-)
+from cosim.estimation import disturbance_summary, estimation_summary, true_states
+from cosim.join import Joined, identity_residual, join_all
+from cosim.record import Life, Rows, RunRecord
+from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
 from noack.io.node import HORIZON
+from noack.knobs import text_of
+from noack.linear import row_norms
+from noack.machine import FAILED, INCARNATION, RESTART
 from noack.records import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
-    OWNER,
     PLANT_ACTUATION,
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
@@ -30,8 +32,9 @@ from noack.records import (
     effective,
 )
 from noack.theory.assumptions import assumptions
-from noack.topology import LOOP_ROLES
+from noack.topology import LOOP_ROLES, RECORDER
 from noack.wire import Flow
+from plant_server.watchdog import too_old
 
 Summary = dict[str, Any]
 
@@ -61,12 +64,11 @@ def _summarise(
     joined = join_all(record)
     residual = identity_residual(record, joined)
     residual = residual[~np.isnan(residual)]
-    common = in_common(record.scenario, joined)
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
     diverged_at_s = _diverged_at_s(record[PLANT_STEP])
     if diverged_at_s is not None and exit_status == ExitStatus.OK:
-        exit_status, reason = ExitStatus.FAILED, f"diverged: x is not finite at {diverged_at_s:g} s"
+        exit_status, reason = ExitStatus.FAILED, _why_diverged(record, diverged_at_s)
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
     live = record.kind == "live"
     summary = {
@@ -83,9 +85,13 @@ def _summarise(
         "drops": int(crossed.lost.sum()),
         "drops_by_cause": _causes(crossed),
         "forced_deliveries": int((crossed.rows["fate"] == Fate.FORCED).sum()),
-        "longest_drop_run": crossed.longest_run(),
+        "longest_drop_run": max(
+            crossed.longest_run(), int(record[CONTROLLER_DELIVERY]["dropouts"].max(initial=0))
+        ),
         "assumption_violations": _violations(record),
         "assumptions": [assumption._asdict() for assumption in assumptions(scenario)],
+        "restarts": _restarts(record),
+        "changes": _changes(record),
         "missing_samples": sum(missing.values()),
         "missing_by_table": {table: n for table, n in missing.items() if n},
         "lost_outside_netem": sum(lost.values()),
@@ -101,7 +107,7 @@ def _summarise(
         "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
         "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
-        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[common]),
+        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[joined.since_delivery(scenario)]),
         "identity_residual_max": _or_none(np.max, residual),
         "identity_residual_relative": _or_none(
             lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),
@@ -112,6 +118,9 @@ def _summarise(
         "realtime": {
             role: report.get("realtime") or {} for role, report in record.reports.items() if live
         },
+        "watchdog": _watchdog(record),
+        "estimation": estimation_summary(record, _or_none(np.max, _true_e_c(record, joined))),
+        "disturbances": disturbance_summary(record),
         "diverged_at_s": diverged_at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }
@@ -119,6 +128,33 @@ def _summarise(
         summary["acknowledgements"] = _acknowledgements(record)
     finite: Summary = _finite(summary)
     return finite
+
+
+def _true_e_c(record: RunRecord, joined: Joined) -> NDArray[np.float64]:
+    """‖x_c − x‖_W against the plant's own state, from the controller's first update on."""
+    e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
+    if record.loop.weight is not None:
+        e_c = e_c @ record.loop.weight.T
+    norms = row_norms(e_c)
+    return norms[np.isfinite(norms) & joined.since_delivery(record.scenario)]
+
+
+def _watchdog(record: RunRecord) -> dict[str, Any]:
+    """When the newest actuation was too old for the plant's watchdog, by its recorded steps."""
+    scenario, steps, taken = record.scenario, record[PLANT_STEP], record[PLANT_ACTUATION]
+    found = np.searchsorted(taken["sequence"], steps["actuation"])
+    there = np.append(taken["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
+    newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(taken["t_ns"], 0)[found], 0)
+    # Of an actuation that is not on record nobody knows how old it is.
+    old = there & too_old(steps["t_ns"], newest_ns, scenario.actuation_timeout_ns)
+    trips = np.flatnonzero(old & ~np.append(False, old[:-1]))
+    return {
+        "policy": scenario.plant.watchdog.policy,
+        "timeout_s": scenario.actuation_timeout_ns * 1e-9,
+        "trips": len(trips),
+        "first_s": float(steps["t_ns"][trips[0]]) * 1e-9 if len(trips) else None,
+        "total_s": int(old.sum()) * scenario.plant_period_ns * 1e-9,
+    }
 
 
 def _acknowledgements(record: RunRecord) -> dict[str, int]:
@@ -147,6 +183,13 @@ def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     return dict(heard + Counter((channel.get("acknowledgements") or {}).get("rejected") or {}))
 
 
+def _why_diverged(record: RunRecord, at_s: float) -> str:
+    for notice in record.notices:
+        if notice["level"] == FAILED:
+            return f"the plant failed at {at_s:g} s: {notice['text']}"
+    return f"diverged: x is not finite at {at_s:g} s"
+
+
 def _diverged_at_s(steps: Rows) -> float | None:
     lost = np.flatnonzero(~np.isfinite(steps["x"]).all(axis=1))
     return float(steps["t_ns"][lost[0]]) * 1e-9 if len(lost) else None
@@ -159,16 +202,38 @@ def _violations(record: RunRecord) -> list[dict[str, Any]]:
         for notice in record.notices
         if notice["level"] == "violation"
     ]
-    mansd = record.scenario.network.mansd
     crossed = crossing(record)
     survived = np.flatnonzero(~crossed.lost)
     last = int(survived[-1]) + 1 if len(survived) else 0
+    mansd = _largest_cap(record, int(crossed.event_ns[last - 1]) if last else 0)
     dropped = len(crossed.lost) - last
     if dropped > mansd:
         what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
         at_s = float(crossed.event_ns[last + mansd]) * 1e-9
         seen.append({"t_s": at_s, "process": "netem", "what": what})
     return seen
+
+
+def _largest_cap(record: RunRecord, since_ns: int) -> int:
+    """The largest M − 1 that was in force at any time since then."""
+    caps = [(0, record.scenario.network.mansd)]
+    caps += [(one.everywhere_ns, one.scenario.network.mansd) for one in changes_of(record)]
+    ends_ns = [*(from_ns for from_ns, _ in caps[1:]), NEVER_NS]
+    return max(cap for (_, cap), end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)
+
+
+def _changes(record: RunRecord) -> list[dict[str, Any]]:
+    """What was changed while the run went on."""
+    return [
+        {
+            "number": made.change.number,
+            "t_s": made.change.t_ns / NS_PER_S,
+            "settings": dict(made.change.settings),
+            "what": text_of(made.change.settings),
+            "since_s": {role: ns / NS_PER_S for role, ns in made.since_ns.items()},
+        }
+        for made in changes_of(record)
+    ]
 
 
 def _causes(crossed: Crossing) -> dict[str, int]:
@@ -190,18 +255,62 @@ def _or_none(statistic: Any, values: NDArray[np.float64]) -> float | None:
 
 def _missing(record: RunRecord) -> dict[str, int]:
     """Rows that a process made and the record lacks, by table."""
-    missing: dict[str, int] = {}
-    for table in record.tables:
-        report = record.reports.get(OWNER[table])
-        if report is not None:
-            missing[table] = report["rows"][table] - len(record[table])
+    missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
-        if role in record.reports:
-            continue
-        # The process died without a report: its inputs are numbered, so gaps still show.
-        inputs = np.concatenate([rows["input"] for rows in record.owned_by(role).values()])
-        missing[role] = int(inputs.max() + 1 - len(inputs)) if len(inputs) else 0
+        for life in record.lives(role):
+            if life.report is not None:
+                for table, rows in life.rows.items():
+                    missing[table] += life.report["rows"][table] - len(rows)
+                continue
+            # The process died without a report: its inputs are numbered, so gaps still show.
+            inputs = np.concatenate([rows["input"] for rows in life.rows.values()])
+            for of in np.unique(inputs // INCARNATION):
+                numbers = inputs[inputs // INCARNATION == of] % INCARNATION
+                missing[role] += int(numbers.max()) + 1 - len(numbers)
     return missing
+
+
+def _restarts(record: RunRecord) -> list[dict[str, Any]]:
+    """Processes that took the place of one that had died."""
+    found: list[dict[str, Any]] = []
+    for role in (*LOOP_ROLES, RECORDER):
+        notices = [n for n in record.notices if (n["process"], n["level"]) == (role, RESTART)]
+        if role == RECORDER:  # it leaves no rows of its own
+            found += [
+                _restart(role, number, None, notice["t_ns"] * 1e-9, notice["text"])
+                for number, notice in enumerate(notices, 1)
+            ]
+            continue
+        acted_s = {life.incarnation: _acted_s(life) for life in record.lives(role)}
+        # Each says it once; if one's word is lost, it is that of one that did not live long.
+        said = dict(enumerate(notices, max(max(acted_s) - len(notices), 0) + 1))
+        last_s = acted_s.pop(0)[-1]
+        for number in sorted(acted_s.keys() | said.keys()):
+            first_s, until_s = acted_s.get(number, (None, last_s))
+            what = said[number]["text"] if number in said else None
+            found.append(_restart(role, number, last_s, first_s, what))
+            last_s = until_s
+    return sorted(found, key=lambda one: one["first_s"] or one["last_s"] or math.inf)
+
+
+def _restart(
+    process: str, incarnation: int, last_s: float | None, first_s: float | None, what: str | None
+) -> dict[str, Any]:
+    return {
+        "process": process,
+        "incarnation": incarnation,
+        "last_s": last_s,
+        "first_s": first_s,
+        "what": what,
+    }
+
+
+def _acted_s(life: Life) -> tuple[float | None, float | None]:
+    """When a process first left a row, and when last; None of one that never did."""
+    now_ns = np.concatenate([rows["now_ns"] for rows in life.rows.values()])
+    if not len(now_ns):
+        return None, None
+    return float(now_ns.min()) * 1e-9, float(now_ns.max()) * 1e-9
 
 
 def _lost(record: RunRecord) -> dict[str, int]:

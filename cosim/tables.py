@@ -12,6 +12,7 @@ from rich.table import Table
 
 from cosim.conclude import Outcome
 from cosim.fidelity_table import summary_rows
+from cosim.linearisation import said
 from cosim.run_dir import RECORDING_FILE, REPORT_FILE
 from cosim.summary import Summary
 from noack.theory.assumptions import Verdict
@@ -96,6 +97,12 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
         ("identity (I1), relative residual", _number(summary["identity_residual_relative"])),
         ("missing samples", str(summary["missing_samples"])),
         ("lost outside the emulator", str(summary["lost_outside_netem"])),
+        *_restarts(summary.get("restarts")),
+        *changes_in(summary),
+        *_watchdog(summary.get("watchdog")),
+        *(said(found) if (found := summary.get("linearisation")) else ()),
+        *_estimation(summary.get("estimation")),
+        *_disturbances(summary.get("disturbances")),
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
@@ -115,20 +122,73 @@ def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]
         yield "  longest run of losses", str(found["longest_loss_run"])
 
 
+def _restarts(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
+    for one in found or ():
+        yield f"{one['process']} was started anew", away(one)
+
+
+def changes_in(summary: Summary) -> Iterator[tuple[str, str]]:
+    """What was changed while the run went on, and from when on."""
+    for one in summary.get("changes") or ():
+        yield f"changed at {one['t_s']:.3f} s", one["what"]
+
+
+def interval_of(claim: dict[str, Any]) -> str:
+    """Of which time something is claimed, if not of the whole run."""
+    from_s, until_s = claim.get("from_s") or 0.0, claim.get("until_s")
+    if from_s == 0 and until_s is None:
+        return ""
+    return f"from {from_s:.3f} s " + ("on" if until_s is None else f"to {until_s:.3f} s")
+
+
+def away(restart: dict[str, Any]) -> str:
+    """From when to when somebody was away, and why."""
+    since, until = (_seconds(restart[key]) for key in ("last_s", "first_s"))
+    why = (restart["what"] or "").partition(": ")[2]
+    when = f"at {until}" if restart["last_s"] is None else f"away from {since} to {until}"
+    return f"{when}: {why}" if why else when
+
+
+def _watchdog(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    if found is not None and found["trips"]:
+        times = "once" if found["trips"] == 1 else f"{found['trips']} times"
+        first, total = _seconds(found["first_s"]), _seconds(found["total_s"])
+        yield "actuations too old (watchdog)", f"{times}, first at {first}, {total} in all"
+        yield "  policy then", found["policy"]
+
+
+def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    if found is not None:
+        rms, expected = _number(found["rms_second_half"]), _number(found["expected_rms"])
+        what = f"estimated ({found['observer']})" if found["observer"] else "measured with noise"
+        yield f"state {what}: RMS ‖x̂ − x‖, second half", rms
+        yield "  in the steady state, were the plant the model", expected
+        yield (
+            "largest ‖x̂ − x‖, ‖x_c − x‖",
+            f"{_number(found['max'])}, {_number(found['sup_e_c_norm'])}",
+        )
+
+
+def _disturbances(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
+    for one in found or ():
+        what = f"disturbance at the {one['at']}, RMS, largest"
+        yield what, f"{_number(one['rms'])}, {_number(one['max'])}"
+
+
 def print_claims(console: Console, summary: Summary) -> None:
     """Print what was claimed of a run, and what became of it."""
     claims = summary.get("claims")
     if not claims:
         return
-    if summary.get("kind", "live") == "live" and any(
-        "felt after" in c["why"] or " old" in c["why"] for c in claims
-    ):
+    undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
+    if undisturbed and any("felt after" in c["why"] or " old" in c["why"] for c in claims):
         console.print(
             "this machine was late, which voids claims that do not allow for it: a greater "
             "certificate.late_periods does, where it can be certified; noack simulate is never late"
         )
     table = Table(title="claims, and what this run says of them")
-    for heading in ("source", "claim", "used", "verdict"):
+    parts = any(map(interval_of, claims))
+    for heading in ("source", "claim", *(["of the time"] if parts else []), "used", "verdict"):
         table.add_column(heading, justify="right" if heading == "used" else "left")
     for claim in claims:
         used = "-" if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %"
@@ -136,6 +196,7 @@ def print_claims(console: Console, summary: Summary) -> None:
         colour = _CLAIM_COLOURS[claim["verdict"]]
         table.add_row(
             *(escape(claim[key]) for key in ("source", "bound")),
+            *([interval_of(claim)] if parts else []),
             used,
             f"[{colour}]{claim['verdict']}{since}[/]",
         )

@@ -17,6 +17,7 @@ from controller_node.controller import controller_of
 from cosim.record import Rows, RunRecord
 from netem.duplex import network_of
 from netem.link import Datagram
+from noack.changes import Change, Changeable, said_of, scheduled
 from noack.io.node import HORIZON
 from noack.machine import Machine, Notice, Record
 from noack.records import (
@@ -27,11 +28,10 @@ from noack.records import (
     PACKET_HEAD_BYTES,
     UPDATES,
     Fate,
-    tables,
 )
-from noack.resolve import loop_of
+from noack.resolve import tables_of
 from noack.scenario import Scenario
-from noack.topology import ACKNOWLEDGES_TO, LEGS, LOOP_ROLES
+from noack.topology import ACKNOWLEDGES_TO, CHANGEABLE, LEGS, LOOP_ROLES, RECORDER
 from noack.wire import KEY_BYTES, Decoder, Encoder, Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
@@ -113,8 +113,7 @@ class Shuttle:
 
     Args:
         machines: the machine of each role.
-        n: number of states.
-        m: number of inputs.
+        entries: how many numbers a message of a flow carries.
         take: takes each row and notice, with the role that emitted it.
         acknowledged: whether updates are acknowledged.
     """
@@ -122,8 +121,7 @@ class Shuttle:
     def __init__(
         self,
         machines: Mapping[str, Machine[Any]],
-        n: int,
-        m: int,
+        entries: Callable[[Flow], int],
         take: Callable[[str, Record | Notice], None],
         *,
         acknowledged: bool = False,
@@ -132,7 +130,7 @@ class Shuttle:
         self._take = take
         self._encoder = Encoder(RUN_ID, _KEY)
         self.decoders = {
-            role: Decoder(leg.receives, m if leg.receives is Flow.ACTUATION else n, RUN_ID, _KEY)
+            role: Decoder(leg.receives, entries(leg.receives), RUN_ID, _KEY)
             for role, leg in LEGS.items()
             if role != "netem"  # which reads no payload
         }
@@ -153,6 +151,13 @@ class Shuttle:
             elif not self._receive(*self._sent.popleft()):
                 continue
             yield self._now_ns
+
+    def announce(self, changes: Sequence[Change]) -> None:
+        """Tell every machine that can be changed of changes to come."""
+        for role in CHANGEABLE:
+            machine: Changeable[Any] = self.machines[role]  # type: ignore[assignment]
+            for change in changes:
+                self._emit(role, machine.announce(change, self._now_ns))
 
     def _next(self) -> tuple[int, int, str] | None:
         due = [
@@ -231,16 +236,21 @@ def simulate(
     Returns:
         The record of the run; reports hold what applies: no sockets, no real-time settings.
     """
-    loop = loop_of(resolved)
     acknowledged = resolved.is_acknowledged
-    gathered = _Gathered(tables(loop.n, loop.m, acknowledged=acknowledged))
+    if network is not None:
+        resolved.require_unchanging()
+    gathered = _Gathered(tables_of(resolved))
     machines: dict[str, Machine[Any]] = {
         "plant": plant_of(resolved),
         "sensor": sensor_of(resolved),
-        "netem": network_of(resolved, None if network is None else DecidedLink(network)),
+        "netem": network_of(resolved, forward=None if network is None else DecidedLink(network)),
         "controller": controller_of(resolved),
     }
-    shuttle = Shuttle(machines, loop.n, loop.m, gathered.take, acknowledged=acknowledged)
+    shuttle = Shuttle(machines, resolved.entries, gathered.take, acknowledged=acknowledged)
+    changes = scheduled(resolved)
+    shuttle.announce(changes)
+    for change in changes:
+        gathered.take(RECORDER, said_of(change))
     with np.errstate(all="ignore"):  # a loop that diverges has a record, too
         for happened, now_ns in enumerate(shuttle.run()):
             if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:

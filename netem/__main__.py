@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
 
 def _in_a_run(node: Node) -> None:
     node.run(
-        network_of(node.scenario),
+        network_of(node.scenario, node.start),
         lambda endpoint, addresses: Relay(
             endpoint,
             addresses["controller"],

@@ -6,8 +6,9 @@ random streams and guarantees are each one's own.
 
 from collections.abc import Sequence
 
-from netem.link import Datagram, Link, update_link_of
-from noack.machine import Machine, Notice, Record
+from netem.link import Datagram, link_of, update_link_of
+from noack.changes import Unchangeable
+from noack.machine import BEGINNING, Machine, Notice, Record, Start
 from noack.records import ACKNOWLEDGEMENTS, UPDATES
 from noack.scenario import Scenario
 
@@ -15,17 +16,20 @@ ACKNOWLEDGEMENT_LINK = "acknowledgement"
 """Name of the link from controller to sensor; part of its random streams' names."""
 
 
-class Duplex:
+class Duplex(Unchangeable):
     """The machine of a network with a way back.
 
     Args:
         forward: takes the datagrams of flow 0.
         back: takes those of flow 1.
+        first_number: of its inputs.
     """
 
-    def __init__(self, forward: Machine[Datagram], back: Machine[Datagram]) -> None:
+    def __init__(
+        self, forward: Machine[Datagram], back: Machine[Datagram], *, first_number: int = 0
+    ) -> None:
         self._ways = {UPDATES: forward, ACKNOWLEDGEMENTS: back}
-        self._inputs = 0
+        self._inputs = first_number
 
     def next_deadline_ns(self) -> int | None:
         """When the next datagram leaves, in whichever direction."""
@@ -55,15 +59,18 @@ class Duplex:
         ]
 
 
-def network_of(resolved: Scenario, forward: Machine[Datagram] | None = None) -> Machine[Datagram]:
+def network_of(
+    resolved: Scenario, start: Start = BEGINNING, forward: Machine[Datagram] | None = None
+) -> Machine[Datagram]:
     """Return the network of a resolved scenario.
 
     Args:
         resolved: the scenario.
+        start: where in the run it takes up its work.
         forward: takes the place of the link from sensor to controller.
     """
-    forward = update_link_of(resolved) if forward is None else forward
+    forward = update_link_of(resolved, start) if forward is None else forward
     if not resolved.is_acknowledged:
         return forward
-    back = Link(resolved.network.way_back.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK)
-    return Duplex(forward, back)
+    back = link_of(resolved.network.way_back.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start)
+    return Duplex(forward, back, first_number=start.first_number)

@@ -19,9 +19,16 @@ from netem.records import Counters, Decision, FlowState, Memory, Verdict
 from netem.rules.change import carry
 from netem.rules.link import admit, leave
 from netem.rules.mansd import NEVER_NS
+from noack.changes import Change, Schedule
 from noack.impairments import LinkSettings
-from noack.machine import Notice, Record
-from noack.records import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate
+from noack.machine import BEGINNING, Notice, Record, Start
+from noack.records import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    NETEM_SETTING,
+    PACKET_HEAD_BYTES,
+    Fate,
+)
 from noack.scenario import Scenario
 
 UPDATE_LINK = "update"
@@ -56,6 +63,7 @@ class Link:
         seed: seed of its random streams.
         name: names of the link and the direction; part of its random streams' names.
         decisions: recorded decisions of each flow, taken again before the settings apply.
+        first_number: of its inputs and of its packets.
     """
 
     def __init__(
@@ -64,6 +72,7 @@ class Link:
         seed: int,
         *name: str,
         decisions: Sequence[Sequence[Decision]] = (),
+        first_number: int = 0,
     ) -> None:
         self._first_delivered = settings.first_delivered
         self._seed = seed
@@ -80,7 +89,7 @@ class Link:
         self._verdict = Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0)
         self._under_way: list[_UnderWay] = []
         self._put_under_way = 0
-        self._inputs = 0
+        self._inputs = self._first_number = first_number
 
     @property
     def counters(self) -> Counters:
@@ -139,7 +148,7 @@ class Link:
         due = heapq.heappop(self._under_way)
         stale = self._leave(due)
         row = (
-            self._inputs, due.packet, due.release_ns, now_ns,
+            self._inputs, self._first_number + due.packet, due.release_ns, now_ns,
             due.datagram.flow, int(due.copy), int(stale),
         )  # fmt: skip
         self._inputs += 1
@@ -150,8 +159,8 @@ class Link:
         verdict = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, verdict.packet, now_ns, now_ns, message.flow, Fate(verdict.fate),
-            verdict.run, verdict.release_ns, verdict.copy_ns, verdict.bit,
+            self._inputs, self._first_number + verdict.packet, now_ns, now_ns, message.flow,
+            Fate(verdict.fate), verdict.run, verdict.release_ns, verdict.copy_ns, verdict.bit,
             len(message.data), head,
         )  # fmt: skip
         self._inputs += 1
@@ -231,6 +240,59 @@ class Link:
         return row
 
 
+class RunLink(Link):
+    """The link from sensor to controller in a run: its settings may change at set times.
+
+    Args:
+        settings: what it does to datagrams at first.
+        seed: seed of its random streams.
+        name: names of the link and the direction; part of its random streams' names.
+        schedule: what it knows of changes.
+        first_number: of its inputs and of its packets.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        schedule: Schedule,
+        first_number: int = 0,
+    ) -> None:
+        super().__init__(settings, seed, *name, first_number=first_number)
+        self._settings = settings
+        self._schedule = schedule
+        self._reached_ns = -1
+
+    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+        """Take a change; it is in force from the first datagram on that comes not before T.
+
+        A smaller cap is kept from that datagram on: if as many as it allows, or more, have just
+        been lost in a row, this one passes. So a run of losses is never longer than the larger of
+        the caps that were in force during it.
+        """
+        said = self._schedule.announce(
+            NETEM_SETTING, change, self._inputs, now_ns, self._reached_ns
+        )
+        self._inputs += 1
+        return said
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Take a datagram; return it if it survives and is not delayed."""
+        if self._schedule.next_ns is not None:
+            while (found := self._schedule.take(now_ns)) is not None:
+                self._apply(found.prepared)
+        self._reached_ns = now_ns
+        return super().handle(message, now_ns)
+
+    def _apply(self, settings: LinkSettings) -> None:
+        first = self._settings.first_delivered  # one that was started anew has its own
+        settings = settings.model_copy(update={"first_delivered": first})
+        if settings != self._settings:
+            self._settings = settings
+            self.change(settings)
+
+
 def flipped(data: bytes, bit: int) -> bytes:
     """Return the data with one bit flipped; bit 0 is the first byte's lowest."""
     changed = bytearray(data)
@@ -238,6 +300,30 @@ def flipped(data: bytes, bit: int) -> bytes:
     return bytes(changed)
 
 
-def update_link_of(resolved: Scenario) -> Link:
+def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> RunLink:
     """Return the link from sensor to controller of a resolved scenario."""
-    return Link(resolved.network.link, resolved.seeds.loss, UPDATE_LINK)
+    settings, names = _at_the_start(resolved.network.link, UPDATE_LINK, start)
+    return RunLink(
+        settings, resolved.seeds.loss, *names,
+        schedule=Schedule(resolved, lambda one: one.network.link), first_number=start.first_number,
+    )  # fmt: skip
+
+
+def link_of(settings: LinkSettings, seed: int, name: str, start: Start) -> Link:
+    """Return a link of a run, whose settings stay as they are."""
+    settings, names = _at_the_start(settings, name, start)
+    return Link(settings, seed, *names, first_number=start.first_number)
+
+
+def _at_the_start(
+    settings: LinkSettings, name: str, start: Start
+) -> tuple[LinkSettings, tuple[str, ...]]:
+    """A link's settings and the names of its random streams.
+
+    One that is started anew knows nothing of how many it dropped in a row: the first passes, and
+    what follows is drawn from other streams than before.
+    """
+    if not start.again:
+        return settings, (name,)
+    again = f"again-{start.incarnation}"
+    return settings.model_copy(update={"first_delivered": True}), (name, again)

@@ -1,7 +1,7 @@
-"""The relay: the network emulator's socket. Datagrams in, survivors out to one destination, unread.
+"""The relay: the network emulator's socket in a run. Datagrams in, survivors out, unread.
 
-Flows are numbered by source address, in the order of their first datagram. Survivors leave from the
-port that they came in by.
+It serves the sensor's address, and the controller's where there is a way back. Survivors leave from
+the port that they came in by.
 """
 
 import socket
@@ -11,43 +11,38 @@ from noack.io.address import Address
 from noack.io.udp import MAX_UDP_BYTES, CountingSocket
 
 
-class Relay(CountingSocket):
+class Relay(CountingSocket[Datagram]):
     """The channel of a link.
 
     Args:
         endpoint: a bound socket, from :func:`noack.io.udp.bind`.
         destination: where surviving datagrams go.
-        source: the only address to serve; None serves everyone.
+        source: the only address to serve.
         duplex: what comes from the destination goes to the source, as flow 1.
     """
+
+    most_bytes = MAX_UDP_BYTES
 
     def __init__(
         self,
         endpoint: socket.socket,
         destination: Address,
-        source: Address | None = None,
+        source: Address,
         *,
         duplex: bool = False,
     ) -> None:
-        super().__init__(endpoint, destination)
-        self._source = source
-        self._back: dict[int, Address] = {}
-        self._flows: dict[Address, int] = {}
-        if duplex and source is not None:
-            self._back = {1: source}
-            self._flows = {source: 0, destination: 1}
+        self._flows = {source: 0, destination: 1} if duplex else {source: 0}
+        self._back = {1: source} if duplex else {}
         self._foreign = 0
+        super().__init__(endpoint, destination, list(self._flows))
 
-    def receive(self) -> Datagram | None:
-        """Take one datagram; None if there was none, or one that is not served."""
-        taken = self.take(MAX_UDP_BYTES)
-        if taken is None:
-            return None
-        data, source = taken
-        if self._source is not None and source != self._source and source not in self._flows:
+    def judge(self, data: bytes, source: Address) -> Datagram | None:
+        """Return a datagram of one that is served; its content is nobody's business here."""
+        flow = self._flows.get(source)
+        if flow is None:
             self._foreign += 1
             return None
-        return Datagram(self._flows.setdefault(source, len(self._flows)), data)
+        return Datagram(flow, data)
 
     def send(self, message: Datagram) -> None:
         """Forward a datagram that survived."""
@@ -55,5 +50,4 @@ class Relay(CountingSocket):
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        foreign = {"source": self._foreign} if self._foreign else {}
-        return super().report() | {"rejected": foreign}
+        return super().report() | {"rejected": self.rejected({"source": self._foreign})}

@@ -1,5 +1,6 @@
 """Errors that say who erred: the caller, a peer, or the machine the process runs on."""
 
+import os
 from enum import IntEnum
 
 
@@ -51,6 +52,11 @@ class NeverStartedError(NoackError):
 def one_line(error: BaseException) -> str:
     """Return what an error of somebody else's says, which may be of several lines, as one."""
     return " ".join(str(error).split())
+
+
+def why(error: OSError) -> str:
+    """Return why the system refused, in its own words, without what some libraries put around."""
+    return os.strerror(error.errno) if error.errno else one_line(error)
 
 
 def printable(text: str) -> str:

@@ -3,11 +3,9 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
-from noack.errors import CallerError
 from noack.impairments import (
     MAX_SCRIPT,
     MOST_DELAY_S,
@@ -19,6 +17,7 @@ from noack.impairments import (
     Scripted,
     Trace,
 )
+from noack.named_file import NamedFile
 
 MAX_SAMPLES = 1_000_000
 TABLE_SUFFIX = ".dist"
@@ -59,7 +58,7 @@ def read_impairment(impairment: Impairment, folder: Path, place: str = "") -> Im
         return LossOf(loss=read_loss(impairment.loss, folder, _within(place, "loss")))
     if not isinstance(impairment, Delay) or impairment.file is None:
         return impairment
-    what = _What(impairment.file, folder, place)
+    what = NamedFile(impairment.file, folder, place)
     if Path(impairment.file).suffix == TABLE_SUFFIX:
         if impairment.jitter_s == 0:
             what.wrong("a distribution table is scaled by the jitter, which is 0; give a jitter")
@@ -84,7 +83,7 @@ def read_loss(loss: Loss, folder: Path, place: str = "") -> Loss:
     """Return a loss model that names no file; see :func:`read_files`."""
     if not isinstance(loss, Trace):
         return loss
-    what = _What(loss.file, folder, place)
+    what = NamedFile(loss.file, folder, place)
     marks = np.frombuffer(what.content().translate(None, _SPACES), np.uint8)
     wrong = np.flatnonzero((marks != ord("0")) & (marks != ord("1")))
     if wrong.size:
@@ -101,41 +100,24 @@ def _within(place: str, key: str) -> str:
     return f"{place}.{key}" if place else ""
 
 
-class _What:
-    """A file, and where it is named."""
-
-    def __init__(self, name: str, folder: Path, place: str) -> None:
-        self._path = folder / name
-        self._named = f'{place}.file = "{name}"' if place else name
-
-    def wrong(self, message: str) -> NoReturn:
-        raise CallerError(f"{self._named}: {message}")
-
-    def content(self) -> bytes:
-        try:
-            return self._path.read_bytes()
-        except (OSError, ValueError) as error:
-            reason = error.strerror if isinstance(error, OSError) else str(error)
-            raise CallerError(f"{self._named}: cannot be read: {reason}") from None
-
-    def lines(self) -> Iterator[tuple[int, str]]:
-        """Numbered lines that are neither empty nor comments."""
-        text = self.content().decode("utf-8", errors="replace")
-        for number, line in enumerate(text.splitlines(), 1):
-            if line.strip() and not line.startswith("#"):
-                yield number, line.strip()
+def _lines(what: NamedFile) -> Iterator[tuple[int, str]]:
+    """Numbered lines that are neither empty nor comments."""
+    text = what.content().decode("utf-8", errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, line.strip()
 
 
-def _table(what: _What) -> Iterator[int]:
-    for number, line in what.lines():
+def _table(what: NamedFile) -> Iterator[int]:
+    for number, line in _lines(what):
         for word in line.split():
             if not re.fullmatch("-?[0-9]{1,5}", word):
                 what.wrong(f"line {number}: {word[:20]}: expected whole numbers, 8192 for 1")
             yield int(word)
 
 
-def _observed_s(what: _What) -> Iterator[float]:
-    for number, line in what.lines():
+def _observed_s(what: NamedFile) -> Iterator[float]:
+    for number, line in _lines(what):
         found = _DELAY.fullmatch(line)
         scale = _UNITS_S.get(found[2]) if found else None
         if found is None or scale is None:

@@ -8,12 +8,44 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from noack.wire import Message
 
+INCARNATION = 2**40
+"""A restarted process numbers from its incarnation times this on: newer than all before it."""
+
+
+class Start(NamedTuple):
+    """Where a machine takes up its work in a run."""
+
+    incarnation: int = 0
+    """How often its process has been started anew in this run; one that was knows no state."""
+    from_ns: int = 0
+    """No timer is due before."""
+
+    @property
+    def first_number(self) -> int:
+        """The first of its sequence numbers, and of the numbers of its inputs."""
+        return self.incarnation * INCARNATION
+
+    @property
+    def again(self) -> bool:
+        """Whether the process was started anew while the run went on."""
+        return self.incarnation > 0
+
+
+BEGINNING = Start()
+"""The run's own start."""
+
 
 class Record(NamedTuple):
     """A row for the numeric record; ``noack.records`` documents the tables."""
 
     table: str
     row: tuple[Any, ...]
+
+
+RESTART = "restart"
+"""Level of the notice of a process that takes another's place."""
+FAILED = "failed"
+"""Level of the notice of a plant that cannot go on."""
 
 
 class Notice(NamedTuple):

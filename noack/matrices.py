@@ -51,11 +51,11 @@ def require_length(row: tuple[object, ...] | None, key: str, expected: int, why:
         raise ValueError(f"{key}: expected {expected} entries ({why}), found {len(row)}")
 
 
-def require_non_negative(row: tuple[float, ...], key: str) -> None:
-    """Check half-widths.
+def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-widths") -> None:
+    """Check half-widths, or what else.
 
     Raises:
         ValueError: one is negative.
     """
     if any(entry < 0 for entry in row):
-        raise ValueError(f"{key}: half-widths cannot be negative")
+        raise ValueError(f"{key}: {what} cannot be negative")

@@ -16,6 +16,8 @@ _PATTERNS = {
     "or digit, at most 64",
     r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, "
     "at most 32",
+    r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
+    "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
 _REMEDIES = {
     "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",

@@ -20,6 +20,14 @@ CONTROLLER_DELIVERY = "controller_delivery"
 SENSOR_ACKNOWLEDGEMENT = "sensor_acknowledgement"
 NETEM_PACKET = "netem_packet"
 NETEM_RELEASE = "netem_release"
+SENSOR_SETTING = "sensor_setting"
+NETEM_SETTING = "netem_setting"
+CONTROLLER_SETTING = "controller_setting"
+
+SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
+"""What each process was told of changes during the run."""
+CHANGE_BYTES = 1024
+"""Width of a change in the record: JSON, filled up with zeros."""
 
 PACKET_HEAD_BYTES = 32
 """Leading bytes of each datagram that the network emulator keeps; it does not interpret them."""
@@ -53,13 +61,31 @@ def effective(fates: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.isin(fates, [fate for fate in Fate if fate.effective])
 
 
-def tables(n: int, m: int, *, acknowledged: bool = False) -> Mapping[str, np.dtype[np.void]]:
+def tables(
+    n: int,
+    m: int,
+    *,
+    acknowledged: bool = False,
+    predictive: bool = False,
+    internal: int = 0,
+    disturbed_input: bool = False,
+    disturbed_state: bool = False,
+    outputs: int = 0,
+    inputs_reported: int = 0,
+) -> Mapping[str, np.dtype[np.void]]:
     """Return the row types of all tables for ``n`` states and ``m`` inputs.
 
     Args:
         n: number of states.
         m: number of inputs.
         acknowledged: whether updates are acknowledged, so that there is a table of that, too.
+        predictive: whether actuations carry the controller's model state.
+        internal: number of entries of the plant's own state z that are on record.
+        disturbed_input: whether something is added to the plant's input.
+        disturbed_state: whether something is added to its ẋ.
+        outputs: number of measured outputs from which an observer estimates the state; 0 if there
+            is no observer.
+        inputs_reported: how many numbers of a measurement are inputs.
     """
     x: tuple[DTypeLike, tuple[int]] = ("<f8", (n,))
     u: tuple[DTypeLike, tuple[int]] = ("<f8", (m,))
@@ -83,6 +109,20 @@ def tables(n: int, m: int, *, acknowledged: bool = False) -> Mapping[str, np.dty
         ],
         NETEM_RELEASE: [*common, ("flow", "<i8"), ("copy", "<i8"), ("stale", "<i8")],
     }  # fmt: skip
+    for table in SETTINGS:
+        columns[table] = [*common, ("since_ns", "<i8"), ("change", f"V{CHANGE_BYTES}")]
+    if internal:
+        columns[PLANT_STEP].append(("z", "<f8", (internal,)))
+    if disturbed_input:
+        columns[PLANT_STEP].append(("d", *u))
+    if disturbed_state:
+        columns[PLANT_STEP].append(("w", *x))
+    if outputs:
+        columns[SENSOR_MEASUREMENT] += [
+            ("y", "<f8", (outputs,)), ("u_felt", "<f8", (inputs_reported,)),
+        ]  # fmt: skip
+    if predictive:
+        columns[PLANT_ACTUATION].append(("x_c", *x))
     if acknowledged:
         columns[SENSOR_ACKNOWLEDGEMENT] = [
             *common, ("model_t_ns", "<i8"), ("x_s_before", *x), ("x_s", *x),
@@ -99,6 +139,9 @@ OWNER: Mapping[str, str] = {
     CONTROLLER_DELIVERY: "controller",
     NETEM_PACKET: "netem",
     NETEM_RELEASE: "netem",
+    SENSOR_SETTING: "sensor",
+    NETEM_SETTING: "netem",
+    CONTROLLER_SETTING: "controller",
 }
 """Which process fills which table; ``sensor_acknowledgement`` is not in every run."""
 

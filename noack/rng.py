@@ -52,6 +52,18 @@ def uniforms(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float
     return np.asarray((words(seed, *name, rows=rows, width=width) >> np.uint64(11)) * 2.0**-53)
 
 
+def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float64]:
+    """Return rows of a table of standard normal numbers; see :func:`words`.
+
+    By inversion of the distribution function, so that each takes one word, wherever it lies.
+    """
+    # Much to import for those who draw no normals.
+    from scipy.special import ndtri
+
+    centred = uniforms(seed, *name, rows=rows, width=width) + 2.0**-54
+    return np.asarray(ndtri(np.minimum(centred, 1 - 2.0**-53)))
+
+
 def stream_key(seed: int, *name: str) -> tuple[int, int]:
     """Return the key of a counter-based random stream: two words of 32 bits.
 

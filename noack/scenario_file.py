@@ -10,7 +10,9 @@ import tomli_w
 from noack import toml_file
 from noack.errors import CallerError, printable
 from noack.impairment_files import read_impairment, read_loss
+from noack.matrix_files import with_matrices
 from noack.scenario import Acknowledgements, Network, Scenario
+from noack.system_files import read_system
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -41,6 +43,7 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
         CallerError: one line per mistake.
     """
     source = source or str(path)
+    content = with_matrices(content, path.parent, source)
     return _with_files(validate(content, source), path, source)
 
 
@@ -60,7 +63,13 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     if (back := network.acknowledgements) is not None:
         read = _read(back, path.parent, f"{place}.acknowledgements")
         update["acknowledgements"] = back.model_copy(update=read)
-    return scenario.model_copy(update={"network": network.model_copy(update=update)})
+    system = read_system(scenario.plant.system, path.parent, f"{source}: plant.system")
+    return scenario.model_copy(
+        update={
+            "network": network.model_copy(update=update),
+            "plant": scenario.plant.model_copy(update={"system": system}),
+        }
+    )
 
 
 def _read(section: Network | Acknowledgements, folder: Path, place: str) -> dict[str, Any]:
@@ -86,13 +95,21 @@ def _apply(content: dict[str, Any], override: str) -> None:
     if not equals or not key.strip():
         shown = printable(override)
         raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
+    put(content, key.strip(), value_of(text, f"--set {key}"), f"--set {override}")
+
+
+def value_of(text: str, source: str) -> Any:
+    """Return the value that a text on the command line stands for; a bare word is a string.
+
+    Raises:
+        CallerError: it is none of TOML; ``source`` names it.
+    """
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
+        return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
-        value = text  # a bare word is taken as a string
+        return text
     except (ValueError, RecursionError) as error:
-        raise CallerError(printable(f"--set {key}: not valid TOML: {error}")) from None
-    put(content, key.strip(), value, f"--set {override}")
+        raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:

@@ -40,6 +40,9 @@ ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.i
 """From whom each process receives them."""
 
 LOOP_ROLES = tuple(LEGS)
+PLANT = "plant"
+CHANGEABLE = ("sensor", "netem", "controller")
+"""Processes whose settings may change during a run."""
 RECORDER = "recorder"
 COORDINATOR = "coordinator"
 ROLES = (*LOOP_ROLES, RECORDER)

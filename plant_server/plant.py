@@ -1,55 +1,82 @@
-"""The plant: exact zero-order-hold propagation of the true state on a time grid.
+"""The plant: a system on a time grid, under held inputs.
 
-At grid time t_k = k h the plant advances x to t_k under the input that was held since t_{k−1},
-measures, and latches the newest actuation received, which it then holds until t_{k+1}. A step is
-always one h long: a late step is a late step of the same length, and is caught up.
+At grid time t_k = k h the plant advances its system to t_k under the input that was held since
+t_{k−1}, measures, and latches the newest actuation received, which it then holds until t_{k+1}. A
+step is always one h long: a late step is a late step of the same length, and is caught up. What is
+held when no actuation has come for too long is the watchdog's to say (``watchdog.py``); what the
+system is, the scenario's (``systems/``), as is what disturbs it from then until t_{k+1}
+(``disturbance.py``), and what is measured of it (``measurement.py``). A
+system that fails has no state any more: x is NaN from then on, as in a plant that diverges, and a
+notice says why.
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from noack.linear import HeldInputPropagator, Matrix, Vector
-from noack.machine import Output, Record
-from noack.records import NO_SEQUENCE, PLANT_ACTUATION, PLANT_STEP
+from noack.linear import Vector
+from noack.machine import FAILED, Notice, Output, Record
+from noack.records import PLANT_ACTUATION, PLANT_STEP
 from noack.resolve import loop_of
 from noack.scenario import Scenario
 from noack.wire import Flow, Message
+from plant_server.disturbance import Disturbance, disturbance_of
+from plant_server.measurement import Measuring, measuring_of
+from plant_server.system import System, SystemFailedError
+from plant_server.systems.choose import system_of
+from plant_server.watchdog import Fallback, Prediction, Watchdog, hold, zero
 
 
 class Plant:
     """The machine of the plant server.
 
     Args:
-        A, B: the true plant, shapes (n, n) and (n, m), per second.
-        x0: x(0), shape (n,).
+        system: what is stepped, at x(0).
+        watchdog: looks at the age of the newest actuation.
         period_ns: step h.
         horizon_ns: no step is due after this time.
         measure_every: a measurement is sent every so many steps.
+        disturbance: what is added to u, and to ẋ; None for nothing.
+        measuring: what is measured of x; None: x itself.
+        reports_inputs: whether a measurement carries the inputs of the steps since the one before,
+            too, as latched at the actuator: what disturbs them comes after it.
     """
 
     def __init__(
         self,
-        A: Matrix,
-        B: Matrix,
-        x0: Vector,
+        system: System,
+        watchdog: Watchdog,
         *,
         period_ns: int,
         horizon_ns: int,
         measure_every: int = 1,
+        disturbance: Disturbance | None = None,
+        measuring: Measuring | None = None,
+        reports_inputs: bool = False,
     ) -> None:
-        self._advance = HeldInputPropagator(A, B)
+        self._system = system
+        self._disturbance = disturbance
+        self._measuring = measuring
+        self._reports_inputs = reports_inputs
+        self._watchdog = watchdog
         self._period_ns = period_ns
         self._horizon_ns = horizon_ns
         self._measure_every = measure_every
         self._inputs = 0
         self._step = 0
         self._measurements = 0
-        self._newest = np.zeros(B.shape[1])
-        self._newest_sequence = NO_SEQUENCE
-        self.x = np.array(x0, dtype=np.float64)
-        self.u = self._newest
-        self._advance.step(period_ns)  # computed before the first deadline, not after it
+        self._failed = False
+        self._x, self._z = system.x, system.z
+        self.u = watchdog.newest.u
+        self._felt = self.u
+        """What the system is under: u, and what disturbs it."""
+        self._held = [self.u] * measure_every
+        """The inputs since the last measurement; before the first there were none."""
+
+    @property
+    def x(self) -> Vector:
+        """The state, as the loop calls it, shape (n,)."""
+        return self._x
 
     def next_deadline_ns(self) -> int | None:
         """Grid time of the next step."""
@@ -58,25 +85,53 @@ class Plant:
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Take an actuation; it is applied from the next step on."""
-        self._newest = message.vector
-        self._newest_sequence = message.sequence
-        row = (self._count(), message.sequence, message.t_ns, now_ns, message.vector)
-        return (Record(PLANT_ACTUATION, row),)
+        newest = self._watchdog.take(message.vector, message.t_ns, message.sequence)
+        row = (self._count(), message.sequence, message.t_ns, now_ns, newest.u)
+        return (Record(PLANT_ACTUATION, (*row, newest.x_c) if len(newest.x_c) else row),)
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
-        """Make one step: x(t_k) = Ad x(t_{k−1}) + Bd u; measure; latch the newest actuation."""
+        """Make one step under the held input; measure; choose the input from now on."""
         step, t_ns = self._step, self._step * self._period_ns
-        if step > 0:
-            self.x = self._advance(self.x, self.u, self._period_ns)
-        self.u = self._newest
+        failed = self._advance(t_ns) if step > 0 else ()
+        self.u, notices = self._watchdog.input(t_ns)
+        disturbed = self._disturb(step)
         self._step += 1
-        row = (self._count(), step, t_ns, now_ns, self.x, self.u, self._newest_sequence)
-        record = Record(PLANT_STEP, row)
+        newest = self._watchdog.newest.sequence
+        x, z = self._x, self._z
+        row = (self._count(), step, t_ns, now_ns, x, self.u, newest)
+        record = Record(PLANT_STEP, (*row, *(part for part in (z, *disturbed) if len(part))))
         if step % self._measure_every:
-            return (record,)
-        measurement = Message(Flow.MEASUREMENT, self._measurements, t_ns, self.x)
+            return (record, *failed, *notices)
+        y = x if self._measuring is None else self._measuring(x, self._measurements)
+        if self._reports_inputs:
+            y = np.concatenate([y, *self._held])
+        measurement = Message(Flow.MEASUREMENT, self._measurements, t_ns, y)
         self._measurements += 1
-        return (measurement, record)
+        return (measurement, record, *failed, *notices)
+
+    def _advance(self, t_ns: int) -> Sequence[Notice]:
+        """Step the system to ``t_ns``."""
+        self._held = [*self._held[1:], self.u]
+        if self._failed:
+            return ()
+        try:
+            self._system.advance(self._felt, t_ns - self._period_ns, self._period_ns)
+            self._x, self._z = self._system.x, self._system.z
+        except SystemFailedError as error:
+            self._failed = True
+            self._x, self._z = np.full_like(self._x, np.nan), np.full_like(self._z, np.nan)
+            return (Notice(t_ns, FAILED, str(error)),)
+        return ()
+
+    def _disturb(self, step: int) -> tuple[Vector, ...]:
+        """Take what disturbs the system during a step; return what goes on record of it."""
+        if self._disturbance is None:
+            self._felt = self.u
+            return ()
+        d, w = self._disturbance(step)
+        pushed = self.u + d if len(d) else self.u
+        self._felt = np.concatenate([pushed, w]) if len(w) else pushed
+        return d, w
 
     def _count(self) -> int:
         self._inputs += 1
@@ -85,12 +140,24 @@ class Plant:
 
 def plant_of(resolved: Scenario) -> Plant:
     """Return the plant of a resolved scenario."""
-    loop = loop_of(resolved)
     return Plant(
-        loop.A,
-        loop.B,
-        loop.x0,
+        system_of(resolved),
+        _watchdog_of(resolved),
         period_ns=resolved.plant_period_ns,
         horizon_ns=resolved.horizon_ns,
         measure_every=resolved.plant.measure_every,
+        disturbance=disturbance_of(resolved),
+        measuring=measuring_of(resolved),
+        reports_inputs=resolved.observer is not None,
     )
+
+
+def _watchdog_of(resolved: Scenario) -> Watchdog:
+    loop = loop_of(resolved)
+    fallbacks: dict[str, tuple[Fallback, str]] = {
+        "hold": (hold, "held"),
+        "zero": (zero, "0"),
+        "model": (Prediction(loop.H, loop.K, resolved.plant_period_ns), "the model's"),
+    }
+    fallback, said = fallbacks[resolved.plant.watchdog.policy]
+    return Watchdog(loop.m, resolved.actuation_timeout_ns, fallback, said)

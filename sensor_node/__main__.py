@@ -11,7 +11,9 @@ from sensor_node.sensor import sensor_of
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the sensor in the run that a recorder or launcher has opened."""
     return process.main(
-        "sensor", lambda member: member.run_messages(sensor_of(member.scenario)), arguments
+        "sensor",
+        lambda member: member.run_messages(sensor_of(member.scenario, member.start)),
+        arguments,
     )
 
 

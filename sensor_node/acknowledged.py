@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from noack.changes import Unchangeable
 from noack.linear import Matrix, Propagator, Vector, norm
 from noack.machine import Output, Record
 from noack.records import NO_SEQUENCE, SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT
@@ -17,7 +18,7 @@ from noack.trigger.policy import Policy, Trigger
 from noack.wire import Flow, Message
 
 
-class AcknowledgedSensor:
+class AcknowledgedSensor(Unchangeable):
     """The machine of the sensor node, if updates are acknowledged.
 
     Its time is the measurements' own here, too: an acknowledgement acts on the model at the time of
@@ -30,6 +31,7 @@ class AcknowledgedSensor:
             case the first measurement is an event, and x_s is 0 as x_c is until it is acknowledged.
         timeout_ns: how long to wait for an acknowledgement.
         period_ns: expected time between measurements, to prepare for; others are taken as well.
+        first_number: of its events and of its inputs.
     """
 
     def __init__(
@@ -40,14 +42,15 @@ class AcknowledgedSensor:
         *,
         timeout_ns: int,
         period_ns: int | None = None,
+        first_number: int = 0,
     ) -> None:
         self._propagate = Propagator(H, () if period_ns is None else (period_ns,))
         self._trigger = Trigger(policy)
         self._weight = policy.weight
         self._timeout_ns = timeout_ns
         self._model_ns = 0
-        self._inputs = 0
-        self._events = 0
+        self._inputs = first_number
+        self._events = first_number
         self._sent: dict[int, Vector] = {}
         self._wait_until_ns: int | None = None
         self._first = x0 is None
@@ -73,6 +76,7 @@ class AcknowledgedSensor:
         t_ns, x = message.t_ns, message.vector
         first, self._first = self._first, False
         if first:
+            self._model_ns = t_ns
             self._trigger.start(t_ns, x)
         self.x_s = x_s = self._propagate(self.x_s, t_ns - self._model_ns)
         self._model_ns = t_ns

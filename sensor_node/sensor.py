@@ -6,15 +6,19 @@ whether or not the update survives the network: nothing is acknowledged.
 
 from collections.abc import Sequence
 
-from noack.linear import Matrix, Propagator, Vector, norm
-from noack.machine import Output, Record
-from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
-from noack.resolve import loop_of
+from noack.changes import Change, Schedule
+from noack.errors import CallerError
+from noack.linear import Matrix, Vector, norm
+from noack.machine import BEGINNING, Notice, Output, Record, Start
+from noack.model_flow import ModelFlow
+from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
+from noack.resolve import loop_of, setpoint_of
 from noack.scenario import Scenario
 from noack.trigger.choose import policy_of
 from noack.trigger.policy import Policy, Trigger
 from noack.wire import Flow, Message
 from sensor_node.acknowledged import AcknowledgedSensor
+from sensor_node.observer import ObservingSensor, observer_of
 
 
 class Sensor:
@@ -29,6 +33,9 @@ class Sensor:
         x0: the state that sensor and controller both know at t = 0; None if they do not, in which
             case the first measurement is an event.
         period_ns: expected time between measurements, to prepare for; others are taken as well.
+        first_number: of its events and of its inputs.
+        setpoint: x_r, shape (n,); None is 0.
+        schedule: what it knows of changes; None if there are none.
     """
 
     def __init__(
@@ -38,13 +45,18 @@ class Sensor:
         x0: Vector | None = None,
         *,
         period_ns: int | None = None,
+        first_number: int = 0,
+        setpoint: Vector | None = None,
+        schedule: Schedule | None = None,
     ) -> None:
-        self._propagate = Propagator(H, () if period_ns is None else (period_ns,))
+        self._flow = ModelFlow(H, () if period_ns is None else (period_ns,), setpoint)
+        self._schedule = schedule
+        self._reached_ns = -1
         self._trigger = Trigger(policy)
         self._weight = policy.weight
         self._model_ns = 0
-        self._inputs = 0
-        self._events = 0
+        self._inputs = first_number
+        self._events = first_number
         self.x_s = x0
         if x0 is not None:
             self._trigger.start(0, x0)
@@ -57,11 +69,33 @@ class Sensor:
         """Nothing is ever due."""
         return ()
 
+    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+        """Take a change; it is in force from the first measurement on that is not before T.
+
+        x_s follows another set-point from T itself on.
+        """
+        if self._schedule is None:
+            raise CallerError("this sensor's settings cannot be changed")
+        said = self._schedule.announce(
+            SENSOR_SETTING, change, self._inputs, now_ns, self._reached_ns
+        )
+        self._inputs += 1
+        return said
+
+    def _change(self, t_ns: int) -> None:
+        """Apply what is in force at a time."""
+        while self._schedule is not None and (found := self._schedule.take(t_ns)) is not None:
+            setpoint, policy = found.prepared
+            self._flow.change(found.since_ns, setpoint)
+            self._trigger.change(policy)
+
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
         """Take a measurement x(t); transmit it and reset x_s if the policy says so."""
         t_ns, x = message.t_ns, message.vector
+        if self._schedule is not None and self._schedule.next_ns is not None:
+            self._change(t_ns)
         first = self.x_s is None
-        x_s = x if self.x_s is None else self._propagate(self.x_s, t_ns - self._model_ns)
+        x_s = x if self.x_s is None else self._flow(self.x_s, self._model_ns, t_ns)
         if first:
             self._trigger.start(t_ns, x)
         e_s = x_s - x
@@ -70,7 +104,7 @@ class Sensor:
         if event:
             self._trigger.start(t_ns, x)
         self.x_s = x if event else x_s
-        self._model_ns = t_ns
+        self._model_ns = self._reached_ns = t_ns
         row = (
             self._inputs, message.sequence, t_ns, now_ns, x, x_s,
             norm(e_s if self._weight is None else self._weight @ e_s), verdict.left, verdict.right,
@@ -85,12 +119,38 @@ class Sensor:
         return (update, record)
 
 
-def sensor_of(resolved: Scenario) -> Sensor | AcknowledgedSensor:
-    """Return the sensor of a resolved scenario; of the plant it learns x(0) at the most."""
+def sensor_of(
+    resolved: Scenario, start: Start = BEGINNING
+) -> Sensor | AcknowledgedSensor | ObservingSensor:
+    """Return the sensor of a resolved scenario; of the plant it learns x(0) at the most.
+
+    One that is started anew transmits its first measurement.
+    """
+    observer = observer_of(resolved, known=not start.again)
+    sensor = _triggering(resolved, start)
+    if observer is None:
+        return sensor
+    return ObservingSensor(observer, sensor, again=start.again)
+
+
+def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
+    """What is behind the observer, if there is one: models, and the trigger."""
     loop, policy = loop_of(resolved), policy_of(resolved)
-    x0 = loop.x0 if resolved.network.initial_sync == "known_state" else None
-    period_ns = resolved.measurement_period_ns
+    known = resolved.network.initial_sync == "known_state" and not start.again
+    x0 = loop.x0 if known else None
+    period_ns, first = resolved.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:
         timeout_ns = resolved.acknowledgement_timeout_ns
-        return AcknowledgedSensor(loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns)
-    return Sensor(loop.H, policy, x0, period_ns=period_ns)
+        return AcknowledgedSensor(
+            loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first
+        )
+    return Sensor(
+        loop.H, policy, x0, period_ns=period_ns, first_number=first, setpoint=loop.setpoint,
+        schedule=Schedule(resolved, _prepared),
+    )  # fmt: skip
+
+
+def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:
+    """What a sensor needs of another scenario: its set-point and its policy."""
+    setpoint = setpoint_of(resolved)
+    return None if setpoint is None else setpoint[0], policy_of(resolved)

@@ -1,6 +1,12 @@
-"""What all tests share: one thread, Hypothesis without wall time or chance, a small scenario."""
+"""What all tests share: one thread, Hypothesis without wall time or chance, a small scenario.
+
+Without chance the same examples are tried every time: a few will do. A thousand new ones of each
+are tried with ``--hypothesis-profile search``.
+"""
 
 import os
+import signal
+from collections.abc import Iterator
 from typing import Any
 
 # Before numpy is imported: threads only get into each other's way with small matrices.
@@ -9,14 +15,51 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.distribution import LongestFirst, in_order
+
 settings.register_profile(
     "noack",
+    max_examples=25,
     deadline=None,
     derandomize=True,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],  # it reads the wall clock
 )
+settings.register_profile(
+    "search",
+    settings.get_profile("noack"),
+    max_examples=1000,
+    derandomize=False,
+)
 settings.load_profile("noack")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items[:] = in_order(items)
+
+
+@pytest.hookimpl(optionalhook=True)  # there may be no xdist, or not be asked for
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LongestFirst | None:
+    return LongestFirst(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_signal_is_ignored_by_children() -> Iterator[None]:
+    """Let processes that tests start hear signals, although this one was told to ignore some.
+
+    What a shell starts in the background ignores SIGINT, what nohup starts SIGHUP, and their
+    children inherit it. A handler that does nothing is as good here, and is not inherited.
+    """
+    deaf = [
+        number
+        for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGQUIT")
+        if (number := getattr(signal, name, None)) and signal.getsignal(number) is signal.SIG_IGN
+    ]
+    for number in deaf:
+        signal.signal(number, lambda *_: None)
+    yield
+    for number in deaf:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @pytest.fixture

@@ -21,7 +21,9 @@ from cosim.campaign.plan import Axis, Campaign, Comparison, Figure, Metrics
 from cosim.campaign.plan import load as load_campaign
 from cosim.cli import app
 from netem.words.parser import KEYWORDS
+from noack.disturbances import AnyDisturbance
 from noack.impairments import Impairment, Loss
+from noack.observers import AnyObserver
 from noack.records import tables
 from noack.scenario import Scenario
 from noack.scenario_file import json_schema, load
@@ -30,7 +32,7 @@ from noack.triggers import AnyTrigger
 ROOT = Path(__file__).parents[1]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
-    "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md",
+    "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
 )  # fmt: skip
 
 
@@ -54,12 +56,17 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (links,) = blocks("docs/netem.md", "toml")
     (folder / "links.toml").write_text(links)
     (folder / ".venv" / "bin").mkdir(parents=True)
+    for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
+        if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
+            (folder / named[1]).write_text(code)
+        elif code.startswith("import control"):  # which makes the file of the matrices
+            subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
     noack = folder / ".venv" / "bin" / "noack"
     noack.write_text(f'#!/bin/sh\nexec {sys.executable} -m cosim.cli "$@"\n')
     noack.chmod(0o755)
     result = subprocess.run(
         [noack, "run", "lane_following", "--json", "--set", "ports={}", "--set", "horizon_s=2"],
-        cwd=folder, capture_output=True, text=True, check=False, timeout=60,
+        cwd=folder, capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     return folder
@@ -85,13 +92,19 @@ def test_every_command_works(command: str, run_folder: Path) -> None:
             assert process.stderr is not None
             assert any("Ctrl-C ends" in line for line in process.stderr)
             process.send_signal(signal.SIGINT)
-        stdout, stderr = process.communicate(timeout=60)
+        stdout, stderr = process.communicate(timeout=250)
     assert process.returncode == 0, stderr
     if "--json" in words:
         json.loads(stdout)
 
 
-@pytest.mark.parametrize("snippet", blocks("docs/record.md", "python"))
+def snippets() -> list[str]:
+    """Programs; what begins with its own file's name is a file."""
+    found = [*blocks("docs/plants.md", "python"), *blocks("docs/record.md", "python")]
+    return [snippet for snippet in found if not snippet.startswith("#")]
+
+
+@pytest.mark.parametrize("snippet", snippets())
 def test_every_snippet_runs(snippet: str, run_folder: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", snippet], cwd=run_folder, capture_output=True, text=True, check=False
@@ -117,7 +130,7 @@ def choices(union: Any) -> tuple[type[BaseModel], ...]:
 
 def test_every_scenario_key_is_documented_and_no_other() -> None:
     text = (ROOT / "docs/scenarios.md").read_text()
-    keys = text.partition("## Trigger policies")[0]
+    keys = text.partition("## Plants")[0]
     assert documented_keys(keys) == set(keys_of(Scenario))
 
 
@@ -130,6 +143,15 @@ def test_every_key_of_a_policy_is_documented(table: type[BaseModel]) -> None:
     named = re.findall("`([^`]+)`", row.split("|")[-2])
     documented = {name.partition(" ")[0] for name in named}
     assert documented == table.model_fields.keys() - {"policy", "weight"}
+
+
+@pytest.mark.parametrize("table", [*choices(AnyDisturbance), *choices(AnyObserver)])
+def test_every_key_of_disturbances_and_observers_is_documented(table: type[BaseModel]) -> None:
+    text = (ROOT / "docs/scenarios.md").read_text().partition("## Disturbances")[2]
+    (kind,) = get_args(table.model_fields["kind"].annotation)
+    (row,) = [line for line in text.splitlines() if line.startswith(f"| `{kind}`")][:1]
+    named = re.findall("`([A-Za-z_]+)", row.split("|")[-2])
+    assert set(named) - {"disturbances", "measurement"} == table.model_fields.keys() - {"kind"}
 
 
 @pytest.mark.parametrize("table", [*choices(Loss), *choices(Impairment)])
@@ -198,8 +220,12 @@ def test_every_option_of_design_is_documented_and_no_other() -> None:
 
 
 def test_every_column_of_the_record_is_documented() -> None:
+    everything = tables(
+        1, 1, acknowledged=True, predictive=True, internal=1,
+        disturbed_input=True, disturbed_state=True, outputs=1, inputs_reported=1,
+    )  # fmt: skip
     text = (ROOT / "docs/record.md").read_text()
-    for table, dtype in tables(1, 1, acknowledged=True).items():
+    for table, dtype in everything.items():
         (row,) = [line for line in text.splitlines() if line.startswith(f"| `{table}`")]
         for name in dtype.names or ():
             common = name in ("input", "sequence", "t_ns", "now_ns")

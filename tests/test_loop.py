@@ -32,6 +32,8 @@ from noack.topology import LEGS
 from noack.trigger.decaying import DecayingTrigger
 from noack.wire import Decoder, Encoder, Flow, Message, Rejection
 from plant_server.plant import Plant
+from plant_server.systems.linear import LinearSystem
+from plant_server.watchdog import Watchdog
 from sensor_node.sensor import Sensor
 
 RUN, KEY = 7, bytes(32)
@@ -55,7 +57,7 @@ class Loop(Shuttle):
             "netem": DecidedLink(network),
             "controller": self._heard("controller", controller),
         }
-        super().__init__(machines, n, m, self._see)
+        super().__init__(machines, lambda flow: m if flow is Flow.ACTUATION else n, self._see)
 
     def _see(self, role: str, output: Record | Notice) -> None:
         if isinstance(output, Notice):
@@ -75,6 +77,11 @@ class Loop(Shuttle):
         machine.handle = noting
         heard: Machine[Message] = machine
         return heard
+
+
+def linear_plant(A: Matrix, B: Matrix, x0: Vector, horizon_ns: int) -> Plant:
+    system = LinearSystem(A, B, x0, step_ns=PERIOD_NS)
+    return Plant(system, Watchdog(B.shape[1]), period_ns=PERIOD_NS, horizon_ns=horizon_ns)
 
 
 class Case(NamedTuple):
@@ -102,7 +109,7 @@ class Case(NamedTuple):
             return None if lost else delay_ns
 
         return Loop(
-            Plant(self.A, self.B, self.x0, period_ns=PERIOD_NS, horizon_ns=horizon_ns),
+            linear_plant(self.A, self.B, self.x0, horizon_ns),
             Sensor(self.H, DecayingTrigger(self.beta, 0.5), known, period_ns=PERIOD_NS),
             Controller(
                 self.H,
@@ -281,12 +288,8 @@ def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
     """
     a, b, k, x0 = 1.0, 1.0, -3.0, 2.0
     h = PERIOD_NS * 1e-9
-    plant = Plant(
-        np.array([[a]]),
-        np.array([[b]]),
-        np.array([x0]),
-        period_ns=PERIOD_NS,
-        horizon_ns=STEPS * PERIOD_NS,
+    plant = linear_plant(
+        np.array([[a]]), np.array([[b]]), np.array([x0]), horizon_ns=STEPS * PERIOD_NS
     )
     H = np.array([[a + b * k]])
     sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # never an event

@@ -46,7 +46,7 @@ os.dup2(ends[0], 3)
 os.dup2(ends[1], 4)
 os.execv(sys.argv[3], sys.argv[3:])
 """
-POLL_S, SETTLE_S, LIMIT_S = 0.5, 2.5, 120.0
+POLL_S, SETTLE_S, LIMIT_S = 0.5, 2.5, 300.0
 
 
 class Browser:

@@ -108,9 +108,11 @@ def setting_of(resolved: Scenario) -> Setting:
     """Return what the runs of a resolved scenario share; its plant, x(0) and seeds play no part.
 
     Raises:
-        CallerError: the scenario is the acknowledgement baseline.
+        CallerError: the scenario is one that exact simulation cannot take.
     """
     resolved.require_unacknowledged()
+    resolved.require_unchanging()
+    resolved.require_exact()
     loop = loop_of(resolved)
     return Setting(
         H=loop.H,

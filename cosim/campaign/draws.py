@@ -1,4 +1,6 @@
-"""What is drawn: plants from the box, initial states, losses, each from a stream of its own.
+"""What is drawn: plants from the box, initial states, losses, disturbances and noise.
+
+Each is from a stream of its own.
 
 Draw i depends on the campaign's seed and i alone: not on the grid point, the chunk or the worker.
 """
@@ -10,7 +12,7 @@ import numpy as np
 
 from cosim.batch.api import Population
 from noack.linear import Matrix, Vector
-from noack.resolve import resolve
+from noack.resolve import loop_of, resolve
 from noack.rng import uniforms, words
 from noack.scenario import Scenario, Seeds
 
@@ -49,20 +51,25 @@ class Box(NamedTuple):
 
 
 def box_of(scenario: Scenario) -> Box:
-    """The box of a scenario; of a plant that is given or nominal, without extent."""
-    centre = resolve(
-        scenario.model_copy(
-            update={
-                "plant": scenario.plant.model_copy(
-                    update={
-                        "draw": "given" if scenario.plant.draw == "given" else "nominal",
-                        "initial_state_halfwidth": None,
-                    }
-                )
-            }
+    """The box of a scenario; of a plant that is given or nominal, without extent.
+
+    Of one that is not linear, it is around the model.
+    """
+    loop = loop_of(
+        resolve(
+            scenario.model_copy(
+                update={
+                    "plant": scenario.plant.model_copy(
+                        update={
+                            "draw": "given" if scenario.plant.draw == "given" else "nominal",
+                            "initial_state_halfwidth": None,
+                        }
+                    )
+                }
+            )
         )
-    ).plant
-    A, B, x0 = np.array(centre.A), np.array(centre.B), np.array(centre.initial_state)
+    )
+    A, B, x0 = loop.A, loop.B, loop.x0
     drawn = scenario.plant.draw in ("uniform", "vertex")
 
     def half(given: tuple[object, ...] | None, like: Matrix) -> Matrix:
@@ -86,15 +93,21 @@ def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
     )
     plant = scenario.plant.model_copy(
         update={
-            "draw": "given",
-            "A": tuple(map(tuple, A)),
-            "B": tuple(map(tuple, B)),
+            **({"draw": "given", "A": _rows(A), "B": _rows(B)} if scenario.is_linear else {}),
             "initial_state": tuple(x0),
             "initial_state_halfwidth": None,
         }
     )
-    seeds = Seeds(loss=loss_seeds)
+    disturbance, noise = (
+        int(words(seed, _STREAM, name, rows=range(draw, draw + 1), width=1)[0, 0] >> np.uint64(1))
+        for name in ("disturbance", "noise")
+    )
+    seeds = Seeds(loss=loss_seeds, disturbance=disturbance, noise=noise)
     return resolve(scenario.model_copy(update={"plant": plant, "seeds": seeds}))
+
+
+def _rows(matrix: list[list[float]]) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix))
 
 
 def _units(seed: int, name: str, draws: range, width: int) -> Matrix:

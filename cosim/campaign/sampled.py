@@ -3,8 +3,10 @@
 With the schedule's sampling, delays and acknowledgements, which continuous time has no place for.
 
 The plant holds its input from step to step, so the cost is exact: over a step of h, with
-z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978). The
-rest is of the samples: x at the plant's steps, e_c at the measurements.
+z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978). What
+disturbs it is held likewise, and belongs to z, weighing nothing. Of plants that are not linear it
+is by the trapezoidal rule over the plant's steps. The rest is of the samples: x at the plant's
+steps, e_c at the measurements.
 """
 
 from dataclasses import dataclass
@@ -93,17 +95,32 @@ class SampledWork:
 
     def _cost(self, record: RunRecord) -> float:
         loop, steps = record.loop, record[PLANT_STEP]
-        n, size = loop.n, loop.n + loop.m
+        n, m = loop.n, loop.m
+        if not record.scenario.is_linear:
+            return self._trapezoid(record)
+        held = {"d": loop.B, "w": np.eye(n)}
+        added = [name for name in held if name in (steps.dtype.names or ())]
+        through = np.hstack([loop.B, *(held[name] for name in added)])
+        size = n + len(through.T)
         weight = np.zeros((size, size))
         weight[:n, :n] = np.eye(n) if self.Q is None else self.Q
-        weight[n:, n:] = np.eye(loop.m) if self.R is None else self.R
+        weight[n : n + m, n : n + m] = np.eye(m) if self.R is None else self.R
         drift = np.zeros((size, size))
-        drift[:n, :n], drift[:n, n:] = loop.A, loop.B
+        drift[:n, :n], drift[:n, n:] = loop.A, through
         block = np.block([[-drift.T, weight], [np.zeros((size, size)), drift]])
         block = expm(block * (record.scenario.plant_period_ns / NS_PER_S))
         over_a_step = block[size:, size:].T @ block[:size, size:]
-        z = np.hstack([steps["x"], steps["u"]])[:-1]
+        z = np.hstack([steps[name] for name in ("x", "u", *added)])[:-1]
         return float(np.einsum("ki,ij,kj->", z, over_a_step, z))
+
+    def _trapezoid(self, record: RunRecord) -> float:
+        x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"][:-1]
+        Q = np.eye(record.loop.n) if self.Q is None else self.Q
+        R = np.eye(record.loop.m) if self.R is None else self.R
+        of_x = np.einsum("ki,ij,kj->k", x, Q, x)
+        of_u = np.einsum("ki,ij,kj->k", u, R, u)
+        step_s = record.scenario.plant_period_ns / NS_PER_S
+        return float(step_s * (0.5 * (of_x[1:] + of_x[:-1]) + of_u).sum())
 
 
 def in_virtual_time(scenario: Scenario) -> Scenario:

@@ -2,8 +2,8 @@
 
 import math
 import sys
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -11,24 +11,27 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.claims.observed import Left, Observed, observe
+from cosim.claims.observed import Left, Observed, Series
+from cosim.claims.observer import observe
 from cosim.claims.theorem_one import theorem_one
 from cosim.join import Joined, identity_residual, in_common, join_all
 from cosim.record import RunRecord
+from noack.linear import row_norms, transition
 from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.scenario import Scenario
 from noack.theory.certificate import Conditions
 from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box, outside_box
 from noack.theory.monitor import ErrorMonitor
 from noack.theory.printed import Theorem2, theorem_2
-from noack.theory.schedule import ideal_conditions, nominal_conditions
+from noack.theory.schedule import allowed_conditions, ideal_conditions, nominal_conditions
+from noack.topology import LOOP_ROLES
 from noack.trigger.choose import policy_of
 
 Reals = NDArray[np.float64]
 
 # What an exact computation may miss by rounding: the record holds 20 s in 10,000 steps.
 _ROUNDING = 1e-9
-_IDENTITY = 1e-9
+_IDENTITY, _LARGEST_IDENTITY = 1e-9, 1e-6
 _LONG_S = 1e300  # finite: what never came took longer
 _ANY = Conditions(sys.maxsize, *[_LONG_S] * 5)
 
@@ -60,6 +63,10 @@ class Claim(NamedTuple):
     since_s: float | None
     """Since when it was violated, or void."""
     why: str
+    from_s: float = 0.0
+    """From when on it is claimed: from the start, or after a change of settings."""
+    until_s: float | None = None
+    """Until when: to the end if None, else to a change of settings."""
 
 
 _NO_CLAIM = Claim(
@@ -79,15 +86,32 @@ class Envelope(NamedTuple):
     values: Reals
 
 
+class Part(NamedTuple):
+    """What part of a run a record is of that is judged as a run of its own."""
+
+    whole: RunRecord
+    from_s: float = 0.0
+    """Its start, in the run's time."""
+    until_s: float = math.inf
+    """Its end, in its own: what comes after is on record, but not what is claimed of."""
+    start_error: float | None = None
+    """What the input was from Kx, scaled, until the plant felt the controller; None if it felt no
+    input before."""
+    void: Mapping[str, str] = {}
+    """Why there is no certificate, by scope."""
+
+
 @dataclass(frozen=True)
 class Claims:
     """The claims about one run; everything is computed when it is asked for, and once.
 
     Args:
-        record: the run's record.
+        record: the run's record, or that of a part of it, as of a run of its own.
+        part: which part; None if it is the run.
     """
 
     record: RunRecord
+    part: Part | None = None
 
     @cached_property
     def joined(self) -> Joined:
@@ -97,7 +121,15 @@ class Claims:
     @cached_property
     def certificates(self) -> list[Certificate]:
         """The certificates of the run's scenario under its schedule."""
-        return scheduled_certificates(self.record.scenario)
+        if self.part is None:
+            return scheduled_certificates(self.record.scenario)
+        found = scheduled_certificates(self.record.scenario, self.part.start_error)
+        return [
+            replace(one, constants=None, floor_constants=None, void=self.part.void[one.scope])
+            if one.scope in self.part.void
+            else one
+            for one in found
+        ]
 
     @cached_property
     def conditions(self) -> dict[str, float | None]:
@@ -107,9 +139,15 @@ class Claims:
     @cached_property
     def _unknown(self) -> Left:
         """Since when not everything is on record, so that no claim can be held against it."""
-        found: list[Left] = [
-            self._observed.left(_ANY._replace(sampling_s=self._schedule.sampling_s))
-        ]
+        limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
+        found: list[Left] = [self._observed.left(limit, ("sampling",))]
+        whole, from_s = self.record, 0.0
+        if self.part is not None:
+            whole, from_s = self.part.whole, self.part.from_s
+        for role in LOOP_ROLES:
+            holes_ns = filter(None, (life.hole_ns() for life in whole.lives(role)))
+            why = f"rows of {role} are missing from the record"
+            found += [(t_s, why) for ns in holes_ns if (t_s := ns * 1e-9 - from_s) >= 0]
         gaps = np.flatnonzero(~self._in_common[np.argmax(self._in_common) :])
         if len(gaps):
             since_s = float(self._t_s[np.argmax(self._in_common) + gaps[0]])
@@ -117,12 +155,18 @@ class Claims:
         return min(filter(None, found), default=None)
 
     @cached_property
+    def beyond_mansd(self) -> Left:
+        """When more than M − 1 updates in a row had been lost, whoever lost them."""
+        return self._observed.left(_ANY._replace(dropouts=self._schedule.dropouts), ("dropouts",))
+
+    @cached_property
     def _beyond_paper(self) -> Left:
-        """When the run left the paper's bound on successive dropouts, on which its theorems rest.
+        """When the run left what the paper's theorems rest on: M − 1, and u = K x_c.
 
         That its trigger watches always and its network is instant, no run keeps; the claims say so.
         """
-        lost = self._observed.left(_ANY._replace(dropouts=self._schedule.dropouts))
+        limit = _ANY._replace(dropouts=self._schedule.dropouts)
+        lost = self._observed.left(limit, ("dropouts", "watchdog", "safe input", "restart"))
         return min(filter(None, (lost, self._unknown)), default=None)
 
     @cached_property
@@ -131,7 +175,22 @@ class Claims:
 
     @cached_property
     def _observed(self) -> Observed:
-        return observe(self.record)
+        found = observe(self.record)
+        if self.part is None or self.part.start_error is None:
+            return found
+        # What the plant felt until its new start, the certificate takes into account otherwise.
+        safe, restarts = found.safe_input, found.restarts
+        kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
+        return found._replace(
+            start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
+            safe_input=Series(safe.t_s[kept], safe.value[kept]),
+            restarts=Series(restarts.t_s[again], restarts.value[again]),
+        )
+
+    @property
+    def started_s(self) -> float:
+        """When the plant began to feel the controller; infinite if never."""
+        return observe(self.record).start_s
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict."""
@@ -196,7 +255,7 @@ class Claims:
     def _theorem_2(self) -> Theorem2 | None:
         """With the uniform Δ of (I1) under the paper's conditions, which Theorem 1 lacks."""
         scenario = self.record.scenario
-        if not scenario.is_decaying:
+        if not scenario.is_certifiable:
             return None
         ideal = certify(scenario, ideal_conditions(scenario)).constants
         if ideal is None or ideal.rate_per_s != scenario.decaying.alpha_per_s:
@@ -215,33 +274,60 @@ class Claims:
         return event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
 
     def _identity(self) -> Iterator[Claim]:
-        residual = identity_residual(self.record, self.joined)[self._in_common]
-        scale = max(float(np.abs(self.joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
-        yield _upper(
+        here, margin = self._in_common, self._identity_margin()
+        residual = identity_residual(self.record, self.joined)[here]
+        # Both models were rounded: what was missed may have carried x_c far from x_s.
+        there = self._t_s < self._until_s
+        both = np.concatenate([self.joined.x_s[there], self.joined.x_c[here & there]])
+        scale = max(float(np.abs(both).max(initial=0.0)), np.finfo(float).tiny)
+        yield self._upper(
             "the models differ by what was missed", "(I1)",
-            "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), to {:.0e} of ‖x_s‖", _IDENTITY,
-            self._t_s[self._in_common], residual / (_IDENTITY * scale), self._unknown, "",
+            "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), to {:.0e} of the larger", margin,
+            self._t_s[here], residual / (margin * scale), self._unknown, "",
         )  # fmt: skip
+        known = self.record.scenario.knows_state
         yield self._controller_error(
-            "the controller's error is at most what was missed", "(I1)",
-            "‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖", None, self._bounds[0], self._unknown, "",
+            "the controller's error is at most what was missed"
+            + ("" if known else ", against what the sensor takes for x"), "(I1)",
+            f"‖{'e_c' if known else 'x_c − x̂'}‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖",
+            None, self._bounds[0], self._unknown, "",
         )  # fmt: skip
 
+    def _identity_margin(self) -> float:
+        """What rounding may amount to, relative to the states.
+
+        Where e^{Hτ} grows before it decays, it makes rounding grow with it, n ε sup‖e^{Hτ}‖ in the
+        time between two deliveries; but of a millionth is said that it is none.
+        """
+        loop, period_ns = self.record.loop, self.record.scenario.measurement_period_ns
+        fresh_ns = self.joined.t_ns[np.flatnonzero(np.diff(self.joined.received, prepend=-1))]
+        ends_ns = np.append(fresh_ns, self.joined.t_ns[-1])
+        longest_ns = int(np.diff(ends_ns).max(initial=0))
+        growth, age_ns, moved = 1.0, period_ns, transition(loop.H, period_ns)
+        while age_ns <= longest_ns and growth < 1 / np.finfo(float).eps:
+            growth = max(growth, float(np.linalg.norm(moved)))
+            age_ns, moved = 2 * age_ns, moved @ moved
+        rounding = loop.n * float(np.finfo(float).eps) * growth
+        return max(_IDENTITY, min(rounding, _LARGEST_IDENTITY))
+
     def _printed(self) -> Iterator[Claim]:
-        if not self.record.scenario.is_decaying:
+        # An estimate, or noise, jumps at every measurement: no trigger keeps e_s below a threshold.
+        if not self.record.scenario.is_decaying or not self.record.scenario.knows_state:
             return
         ideal = (
             "presupposes a trigger that watches always and a network and an input without delay, "
             "which no sampled loop has"
         )
-        left = self._beyond_paper
+        left, until_s = self._beyond_paper, self._until_s
         yield self._controller_error(
             "the paper's bound, line by line", "eq:LossEv3",
             "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1],
             self._unknown, ideal,
         )  # fmt: skip
+        if not self.record.scenario.is_certifiable:
+            return
         trigger = self.record.scenario.decaying
-        delta = theorem_one(self.record, self.joined, math.inf if left is None else left[0])
+        delta = theorem_one(self.record, self.joined, min(until_s, left[0]) if left else until_s)
         if delta is not None and trigger.floor == 0:
             name = "Theorem 1" if self.record.loop.H.any() else "Theorem 3"
             level = trigger.beta * np.exp(-trigger.alpha_per_s * self._t_s)
@@ -269,7 +355,7 @@ class Claims:
             constants, t_s, source = certificate.constants, self._t_s, certificate.source
             rate = f"e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
             suffix = "" if certificate.floor_constants is None else ", and the floor's share"
-            yield _upper(
+            yield self._upper(
                 "the sensor's error follows its threshold", source,
                 f"‖e_s‖ ≤ {{:.4g}} β{rate}{suffix}", constants.overshoot,
                 t_s, self.joined.e_s_norm / certificate.sensor_error(t_s), left, "",
@@ -293,26 +379,39 @@ class Claims:
         here = self._in_common
         left = min(filter(None, (left, self._unknown)), default=None)
         # Rounding of x itself, where a bound is as small as that.
-        slack = _ROUNDING * np.linalg.norm(self.joined.x[here], axis=1)
+        slack = _ROUNDING * row_norms(self.joined.x[here])
         shares = _shares(self.joined.e_c_norm[here], values[here] + slack)
-        return _upper(what, source, bound, certified, self._t_s[here], shares, left, why)
+        return self._upper(what, source, bound, certified, self._t_s[here], shares, left, why)
 
     def _state(
         self, source: str, bound: str, certified: float | None, values: Reals,
         left: Left, why: str,
     ) -> Claim:  # fmt: skip
-        shares = _shares(np.linalg.norm(self.joined.x, axis=1), values)
+        shares = _shares(row_norms(self.joined.x), values)
         what = "the state is bounded and decays" if "e^" in bound else "the state is bounded"
-        return _upper(what, source, bound, certified, self._t_s, shares, left, why)
+        return self._upper(what, source, bound, certified, self._t_s, shares, left, why)
 
     def _spacing(self, source: str, certified_s: float, left: Left, why: str) -> Claim:
         t_s, passed_s = self._inter_event_s
-        claim = _upper(
+        claim = self._upper(
             "events keep their distance", source, "t_(i+1) − t_i ≥ {:.4g} s", certified_s,
             t_s, certified_s / passed_s, left, why,
         )  # fmt: skip
         ratio = claim.ratio
         return claim._replace(observed=certified_s / ratio if ratio else None)
+
+    @property
+    def _until_s(self) -> float:
+        return math.inf if self.part is None else self.part.until_s
+
+    def _upper(
+        self, what: str, source: str, bound: str, certified: float | None, t_s: Reals,
+        shares: Reals, left: Left, why: str,
+    ) -> Claim:  # fmt: skip
+        """Judge a bound over the time of which it is claimed."""
+        kept = t_s < self._until_s
+        left = None if left is not None and left[0] >= self._until_s else left
+        return _upper(what, source, bound, certified, t_s[kept], shares[kept], left, why)
 
 
 def _shares(observed: Reals, bound: Reals) -> Reals:
@@ -342,15 +441,23 @@ def _upper(
     return Claim(what, source, text, certified, observed, ratio, verdict, since_s, why)
 
 
-def scheduled_certificates(scenario: Scenario) -> list[Certificate]:
+def scheduled_certificates(
+    scenario: Scenario, start_error: float | None = None
+) -> list[Certificate]:
     """The certificates of a resolved scenario under its own schedule, with its allowance.
 
-    They are of the paper's trigger and of the loop without acknowledgements; else there are none.
+    There are none of what is beyond the theory.
+
+    Args:
+        scenario: the scenario.
+        start_error: of a run that begins with the input of an earlier one; see ``Scope``.
     """
-    if not scenario.is_decaying or scenario.is_acknowledged:
+    if not scenario.is_certifiable:
         return []
-    conditions = nominal_conditions(scenario, scenario.certificate.late_periods)
-    found = [certify(scenario, conditions), certify_box(scenario, conditions)]
+    conditions, error = allowed_conditions(scenario), 0.0
+    if start_error is not None:
+        conditions, error = conditions._replace(start_s=0.0), start_error
+    found = [certify(scenario, conditions, error), certify_box(scenario, conditions, error)]
     return [certificate for certificate in found if certificate is not None]
 
 

@@ -43,11 +43,24 @@ def theorem_one(record: RunRecord, joined: Joined, until_s: float = math.inf) ->
         if first <= index and joined.received[start] != NO_SEQUENCE:
             stretches[first] = index + 1
     found = [
-        theorem_1(loop.H, trigger.alpha_per_s, longest_s[first:end])
-        for first, end in stretches.items()
+        theorem_1(loop.H, trigger.alpha_per_s, missed_s)
+        for missed_s in _longest([longest_s[first:end] for first, end in stretches.items()])
     ]
     delta = max(found, default=1.0)
     return delta if math.isfinite(delta) else None
+
+
+def _longest(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
+    """Those that no other one exceeds throughout: Δ grows with every δ̃_k, the sums from k on."""
+    most = max(map(len, stretches), default=0)
+    reaches = np.zeros((len(stretches), most))
+    for row, stretch in zip(reaches, stretches, strict=True):
+        row[: len(stretch)] = np.cumsum(stretch[::-1])[::-1]
+    kept: list[int] = []
+    for place in np.argsort(-reaches.sum(axis=1), kind="stable").tolist():
+        if not (reaches[kept] >= reaches[place]).all(axis=1).any():
+            kept.append(place)
+    return [stretches[place] for place in kept]
 
 
 def _decay(record: RunRecord) -> float:

@@ -1,6 +1,6 @@
 """The command line ``noack``, by the panels of its help."""
 
-from cosim.cli import runs, theory, campaigns, design, processes, files  # noqa: I001 - in the order of the help
+from cosim.cli import runs, knobs, theory, campaigns, design, processes, files  # noqa: I001 - in the order of the help
 from cosim.cli.app import app, find_scenario, main
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "design",
     "files",
     "find_scenario",
+    "knobs",
     "main",
     "processes",
     "runs",

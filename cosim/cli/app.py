@@ -43,6 +43,13 @@ SetOption = Annotated[
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", help="Where run directories are made.")]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the run in the rerun viewer.")]
+ReportOption = Annotated[
+    bool,
+    typer.Option(
+        "--report/--no-report",
+        help="Draw report.html, which takes some seconds; `noack report` does it later.",
+    ),
+]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")
 ]

@@ -21,16 +21,29 @@ from noack.scenario_file import json_schema, load
 
 @command(FILES)
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
-    """Check a scenario and print it resolved: defaults, named models and draws made explicit."""
+    """Check a scenario and print it resolved: defaults, named models and draws made explicit.
+
+    A plant that is not linear is made, and what it is said; with one of the user's own that runs
+    its code.
+    """
+    from cosim.linearisation import linearisation, said
     from cosim.tables import print_assumptions
     from noack.resolve import resolve
     from noack.theory.assumptions import assumptions
     from noack.trigger.choose import policy_of
+    from plant_server.systems.choose import system_of
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
     policy_of(resolved)  # some need a stable loop
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
-    print_assumptions(Console(stderr=True), verdicts)
+    console = Console(stderr=True)
+    print_assumptions(console, verdicts)
+    if not resolved.is_linear:
+        about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
+        console.print(f"the plant: {about}", highlight=False, markup=False)
+    if (near := linearisation(resolved)) is not None:
+        for what, value in said(near):
+            console.print(f"{what}: {value}", highlight=False, markup=False)
     if json:
         print_json(resolved.model_dump(mode="json"))
     else:

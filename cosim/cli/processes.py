@@ -7,6 +7,7 @@ from cosim.cli.app import (
     PROCESSES,
     JsonOption,
     LiveOption,
+    ReportOption,
     RunsOption,
     ScenarioArgument,
     SessionOption,
@@ -26,11 +27,12 @@ def record(
     session: SessionOption = "default",
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
+    report: ReportOption = True,
     json: JsonOption = False,
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
     loaded = load(find_scenario(scenario), settings or ())
-    return run_processes(loaded, runs, (RECORDER,), session, live=live, json=json)
+    return run_processes(loaded, runs, (RECORDER,), session, live=live, report=report, json=json)
 
 
 @command(PROCESSES)

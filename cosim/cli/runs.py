@@ -14,6 +14,7 @@ from cosim.cli.app import (
     RUNS,
     JsonOption,
     LiveOption,
+    ReportOption,
     RunsOption,
     ScenarioArgument,
     SetOption,
@@ -37,11 +38,12 @@ def run(
     settings: SetOption = None,
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
+    report: ReportOption = True,
     json: JsonOption = False,
 ) -> int:
     """Run a scenario: start all processes, watch them, record everything."""
     loaded = load(find_scenario(scenario), settings or ())
-    return run_processes(loaded, runs, ROLES, None, live=live, json=json)
+    return run_processes(loaded, runs, ROLES, None, live=live, report=report, json=json)
 
 
 @command(RUNS)
@@ -50,12 +52,13 @@ def demo(
     settings: SetOption = None,
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
+    report: ReportOption = True,
     json: JsonOption = False,
 ) -> int:
     """Run the paper's lane-following example in real time."""
     mode = ['mode="zoh"'] if zoh else []
     loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
-    return run_processes(loaded, runs, ROLES, None, live=live, json=json)
+    return run_processes(loaded, runs, ROLES, None, live=live, report=report, json=json)
 
 
 class Trigger(StrEnum):
@@ -74,6 +77,7 @@ def simulate(
         typer.Option(help="sampled: at each measurement, as a live run; continuous: at all times."),
     ] = Trigger.SAMPLED,
     runs: RunsOption = DEFAULT_RUNS,
+    report: ReportOption = True,
     json: JsonOption = False,
 ) -> int:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
@@ -86,7 +90,7 @@ def simulate(
     _warn_of_violations(loaded)
     with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
         ending = simulate_run(loaded, runs, progress=progress)
-    return _conclude(ending, json=json)
+    return _conclude(ending, report=report, json=json)
 
 
 @command(RUNS)
@@ -95,6 +99,9 @@ def view(
         Path | None, typer.Argument(help="A run directory or .rrd file; by default the last run.")
     ] = None,
     runs: RunsOption = DEFAULT_RUNS,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve it to a browser on this machine; no window.")
+    ] = False,
     json: JsonOption = False,
 ) -> int:
     """Open a recording in the rerun viewer."""
@@ -105,7 +112,7 @@ def view(
     if json:
         print_json({"recording": str(path), "exists": path.is_file()})
         return ExitStatus.OK if path.is_file() else ExitStatus.CALLER
-    view_recording(path)
+    view_recording(path, native=False if web else None)
     return ExitStatus.OK
 
 
@@ -205,6 +212,7 @@ def run_processes(
     session: str | None,
     *,
     live: bool,
+    report: bool,
     json: bool,
 ) -> int:
     """Run a scenario with the processes ``spawn``; the others join by ``session``."""
@@ -215,14 +223,14 @@ def run_processes(
     _warn_of_violations(scenario)
     ending = None
     try:
-        with progress_line(PatientConsole(stderr=True), scenario) as watcher:
+        with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
             ending = launch(
                 scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
             )
     except OSError:  # a closed terminal is no reason to lose a run
         if ending is None:
             raise
-    return _conclude(ending, json=json)
+    return _conclude(ending, report=report, json=json)
 
 
 def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
@@ -250,11 +258,14 @@ def _warn_of_violations(scenario: Scenario) -> None:
             print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
 
 
-def _conclude(ending: "Ending", *, json: bool) -> int:
+def _conclude(ending: "Ending", *, report: bool, json: bool) -> int:
     from cosim.conclude import conclude
+    from cosim.progress import PatientConsole
     from cosim.tables import print_outcome
 
-    outcome = conclude(ending)
+    # Of a run of an hour this takes minutes.
+    with PatientConsole(stderr=True).status("replaying the run and judging its claims"):
+        outcome = conclude(ending, report=report)
     if json:
         print_json(outcome.summary)
     else:

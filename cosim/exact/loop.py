@@ -350,7 +350,9 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     """Return the exact loop of a resolved scenario.
 
     Raises:
-        CallerError: its updates are acknowledged.
+        CallerError: it is a scenario that exact simulation cannot take.
     """
     resolved.require_unacknowledged()
+    resolved.require_unchanging()
+    resolved.require_exact()
     return ContinuousLoop(loop_of(resolved), policy_of(resolved))

@@ -33,6 +33,7 @@ class Condition(NamedTuple):
     """Whether it varies only what the paper leaves open: how much is lost, and from where."""
 
 
+_STREAMS = ("plant", "initial_state", "loss")
 _COMMON = (f"horizon_s={HORIZON_S}", "plant.initial_state_halfwidth=[0.5, 0.1, 0.1, 2.0]")
 
 
@@ -83,11 +84,11 @@ def load_condition(path: Path, condition: Condition) -> Scenario:
 
 def settings_of(condition: Condition, draw: int) -> list[str]:
     """All settings of a draw, as after ``--set`` on the command line."""
-    seeds = [f"seeds.{stream}={draw}" for stream in Seeds.model_fields]
+    seeds = [f"seeds.{stream}={draw}" for stream in _STREAMS]
     return [*_COMMON, *condition.settings, *seeds]
 
 
 def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
     """Draw number ``draw`` of a condition's scenario, resolved."""
-    seeds = Seeds(plant=draw, initial_state=draw, loss=draw)
+    seeds = Seeds(**dict.fromkeys(_STREAMS, draw))
     return resolve(scenario.model_copy(update={"mode": mode, "seeds": seeds}))

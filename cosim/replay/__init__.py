@@ -26,4 +26,5 @@ def replay(record: RunRecord) -> Replay:
     with np.errstate(all="ignore"):  # a run that diverged is replayed, too
         replayed = {role: replay_machine(role, record) for role in LOOP_ROLES}
         messages = check_messages(record, replayed)
-    return Replay(tuple(one.account for one in replayed.values()), messages)
+    accounts = tuple(account for one in replayed.values() for account in one.accounts)
+    return Replay(accounts, messages)

@@ -8,18 +8,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller_node.controller import controller_of
-from cosim.record import Rows, RunRecord
+from cosim.record import Life, Rows, RunRecord
 from cosim.replay.result import Difference, ProcessReplay, difference, rows_differ
 from netem.duplex import network_of
 from netem.link import Datagram
-from noack.machine import Machine, Notice, Record
+from noack.changes import Change, settings_of
+from noack.errors import CallerError
+from noack.machine import INCARNATION, Machine, Notice, Record, Start
 from noack.records import (
+    CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,
     NETEM_RELEASE,
     OWNER,
     PLANT_STEP,
     SENSOR_ACKNOWLEDGEMENT,
+    SETTINGS,
 )
 from noack.scenario import Scenario
 from noack.topology import LEGS
@@ -27,8 +31,8 @@ from noack.wire import NO_VECTOR, Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
-_MACHINES: Mapping[str, Callable[[Scenario], Machine[Any]]] = {
-    "plant": plant_of,
+_MACHINES: Mapping[str, Callable[[Scenario, Start], Machine[Any]]] = {
+    "plant": lambda scenario, _: plant_of(scenario),
     "sensor": sensor_of,
     "netem": network_of,
     "controller": controller_of,
@@ -40,39 +44,67 @@ _MOST_BYTES = 65_535
 
 @dataclass(frozen=True)
 class Replayed:
-    """A machine's replay: the account of it, and the messages that it emitted."""
+    """The replay of a role's machines: the account of each, and the messages that they emitted."""
 
-    account: ProcessReplay
+    accounts: tuple[ProcessReplay, ...]
     sent: Sequence[Any]
 
+    @property
+    def whole(self) -> bool:
+        """Whether all that was done was replayed."""
+        return all(account.whole for account in self.accounts)
 
-def vector_of(table: str) -> str | None:
-    """Name of the column that holds the vector of a received message; None if it has none."""
+
+def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
+    """Names of the columns that make up the vector of a received message."""
     if table == SENSOR_ACKNOWLEDGEMENT:
-        return None
-    return "u" if LEGS[OWNER[table]].receives is Flow.ACTUATION else "x"
+        return ()
+    names = rows.dtype.names or ()
+    if LEGS[OWNER[table]].receives is Flow.ACTUATION:
+        return tuple(column for column in ("u", "x_c") if column in names)
+    return ("y", "u_felt") if "y" in names else ("x",)
 
 
 def replay_machine(role: str, record: RunRecord) -> Replayed:
-    """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows."""
-    owned = record.owned_by(role)
-    inputs = _inputs(owned, record.reports.get(role))
-    run = _Run(_MACHINES[role](record.scenario), owned)
+    """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows.
+
+    If others took the place of the process, so do theirs.
+    """
+    sent: list[Any] = []
+    accounts = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
+    return Replayed(tuple(accounts), sent)
+
+
+def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> ProcessReplay:
+    owned, first = life.rows, life.incarnation * INCARNATION
+    inputs = _inputs(owned, life.report, first)
+    run = _Run(_MACHINES[role](scenario, _start(life)), owned)
     compared = 0
     for table, row in inputs.order:
         if not run.step(table, row):
             break
         compared += 1
     found = [one for one in (run.difference, inputs.damage) if one is not None]
-    account = ProcessReplay(
-        role,
+    sent += run.sent
+    return ProcessReplay(
+        f"{role} ({life.incarnation + 1})" if life.incarnation else role,
         sum(map(len, owned.values())),
         compared,
         inputs.missing_from,
         inputs.end_known,
         min(found, key=lambda one: one.now_ns, default=None),
     )
-    return Replayed(account, run.sent)
+
+
+def _start(life: Life) -> Start:
+    """Where a process took up its work: of the controller, its first tick says it.
+
+    If it died before that, what it took says so.
+    """
+    if not life.incarnation or CONTROLLER_STEP not in life.rows:
+        return Start(life.incarnation)
+    ticks, taken = life.rows[CONTROLLER_STEP]["t_ns"], life.rows[CONTROLLER_DELIVERY]["model_t_ns"]
+    return Start(life.incarnation, int(min((*ticks[:1], *taken[:1]), default=0)))
 
 
 class _Inputs(NamedTuple):
@@ -83,9 +115,9 @@ class _Inputs(NamedTuple):
     damage: Difference | None
 
 
-def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None) -> _Inputs:
+def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: int) -> _Inputs:
     """Put the rows of a process's tables in the order of their ``input`` numbers."""
-    numbers = np.concatenate([rows["input"] for rows in owned.values()])
+    numbers = np.concatenate([rows["input"] for rows in owned.values()]) - first
     places = [(table, row) for table, rows in owned.items() for row in range(len(rows))]
     order = np.argsort(numbers, kind="stable")
     numbers, count = numbers[order], len(numbers)
@@ -134,7 +166,9 @@ class _Run:
             self._differs(table, row, "time runs backward", "now_ns", now_ns, self._before_ns)
         self._before_ns = now_ns
         try:
-            if message is None:
+            if isinstance(message, Change):
+                outputs = self._machine.announce(message, now_ns)  # type: ignore[attr-defined]
+            elif message is None:
                 due_ns = self._machine.next_deadline_ns()
                 if due_ns is None or now_ns < due_ns:
                     self._differs(table, row, "acted before it was due", "now_ns", now_ns, due_ns)
@@ -142,7 +176,12 @@ class _Run:
             else:
                 outputs = self._machine.handle(message, now_ns)
             self._compare(table, row, outputs)
-        except (ArithmeticError, LookupError, ValueError) as error:  # from numbers that no run has
+        except (
+            ArithmeticError,
+            LookupError,
+            ValueError,
+            CallerError,
+        ) as error:  # from numbers that no run has
             self._differs(table, row, f"the machine cannot take this input: {error}")
             return False
         return True
@@ -166,10 +205,15 @@ class _Run:
             self.difference = difference(table, row, now_ns, what, *values)
 
 
-def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | None]:
+def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Change | None]:
     """Yield what the machine took at each row; None for its timer."""
     if table in _TIMERS:
         yield from itertools.repeat(None, len(rows))
+    elif table in SETTINGS:
+        for number, t_ns, data in zip(
+            rows["sequence"].tolist(), rows["t_ns"].tolist(), rows["change"].tolist(), strict=True
+        ):
+            yield Change(number, t_ns, _settings(data))
     elif table == NETEM_PACKET:
         for flow, size, head in zip(
             rows["flow"].tolist(), rows["size_bytes"].tolist(), rows["head"].tolist(), strict=True
@@ -177,15 +221,24 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | None]:
             size_bytes = min(max(size, 0), _MOST_BYTES)
             yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
     else:
-        flow, column = LEGS[OWNER[table]].receives, vector_of(table)
-        if column is None:
+        flow, columns = LEGS[OWNER[table]].receives, vector_columns(table, rows)
+        if not columns:
             for sequence, t_ns in zip(
                 rows["sequence"].tolist(), rows["t_ns"].tolist(), strict=True
             ):
                 yield Message(Flow.ACKNOWLEDGEMENT, sequence, t_ns, NO_VECTOR)
             return
+        vectors = np.hstack([rows[column] for column in columns])
         for sequence, t_ns, vector in zip(
-            rows["sequence"].tolist(), rows["t_ns"].tolist(), rows[column], strict=True
+            rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors, strict=True
         ):
             # A copy lies in memory as the decoder's vector does, which arithmetic may depend on.
             yield Message(flow, sequence, t_ns, vector.copy())
+
+
+def _settings(data: bytes) -> dict[str, Any]:
+    """What was changed; of a damaged record, nothing that a scenario knows."""
+    try:
+        return settings_of(data)
+    except ValueError:
+        return {"": None}

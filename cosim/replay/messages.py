@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from cosim.record import Rows, RunRecord
-from cosim.replay.machines import Replayed, vector_of
+from cosim.replay.machines import Replayed, vector_columns
 from cosim.replay.result import MessagesReplay, difference, first_entry
 from netem.link import Datagram
 from noack.records import (
@@ -21,9 +21,10 @@ from noack.records import (
     PLANT_ACTUATION,
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
+    SETTINGS,
     UPDATES,
 )
-from noack.wire import KEY_BYTES, NO_VECTOR, Encoder, Flow, Header, Message, read_header
+from noack.wire import KEY_BYTES, Encoder, Flow, Header, Message, read_header
 
 
 def check_messages(
@@ -53,7 +54,26 @@ def check_messages(
         found += [answers, returned]
     else:
         entering.compare_flows()
-    return tuple(one.result() for one in found)
+    changes = () if (told := _compare_changes(record)) is None else (told,)
+    return (*(one.result() for one in found), *changes)
+
+
+def _compare_changes(record: RunRecord) -> MessagesReplay | None:
+    """Look whether all processes were told the same of each change; None if there were none."""
+    first: dict[int, tuple[object, ...]] = {}
+    compared, found = 0, None
+    for table in SETTINGS:
+        for place, row in enumerate(record[table]):
+            number = int(row["sequence"])
+            said = (int(row["t_ns"]), row["change"].tobytes())
+            compared += number in first
+            known = first.setdefault(number, said)
+            for column, one, other in zip(("t_ns", "change"), said, known, strict=True):
+                if one != other and found is None:
+                    what = "another process was told otherwise"
+                    found = difference(table, place, int(row["now_ns"]), what, column, one, other)
+    received = sum(len(record[table]) for table in SETTINGS)
+    return MessagesReplay("coordinator → all", received, compared, found) if received else None
 
 
 class _Received:
@@ -73,7 +93,7 @@ class _Received:
         self._sent: dict[int, Message] = {
             message.sequence: message for message in sender.sent if message.flow is flow
         }
-        self._all_sent = sender.account.whole
+        self._all_sent = sender.whole
         self._compared = 0
         self._first: tuple[int, str, str, object, object] | None = None
 
@@ -87,8 +107,11 @@ class _Received:
 
     def compare_vectors(self) -> None:
         """Compare sequence number, time and vector of what a machine received."""
-        rows, column, newest = self._rows, vector_of(self._table), -1
-        vectors = [NO_VECTOR] * len(rows) if column is None else rows[column]
+        rows, columns, newest = self._rows, vector_columns(self._table, self._rows), -1
+        entries = [f"{column}_{i}" for column in columns for i in range(rows[column].shape[1])]
+        vectors = (
+            np.hstack([rows[column] for column in columns]) if columns else np.zeros((len(rows), 0))
+        )
         fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
         for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
             if sequence <= newest:
@@ -99,10 +122,11 @@ class _Received:
                 continue
             if t_ns != message.t_ns:
                 self._differs(row, "was not sent so", "t_ns", t_ns, message.t_ns)
-            elif column is not None and vector.tobytes() != message.vector.tobytes():
+            elif vector.tobytes() != message.vector.tobytes():
                 entry = first_entry(vector, message.vector)
                 if entry is not None:
-                    self._differs(row, "was not sent so", column + entry[0], *entry[1:])
+                    column = entries[int(entry[0].removeprefix("_"))]
+                    self._differs(row, "was not sent so", column, *entry[1:])
 
     def compare_heads(self) -> None:
         """Compare what netem keeps of a datagram: its first bytes and its size."""
@@ -130,7 +154,7 @@ class _Received:
 
     def compare_with_survivors(self, network: Replayed) -> None:
         """Look whether the network let through what was received."""
-        if not network.account.whole:
+        if not network.whole:
             return
         survivors = {
             header.sequence

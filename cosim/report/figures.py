@@ -71,6 +71,7 @@ def paper_figure(
     received_s: Reals,
     forced: Flags,
     title: str = "",
+    x_hat: Reals | None = None,
 ) -> Figure:
     """States above, broadcasting and receiving intervals below: the paper's Fig. 2 and 3.
 
@@ -86,6 +87,7 @@ def paper_figure(
         received_s: (d,) times t_i* of those that the controller received.
         forced: (d,) which of them only the bound on successive dropouts let through.
         title: what the run was, shown after "MB-ET" or "ZOH-ET".
+        x_hat: (k, n) what the sensor takes for x; None where that is x itself.
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
@@ -103,7 +105,8 @@ def paper_figure(
         row, column = divmod(i, columns)
         left_in = LEFT_IN + column * (LEFT_IN + width_in)
         axes = place(figure, left_in, tops_in[row], width_in, height_in)
-        shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i])
+        known = None if x_hat is None else x_hat[:, i]
+        shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
         axes.set_ylabel(f"{plain(state_names[i])}\n{_UNIT}")
         axes.tick_params(labelbottom=i + columns >= drawn)
         axes.set_xlabel(TIME if i + columns >= drawn else "")
@@ -124,12 +127,18 @@ def paper_figure(
     return figure
 
 
-def _state(axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals) -> list[Shown]:
+def _state(
+    axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals, x_hat: Reals | None
+) -> list[Shown]:
     """Draw one state; what comes later is thinner, so that curves that coincide stay visible."""
     plant = line(axes, t_s, finite(x), "$x$ plant", color=_PLANT, linewidth=4.2)
     controller = line(axes, t_s, finite(x_c), "$x_c$ controller", color=_CONTROLLER, linewidth=2.4)
     sensor = line(axes, t_s, finite(x_s), "$x_s$ sensor", color=_SENSOR, linewidth=1.3)
-    return [*plant, *sensor, *controller]
+    known: list[Shown] = []
+    if x_hat is not None:
+        style: dict[str, Any] = {"color": _SENSOR, "linewidth": 1.0, "linestyle": (0, (1, 1))}
+        known = line(axes, t_s, finite(x_hat), r"$\hat{x}$ sensor", **style)
+    return [*plant, *known, *sensor, *controller]
 
 
 def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[Shown]) -> None:

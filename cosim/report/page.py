@@ -9,7 +9,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.tables import key_numbers, warnings_of
+from cosim.tables import away, changes_in, interval_of, key_numbers, warnings_of
 from noack.scenario import Scenario
 from noack.trigger.text import trigger_text
 
@@ -127,6 +127,10 @@ def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) ->
     if summary["lost_outside_netem"]:
         where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
         yield f"{summary['lost_outside_netem']} datagrams were lost outside the emulator: {where}"
+    for one in summary.get("restarts") or ():
+        yield f"{one['process']} was started anew, {away(one)}; claims are void from its death on"
+    for when, what in changes_in(dict(summary)):
+        yield f"{when}: {what}"
     for role, reasons in summary["rejected_datagrams"].items():
         yield f"{role} rejected datagrams: {_shown(reasons)}"
 
@@ -167,7 +171,8 @@ def _claim(claim: Mapping[str, Any]) -> dict[str, str]:
     ratio = claim.get("ratio")
     numbers["ratio"] = f"{100 * ratio:.3g} %" if isinstance(ratio, float) else _shown(ratio)
     since_s = claim.get("since_s")
-    return texts | numbers | {"since": "" if since_s is None else f"t = {_shown(since_s)} s"}
+    since = "" if since_s is None else f"t = {_shown(since_s)} s"
+    return texts | numbers | {"since": since, "interval": interval_of(dict(claim))}
 
 
 def _text(mapping: Mapping[str, Any], key: str) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cosim.crossing import crossing
+from cosim.estimation import true_states
 from cosim.join import Joined, join_all
 from cosim.record import (
     RunRecord,
@@ -24,6 +25,7 @@ from noack.records import (
     SENSOR_MEASUREMENT,
     Fate,
 )
+from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES
 
 Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals]
@@ -72,10 +74,12 @@ def _states(record: RunRecord, joined: Joined) -> Picture:
     dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
     forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.rows["fate"] == Fate.FORCED])
     scenario, names = record.scenario, record.loop.state_names
+    known = "x" if scenario.knows_state else "x̂"
     figure = figures.paper_figure(
         mode=scenario.mode,
         t_s=_seconds(joined.t_ns),
-        x=joined.x,
+        x=joined.x if scenario.knows_state else true_states(record[PLANT_STEP], joined.t_ns),
+        x_hat=None if scenario.knows_state else joined.x,
         x_s=joined.x_s,
         x_c=joined.x_c,
         state_names=names,
@@ -90,16 +94,27 @@ def _states(record: RunRecord, joined: Joined) -> Picture:
         figure,
         "States, and the time between broadcasts and between receptions. "
         + (
-            "x_c jumps to x when a packet survives, x_s when its acknowledgement does, too. "
+            f"x_c jumps to {known} when a packet survives, x_s when its acknowledgement does, too. "
             if scenario.is_acknowledged
-            else "At every event x_s jumps to x; x_c does so only when the packet survives. "
+            else f"At every event x_s jumps to {known}; x_c does so only when the packet survives. "
         )
+        + _known(scenario)
         + "A cross is a packet that was lost, a "
         "diamond one that only the bound on successive drops let through.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
         f"{len(events)} broadcasts, of which {int(dropped.sum())} were dropped, and for "
         f"{len(deliveries)} receptions, of which {int(forced.sum())} were forced.",
     )
+
+
+def _known(scenario: Scenario) -> str:
+    """What the sensor knows of x, where it does not measure x itself."""
+    if scenario.knows_state:
+        return ""
+    if scenario.observer is None:
+        return "x̂ is what is measured, x with noise. "
+    outputs = "1 measured output" if scenario.outputs == 1 else f"{scenario.outputs} outputs"
+    return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
 
 
 def _norms(
@@ -117,6 +132,7 @@ def _norms(
             "The controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, "
             "leaves it while packets are lost."
         )
+        + ("" if record.scenario.knows_state else " Both are against x̂, what the sensor knows.")
         + _dashed(e_c_bounds),
         "Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",

@@ -87,6 +87,6 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def printed(colour: Colour) -> Rgb:
-    """A colour of the palette, as much darker as gives it a contrast of 3 to 1 on white paper."""
-    r, g, b = (0.85 * part / 255 for part in colour)
+    """A colour of the palette, as matplotlib has them."""
+    r, g, b = (part / 255 for part in colour)
     return r, g, b

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from cosim.report.page import Embedded, page
 from cosim.report.run_figures import Envelope, run_figures
 from cosim.report.save import inline
 from cosim.run_dir import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE
-from noack.errors import MachineError
+from noack.errors import MachineError, why
 
 
 def write_report(
@@ -50,7 +51,9 @@ def write_report(
         scratch.write_text(html, encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
-        raise MachineError(f"{path}: the report cannot be written: {error}") from None
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise MachineError(f"{path}: the report cannot be written: {why(error)}") from None
     return path
 
 

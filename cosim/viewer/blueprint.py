@@ -18,6 +18,8 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``drop``                  0 at every dropped update
 ``lateness/<process>``    lateness in microseconds
 ``log``                   text
+``picture/…``             the plant, as a picture that moves (``cosim/viewer/pictures/``)
+``network/…``             the loop's processes, and packets under way
 ========================  =================================================================
 """
 
@@ -41,8 +43,8 @@ from cosim.palette import (
     Colour,
 )
 from cosim.palette import FORCED as FORCED_COLOUR
-
-TIMELINE = "t"
+from cosim.viewer.pictures.network import Diagram
+from cosim.viewer.pictures.picture import TIMELINE, Picture, panel
 
 ABOUT = "about"
 ERROR = "error/norm"
@@ -127,9 +129,17 @@ def _mark(
 
 
 def layout(
-    state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+    processes: Sequence[str],
+    *,
+    picture: Picture | None = None,
+    diagram: Diagram | None = None,
 ) -> rrb.Blueprint:
-    """Lay out the panels: states above the two kinds of interval, the rest at the side."""
+    """Lay out the panels: picture and packets on the left, above words; curves on the right.
+
+    Without a picture or diagram, the curves have the place to themselves.
+    """
     intervals = rrb.Horizontal(
         _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
         _plot(
@@ -138,31 +148,47 @@ def layout(
             [RECEPTION_STEM, RECEPTION, FORCED, DROP],
         ),
     )
-    main = rrb.Vertical(_states(state_names), intervals, row_shares=[2, 1])
-    side = rrb.Vertical(
-        rrb.Tabs(
-            _plot("Error norms, log10", ERROR_LOG10),
-            _plot("Error norms", ERROR),
-            _plot("State norm, log10", SIZE_LOG10),
-        ),
-        _plot("Control input u = K x_c", INPUT),
-        rrb.Tabs(
-            rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-            *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
-            rrb.TextLogView(
-                origin=LOG,
-                name="Log",
-                # The column of times is as narrow as its title, "t": the text says the time.
-                columns=rrb.TextLogColumns(
-                    timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
-                    text_log_columns=["loglevel", "body"],
-                ),
-                format_options=rrb.TextLogFormat(monospace_body=True),
+    norms = rrb.Tabs(
+        _plot("Error norms, log10", ERROR_LOG10),
+        _plot("Error norms", ERROR),
+        _plot("State norm, log10", SIZE_LOG10),
+    )
+    inputs = _plot("Control input u = K x_c", INPUT)
+    words = rrb.Tabs(
+        rrb.TextDocumentView(origin=ABOUT, name="About this run"),
+        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
+        rrb.TextLogView(
+            origin=LOG,
+            name="Log",
+            # The column of times is as narrow as its title, "t": the text says the time.
+            columns=rrb.TextLogColumns(
+                timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
+                text_log_columns=["loglevel", "body"],
             ),
+            format_options=rrb.TextLogFormat(monospace_body=True),
         ),
     )
+    states = _states(state_names)
+    drawings = [
+        *([] if picture is None else [panel(picture)]),
+        *([] if diagram is None else [diagram.panel()]),
+    ]
+    if drawings:
+        shares = [4, 3, 3][: len(drawings)]
+        curves = rrb.Vertical(
+            states, rrb.Horizontal(norms, inputs), intervals, row_shares=[2, 1, 1]
+        )
+        whole = rrb.Horizontal(
+            rrb.Vertical(*drawings, words, row_shares=[*shares, 3]), curves, column_shares=[1, 1]
+        )
+    else:
+        whole = rrb.Horizontal(
+            rrb.Vertical(states, intervals, row_shares=[2, 1]),
+            rrb.Vertical(norms, inputs, words),
+            column_shares=[2, 1],
+        )
     return rrb.Blueprint(
-        rrb.Horizontal(main, side, column_shares=[2, 1]),
+        whole,
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         collapse_panels=True,
     )

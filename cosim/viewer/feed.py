@@ -7,12 +7,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.join import ControllerTrack, Joined, controller_track, initial_track, join
-from cosim.record import Rows, tables_of, updates_in
+from cosim.changes import claimed_until_s, model_flow
+from cosim.estimation import true_states
+from cosim.join import (
+    ControllerTrack,
+    Joined,
+    controller_track,
+    in_common,
+    initial_track,
+    join,
+)
+from cosim.record import Rows, updates_in
+from cosim.viewer.pictures.picture import Frames
 from cosim.viewer.recording import RunView
 from noack.clock import NS_PER_S
 from noack.records import (
     CONTROLLER_DELIVERY,
+    CONTROLLER_SETTING,
     CONTROLLER_STEP,
     NETEM_PACKET,
     NO_SEQUENCE,
@@ -21,17 +32,26 @@ from noack.records import (
     Fate,
     effective,
 )
-from noack.resolve import loop_of
+from noack.resolve import loop_of, tables_of
 from noack.scenario import Scenario
 from noack.theory.certify import Certificate, certify
 from noack.theory.monitor import ErrorMonitor
-from noack.theory.schedule import nominal_conditions
+from noack.theory.schedule import allowed_conditions
 from noack.trigger.choose import policy_of
+from noack.wire import Flow
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""
+_PATIENCE_S = 1.0
+"""Wall time that it waits for a controller that is silent."""
+
+_SHOWN = (
+    CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)  # fmt: skip
 
 Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
 
 
 class ViewFeed:
@@ -46,13 +66,22 @@ class ViewFeed:
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
-        self._pending: dict[str, list[Rows]] = {table: [] for table in tables_of(scenario)}
+        # What is not shown is not kept.
+        self._pending: dict[str, list[Rows]] = {table: [] for table in _SHOWN}
         self._types = tables_of(scenario)
         self._track: ControllerTrack = initial_track(scenario)
         self._undrawn: list[Rows] = []
         self._forced: set[int] = set()
         self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario))
-        self._known = scenario.network.initial_sync == "known_state"
+        own = dict(self._types[PLANT_STEP].fields or {}).get("z")
+        self._own = None if own is None else (np.zeros(0, np.int64), np.zeros((0, *own[0].shape)))
+        self._told = np.zeros(0, self._types[CONTROLLER_SETTING])
+        self._flow = model_flow(scenario, self._told)
+        self._claimed_until_s = np.inf
+        # Where the sensor does not know x, the plant's own is shown.
+        self._plant: Rows | None = None
+        if not scenario.knows_state:
+            self._plant = np.zeros(0, self._types[PLANT_STEP])
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
 
@@ -64,12 +93,16 @@ class ViewFeed:
     def log(self, notice: Mapping[str, Any]) -> None:
         """Take a line of the run's log."""
         text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
-        level = "WARN" if notice["level"] == "violation" else "INFO"
+        level = "WARN" if notice["level"] in ("failed", "violation", "void", "watchdog") else "INFO"
         self._view.log(int(notice["t_ns"]), level, str(text))
 
     @np.errstate(all="ignore")  # a run may diverge
     def advance(self, *, final: bool = False) -> None:
         """Pass on what is complete; at the end, everything."""
+        if len(told := self._take(CONTROLLER_SETTING, None)):
+            self._told = np.concatenate([self._told, told])
+            self._flow = model_flow(self._scenario, self._told)
+            self._claimed_until_s = claimed_until_s(self._told)
         steps = self._take(CONTROLLER_STEP, None)
         deliveries = self._take(CONTROLLER_DELIVERY, None)
         if len(steps) or len(deliveries):
@@ -79,13 +112,23 @@ class ViewFeed:
             until_ns = None
             reach_ns += self._scenario.controller_period_ns
         else:
-            until_ns = reach_ns - int(_LAG_S * NS_PER_S * self._scenario.speed)
+            waiting = self._pending[SENSOR_MEASUREMENT]
+            newest_ns = int(waiting[-1]["t_ns"][-1]) if waiting else reach_ns
+            wall_ns = NS_PER_S * self._scenario.speed
+            until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
+            until_ns -= int(_LAG_S * wall_ns)
         self._packets(self._take(NETEM_PACKET, None))
+        self._view.travel(self._scenario.horizon_ns if until_ns is None else until_ns)
         self._inputs(steps)
         self._undrawn.append(deliveries)
         self._deliveries(until_ns)
-        self._lateness("plant", self._take(PLANT_STEP, None))
+        taken = self._take(PLANT_STEP, None)
+        if self._plant is not None:
+            self._plant = np.concatenate([self._plant, taken])
+        self._lateness("plant", taken)
+        self._systems(taken)
         self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
+        self._view.flush()
 
     def _take(self, table: str, until_ns: int | None) -> Rows:
         waiting = self._pending[table]
@@ -97,17 +140,41 @@ class ViewFeed:
         self._pending[table] = [rows[ready:]] if ready < len(rows) else []
         return rows[:ready]
 
+    def _systems(self, steps: Rows) -> None:
+        """Keep the system's own states until the measurements at their times are shown."""
+        if self._own is not None and len(steps):
+            t_ns, z = self._own
+            self._own = np.concatenate([t_ns, steps["t_ns"]]), np.vstack([z, steps["z"]])
+
+    def _own_at(self, times_ns: Times) -> Reals | None:
+        """The system's own state at ascending times (k,), NaN where it is not in; (k, N)."""
+        if self._own is None:
+            return None
+        t_ns, z = self._own
+        found = np.full((len(times_ns), z.shape[1]), np.nan)
+        if len(t_ns):
+            at = np.minimum(np.searchsorted(t_ns, times_ns), len(t_ns) - 1)
+            known = t_ns[at] == times_ns
+            found[known] = z[at[known]]
+            self._own = t_ns[at[-1] :], z[at[-1] :]
+        return found
+
     def _measurements(self, rows: Rows, reach_ns: int) -> None:
         if not len(rows):
             return
         acknowledged = self._scenario.is_acknowledged
-        joined = join(self._loop, rows, self._track, reach_ns, acknowledged=acknowledged)
+        joined = join(
+            self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
+        )
+        if self._plant is not None:
+            joined = joined._replace(x=true_states(self._plant, joined.t_ns))
+            self._plant = self._plant[self._plant["t_ns"] > joined.t_ns[-1]]
         t_s = np.asarray(joined.t_ns * 1e-9)
         bounds = np.column_stack(
             [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
         )
-        if not self._known:  # as yet, sensor and controller have nothing in common
-            bounds[joined.received == NO_SEQUENCE] = np.nan
+        if not self._scenario.is_acknowledged:
+            bounds[~in_common(self._scenario, joined)] = np.nan
         self._view.samples(
             joined.t_ns,
             joined.x,
@@ -119,6 +186,8 @@ class ViewFeed:
             bounds,
             self._certified(t_s, "state"),
         )
+        z = self._own_at(joined.t_ns)
+        self._view.move(joined.t_ns, Frames(t_s, joined.x, joined.x_s, joined.x_c, z))
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
         if len(event_ns):
             self._view.broadcasts(event_ns, _intervals_s(event_ns, self._last_event_ns))
@@ -131,12 +200,11 @@ class ViewFeed:
     def _certificate(self) -> Certificate | None:
         """The certificate of the run, made when the run is under way: it takes its time.
 
-        None for another trigger than the paper's, and where updates are acknowledged.
+        None of what is beyond the theory.
         """
-        if not self._scenario.is_decaying or self._scenario.is_acknowledged:
-            return None
-        conditions = nominal_conditions(self._scenario, self._scenario.certificate.late_periods)
-        certificate = certify(self._scenario, conditions)
+        if not self._scenario.is_certifiable or self._loop.setpoint is not None:
+            return None  # at a set-point it would be of the deviations
+        certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
             self._view.certified_interval(certificate.inter_event_s, self._scenario.horizon_ns)
         return certificate
@@ -146,7 +214,8 @@ class ViewFeed:
     ) -> NDArray[np.float64]:
         if self._certificate is None:
             return np.full(len(t_s), np.nan)
-        return np.asarray(getattr(self._certificate, what)(t_s))
+        bound = getattr(self._certificate, what)(t_s)
+        return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     def _bounds(self, rows: Rows, joined: Joined) -> NDArray[np.float64]:
         """The bound of ‖e_c‖ that (I1) gives, (k,); none where updates are acknowledged."""
@@ -167,6 +236,8 @@ class ViewFeed:
         if not len(rows):
             return
         forced = np.array([int(sequence) in self._forced for sequence in rows["sequence"]])
+        newest = int(rows["sequence"][-1])
+        self._forced = {sequence for sequence in self._forced if sequence > newest}
         event_ns = rows["t_ns"]
         self._view.receptions(event_ns, _intervals_s(event_ns, self._last_delivery_ns), forced)
         self._last_delivery_ns = int(event_ns[-1])
@@ -174,7 +245,11 @@ class ViewFeed:
     def _packets(self, rows: Rows) -> None:
         if not len(rows):
             return
+        if self._scenario.is_acknowledged:
+            back = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
+            self._view.packets(back["t_ns"], back["release_ns"], back["fate"], back=True)
         rows, sequence, event_ns = updates_in(rows)
+        self._view.packets(event_ns, rows["release_ns"], rows["fate"])
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
         dropped = ~effective(rows["fate"])
         if dropped.any():

@@ -110,8 +110,13 @@ class LiveView:
             self._host.stdin.flush()
 
 
-def view_recording(path: Path) -> None:
+def view_recording(path: Path, *, native: bool | None = None) -> None:
     """Show a finished recording until its window is closed, or in the browser until Ctrl-C.
+
+    Args:
+        path: the recording.
+        native: open a window (True), serve a browser on loopback (False), or decide by the display
+            (None); where no window can be opened after all, a browser is served.
 
     Raises:
         CallerError: there is no such file.
@@ -123,7 +128,8 @@ def view_recording(path: Path) -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:
-        window = server.open_window() if has_display() else None
+        wanted = has_display() if native is None else native
+        window = server.open_window() if wanted else None
         if window is not None:
             window.wait()
             return

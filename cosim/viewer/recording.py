@@ -15,6 +15,9 @@ import rerun as rr
 
 from cosim.viewer import blueprint as bp
 from cosim.viewer.live import LiveView
+from cosim.viewer.pictures.network import DIAGRAM, Diagram
+from cosim.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
+from noack.clock import NS_PER_S
 from noack.errors import MachineError
 
 Floats = npt.NDArray[np.float64]
@@ -26,6 +29,8 @@ APPLICATION_ID = "noack"
 # fraction of the threshold, and no lower than the smallest error worth a look.
 _LOG_DEPTH = 1e-3
 _LOG_FLOOR = 1e-12
+_FRAMES_AT_ONCE = 12
+"""A batch of them takes more than a kilobyte by itself, once for everything that moves."""
 
 
 class ViewError(MachineError):
@@ -46,7 +51,12 @@ class RunView:
         state_names: names of the n coordinates of x.
         input_names: names of the m coordinates of u.
         processes: names of the processes whose lateness is shown; none in a simulated run.
+        picture: of the plant; None does without.
+        diagram: of the network; None does without.
         live: shows the file while it is written.
+        indexed: end the file with an index of its chunks, so that tools find what they look for.
+            Until then the index is kept in memory, some 200 bytes for each chunk: a view that is
+            written bit by bit for hours goes without, and is read in full.
 
     Raises:
         ViewError: the file cannot be created.
@@ -62,18 +72,25 @@ class RunView:
         state_names: Sequence[str],
         input_names: Sequence[str],
         processes: Sequence[str],
+        picture: Picture | None = None,
+        diagram: Diagram | None = None,
         live: LiveView | None = None,
+        indexed: bool = True,
     ) -> None:
         self._path = path
         self._states = [bp.state_path(name) for name in state_names]
         self._lateness = {name: bp.lateness_path(name) for name in processes}
         self._n, self._m = len(state_names), len(input_names)
+        self._picture, self._diagram = picture, diagram
+        self._frame = -1
+        self._waiting: list[tuple[Nanoseconds, Frames]] = []
         self._open = True
         self._live = live
         self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=run_id)
         names = (state_names, input_names, processes)
         try:
-            self._recording.save(path, default_blueprint=bp.layout(*names))
+            layout = bp.layout(*names, picture=picture, diagram=diagram)
+            self._recording.save(path, default_blueprint=layout, write_footer=indexed)
         except RuntimeError as error:
             raise ViewError(f"{path}: cannot create the recording: {error}") from None
         self._recording.send_recording_name(title)
@@ -81,6 +98,9 @@ class RunView:
         self._recording.log(bp.ABOUT, document, static=True)
         for entity, style in bp.styles(*names).items():
             self._recording.log(entity, style, static=True)
+        for below, drawing in ((PICTURE, picture), (DIAGRAM, diagram)):
+            for entity, shape in ({} if drawing is None else drawing.scenery()).items():
+                self._recording.log(f"{below}/{entity}", shape, static=True)
         if live is not None:
             live.show(path)
 
@@ -134,6 +154,48 @@ class RunView:
         sizes = np.column_stack([np.linalg.norm(x, axis=1), _shaped("x_bound", x_bound, (k,))])
         self._send(bp.SIZE_LOG10, times, _log10(sizes, threshold))
 
+    def move(self, t_ns: Nanoseconds, frames: Frames) -> None:
+        """Add states at times (k,) to the plant's picture, which shows as many as it needs."""
+        if self._picture is None:
+            return
+        frame = t_ns // round(NS_PER_S / self._picture.rate_hz)
+        new = np.diff(frame, prepend=self._frame) > 0
+        if not new.any():
+            return
+        self._frame = int(frame[-1])
+        self._waiting.append((t_ns[new], frames.at(new)))
+        if sum(len(times) for times, _ in self._waiting) >= _FRAMES_AT_ONCE:
+            self._draw()
+
+    def _draw(self) -> None:
+        """Write the frames that wait."""
+        if self._picture is None or not self._waiting:
+            return
+        t_ns = np.concatenate([times for times, _ in self._waiting])
+        frames = joined([frames for _, frames in self._waiting])
+        self._waiting = []
+        for entity, columns in self._picture.frames(frames).items():
+            self._send_columns(f"{PICTURE}/{entity}", self._times(t_ns), columns)
+
+    def packets(
+        self,
+        t_ns: Nanoseconds,
+        release_ns: Nanoseconds,
+        fate: npt.NDArray[np.int64],
+        *,
+        back: bool = False,
+    ) -> None:
+        """Add packets (p,) to the network's diagram; see :meth:`Diagram.add`."""
+        if self._diagram is not None:
+            self._diagram.add(t_ns, release_ns, fate, back=back)
+
+    def travel(self, until_ns: int) -> None:
+        """Let the packets travel up to a time by which all of them were added."""
+        if self._diagram is None:
+            return
+        for entity, moving in self._diagram.advance(until_ns).items():
+            self._send_columns(f"{DIAGRAM}/{entity}", self._times(moving.t_ns), moving.columns)
+
     def certified_interval(self, interval_s: float, until_ns: int) -> None:
         """Draw the certified least time between two broadcasts, from 0 to ``until_ns``."""
         ends_ns = np.array([0, until_ns], dtype=np.int64)
@@ -184,6 +246,13 @@ class RunView:
         times = self._times(np.array([t_ns], dtype=np.int64))
         self._send_columns(bp.LOG, times, columns)
 
+    def flush(self) -> None:
+        """Hand everything over to the operating system: what waits in between takes memory."""
+        try:
+            self._recording.flush()
+        except RuntimeError as error:
+            raise ViewError(f"{self._path}: cannot write the recording: {error}") from None
+
     def close(self) -> None:
         """Write what is left and the file's footer; a second call does nothing.
 
@@ -194,6 +263,7 @@ class RunView:
             return
         self._open = False
         try:
+            self._draw()
             self._recording.flush()
         except RuntimeError as error:
             raise ViewError(f"{self._path}: the recording is incomplete: {error}") from None
@@ -229,7 +299,7 @@ class RunView:
 
     @staticmethod
     def _times(t_ns: Nanoseconds) -> rr.TimeColumn:
-        return rr.TimeColumn(bp.TIMELINE, duration=np.asarray(t_ns).astype("timedelta64[ns]"))
+        return rr.TimeColumn(TIMELINE, duration=np.asarray(t_ns).astype("timedelta64[ns]"))
 
     def _stems(self, t_ns: Nanoseconds, height: Floats) -> tuple[rr.TimeColumn, Floats]:
         """Draw lines that rise from 0 to each height (k,), with a gap after each."""

@@ -228,7 +228,8 @@ def _start_viewer(
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=start_new_session,
-        preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGTERM) if tied else None,
+        # Not SIGTERM, for which a program that stands still waits until it goes on.
+        preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGKILL) if tied else None,
     )
 
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator
 from typing import Any, Self, cast
 
 import zenoh
-from zenoh.handlers import FifoChannel, RingChannel
+from zenoh.handlers import RingChannel
 
-from netem.control.server import USER
+from netem.control.server import secret_of
 from netem.control.session import Session, running
 from netem.control.statistics import Statistics
-from noack.errors import CallerError, PeerError
-from noack.io.plane import cause_of, star_config
+from noack.errors import PeerError
+from noack.io.star import answer_to, cause_of, open_star
 
 _ANSWER_S = 10.0
 _SILENCE_S = 3.0
@@ -32,9 +32,8 @@ class Client:
     def __init__(self, session: Session) -> None:
         self._name = session.name
         self._token = session.token
-        secret = {"transport/auth/usrpwd/user": USER, "transport/auth/usrpwd/password": self._token}
         try:
-            self._session = zenoh.open(star_config(session.endpoint, listen=False, more=secret))
+            self._session = open_star(session.endpoint, secret_of(self._token), listen=False)
         except zenoh.ZError as error:
             raise PeerError(
                 f"emulator {self._name!r} cannot be reached at {session.endpoint}: "
@@ -56,19 +55,9 @@ class Client:
         """
         payload = json.dumps(content | {"token": self._token})
         key = f"netem/{self._name}/{what}"
-        replies = self._session.get(key, FifoChannel(4), payload=payload, timeout=_ANSWER_S)
-        deadline_s = time.monotonic() + _ANSWER_S
-        while time.monotonic() < deadline_s:
-            try:
-                reply = replies.try_recv()
-            except zenoh.ZError:  # the query has ended without an answer
-                break
-            if reply is None:
-                time.sleep(0.002)
-            elif reply.ok is not None:
-                return json.loads(reply.ok.payload.to_string())
-            elif reply.err is not None:
-                raise CallerError(reply.err.payload.to_string())
+        answer = answer_to(self._session, key, payload, _ANSWER_S)
+        if answer is not None:
+            return json.loads(answer)
         raise PeerError(f"emulator {self._name!r} does not answer")
 
     def follow(self, stop: Callable[[], bool]) -> Iterator[Statistics]:

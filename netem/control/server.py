@@ -23,7 +23,6 @@ All of this happens in a thread of its own; see :mod:`netem.control.errands`.
 
 import hmac
 import json
-import os
 import secrets
 import threading
 import time
@@ -39,25 +38,28 @@ from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
 from netem.control.errands import Errands, Snapshot
-from netem.control.session import Session, make_folder, published
+from netem.control.session import Session, published
 from netem.control.statistics import statistics
 from netem.engine.api import DIRECTIONS, Direction
 from netem.words.parser import settings_of
 from netem.words.text import text_of
 from noack.errors import CallerError, MachineError, NoackError, PeerError
 from noack.impairments import Delay, LinkSettings, LossOf, Trace
-from noack.io.plane import cause_of, star_config
+from noack.io.star import Secret, cause_of, open_star
 from noack.io.udp import LOOPBACK, free_tcp_port
 from noack.mistakes import brief
 
-USER = "netem"
 _TOKEN_BYTES = 32
 _POLL_S = 0.02
 _PUBLISH_S = 1.0
 _QUERIES = 64
 """Of each kind wait at most; the oldest give way."""
 _PATIENCE_S = 10.0
-_PRIVATE = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+
+
+def secret_of(token: str) -> Secret:
+    """Return what zenoh asks for whoever connects."""
+    return Secret("netem", token)
 
 
 class Change(BaseModel):
@@ -122,17 +124,10 @@ class ControlServer:
         self._stack.close()
 
     def _open(self, endpoint: str) -> zenoh.Session:
-        # zenoh takes the passwords that it accepts from a file only.
-        passwords = make_folder() / f"{self._name}.{os.getpid()}.passwords"
-        with os.fdopen(os.open(passwords, _PRIVATE, 0o600), "w") as file:
-            file.write(f"{USER}:{self._token}\n")
-        more = {"transport/auth/usrpwd/dictionary_file": str(passwords)}
         try:
-            return zenoh.open(star_config(endpoint, listen=True, more=more))
+            return open_star(endpoint, secret_of(self._token), listen=True)
         except zenoh.ZError as error:
             raise MachineError(f"cannot listen on {endpoint}: {cause_of(error)}") from None
-        finally:
-            passwords.unlink()
 
     def _key(self, what: str) -> str:
         return f"netem/{self._name}/{what}"

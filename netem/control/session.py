@@ -1,22 +1,19 @@
 """Session files: where a running emulator can be reached, and the secret that it asks for.
 
-A file lies in the user's runtime directory, readable by its owner only, while the emulator runs.
-The emulator holds a lock on it, which the system releases however the emulator ends; a file without
-a lock is of one that died, and is removed by whoever finds it.
+A file lies in the user's runtime directory, readable by its owner only, while the emulator runs
+(:mod:`noack.io.held`).
 """
 
-import fcntl
-import json
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from pydantic import TypeAdapter, ValidationError
 
 from noack.errors import CallerError, PeerError
-from noack.io.private import make_private, private_folder, require_name, require_private
+from noack.io import held
+from noack.io.private import require_name
 from noack.mistakes import brief
 
 
@@ -31,15 +28,12 @@ class Session(NamedTuple):
 
 
 _SESSION = TypeAdapter(Session)
-
-
-def _folder() -> Path:
-    return private_folder() / "netem"
+_KIND = "netem"
 
 
 def _path_of(name: str) -> Path:
     require_name(name, "emulator")
-    return _folder() / f"{name}.json"
+    return held.folder_of(_KIND) / f"{name}.json"
 
 
 def make_folder() -> Path:
@@ -48,9 +42,7 @@ def make_folder() -> Path:
     Raises:
         CallerError: it cannot be made, or others may look into it.
     """
-    make_private(_folder().parent)
-    make_private(_folder())
-    return _folder()
+    return held.make_folder(_KIND)
 
 
 @contextmanager
@@ -61,55 +53,15 @@ def published(session: Session) -> Iterator[Path]:
         CallerError: the name is unfit or in use, or the folder is not the user's own.
     """
     path = _path_of(session.name)
-    scratch = make_folder() / f"{session.name}.{os.getpid()}"
-    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        json.dump(session._asdict(), file)
-        file.flush()
+    make_folder()
+    with ExitStack() as stack:
         try:
-            _put(scratch, path, session.name)
-        finally:
-            scratch.unlink()
-        try:
-            yield path
-        finally:
-            _remove(path, os.fstat(descriptor))
-
-
-def _put(scratch: Path, path: Path, name: str) -> None:
-    """Give the file its name, unless a running emulator has it."""
-    for attempt in range(2):
-        try:
-            os.link(scratch, path)
-            return
+            stack.enter_context(held.held(path, session._asdict()))
         except FileExistsError:
-            if attempt or _alive(path):
-                break
-    raise CallerError(f"--control {name}: an emulator of this name runs; choose another name")
-
-
-def _remove(path: Path, status: os.stat_result) -> None:
-    """Remove a file unless another has taken its place."""
-    try:
-        if os.path.samestat(path.stat(), status):
-            path.unlink()
-    except FileNotFoundError:
-        pass
-
-
-def _alive(path: Path) -> bool:
-    """Whether the emulator of a session file runs; the file of one that does not is removed."""
-    try:
-        with path.open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            _remove(path, os.fstat(file.fileno()))
-    except FileNotFoundError:
-        pass
-    return False
+            raise CallerError(
+                f"--control {session.name}: an emulator of this name runs; choose another name"
+            ) from None
+        yield path
 
 
 def running() -> list[str]:
@@ -118,10 +70,7 @@ def running() -> list[str]:
     Raises:
         CallerError: the folder is open to others.
     """
-    if not _folder().exists():
-        return []
-    require_private(_folder())
-    return sorted(path.stem for path in _folder().glob("*.json") if _alive(path))
+    return sorted(path.stem for path in held.running(_KIND))
 
 
 def find(name: str | None) -> Session:

@@ -35,12 +35,12 @@ from netem.engine.pump.layout import (
     SERVER_NAME,
     STORE_FULL,
 )
-from netem.engine.sockets import drops_of, raise_file_limit, stamp_arrivals, take_together
+from netem.engine.sockets import raise_file_limit, stamp_arrivals, take_together
 from netem.engine.unreachable import Unreachable
 from netem.records import Counters, Verdict, dtype_of
 from noack.errors import CallerError
 from noack.impairments import LinkSettings
-from noack.io.udp import LOOPBACK
+from noack.io.udp import LOOPBACK, drops_of
 
 _PERIOD_NS = 20_000_000
 _RARELY_NS = 250_000_000

@@ -16,12 +16,12 @@ from netem.engine.refusals import STOPPED_NS, Refusals
 from netem.engine.sockets import (
     Endpoint,
     Place,
-    drops_of,
     has_data,
     return_path,
     stamp_arrivals,
     take_together,
 )
+from noack.io.udp import drops_of
 
 _LOOKED_AT = 256
 

@@ -9,7 +9,6 @@ from netem.engine.sockets import (
     Endpoint,
     Place,
     address_of,
-    drops_of,
     leads_to,
     listen,
     one_way_path,
@@ -17,6 +16,7 @@ from netem.engine.sockets import (
 )
 from noack.errors import CallerError
 from noack.io.address import text_of
+from noack.io.udp import drops_of
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from netem.engine.refusals import STOPPED_NS, Refusals
 from netem.engine.sockets import (
     Endpoint,
     address_of,
-    drops_of,
     has_data,
     raise_file_limit,
     return_path,
@@ -32,7 +31,7 @@ from netem.engine.sockets import (
 from netem.engine.unreachable import Unreachable
 from noack.errors import CallerError
 from noack.impairments import LinkSettings
-from noack.io.udp import MAX_UDP_BYTES
+from noack.io.udp import MAX_UDP_BYTES, drops_of
 
 _PERIOD_NS = 20_000_000
 _RARELY_NS = 250_000_000

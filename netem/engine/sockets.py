@@ -18,9 +18,6 @@ _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_SNDBUFFORCE = 32
 _SO_ATTACH_FILTER = 26
 _BPF_RETURN = 6
-_SO_MEMINFO = 55
-_MEMINFO_WORDS = 9
-_MEMINFO_DROPS = 8
 _UDP_GRO = 104
 _SO_TIMESTAMPNS = 35
 
@@ -95,7 +92,7 @@ def return_path(server: Place) -> Endpoint:
 def one_way_path(server: Place) -> Endpoint:
     """Return a socket from which a link that takes no answers sends to its server.
 
-    It lets nothing in: answers are dropped at once, and counted by :func:`drops_of`.
+    It lets nothing in: answers are dropped at once, and counted by :func:`noack.io.udp.drops_of`.
 
     Raises:
         OSError: there is no file descriptor left.
@@ -154,20 +151,6 @@ def has_data(endpoint: Endpoint) -> bool:
     except OSError:
         return False
     return True
-
-
-def drops_of(endpoint: Endpoint) -> int | None:
-    """Datagrams that the kernel dropped at a socket; None if it does not say.
-
-    The count is exact whenever it is asked for, which the one that comes with datagrams
-    (SO_RXQ_OVFL) is only after one more has come; and it costs nothing per datagram.
-    """
-    try:
-        found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
-    except OSError:
-        return None
-    words = struct.unpack(f"={len(found) // 4}I", found[: len(found) // 4 * 4])
-    return words[_MEMINFO_DROPS] if len(words) > _MEMINFO_DROPS else None
 
 
 def raise_file_limit() -> None:

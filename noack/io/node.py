@@ -5,33 +5,37 @@ its lifeline is gone, or on SIGINT and SIGTERM. What it recorded reaches the rec
 run directory's spool.
 """
 
+import contextlib
 import os
 import select
 import signal
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
+from noack.changes import Change, Changeable
 from noack.clock import NS_PER_S, RunClock
-from noack.errors import PeerError
+from noack.errors import CallerError, PeerError
 from noack.io.address import Address
 from noack.io.loop import Channel, run_loop
+from noack.io.messages import Admission, Announced, Begin, Kept, Missing, Said, heard
 from noack.io.plane import Plane
 from noack.io.realtime import realtime
 from noack.io.signals import Signals
 from noack.io.spool import SpoolWriter
-from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notices_of
+from noack.io.telemetry import NOTICES, TelemetryBuffer, first_row, notice_number, notices_of
 from noack.io.ticket import Ticket
 from noack.io.udp import MessageSocket, bind
-from noack.machine import Machine
-from noack.records import OWNER, tables
-from noack.resolve import Loop, loop_of
+from noack.machine import BEGINNING, RESTART, Machine, Notice, Record, Start
+from noack.records import OWNER
+from noack.resolve import Loop, loop_of, tables_of
 from noack.topology import (
     ACKNOWLEDGED_BY,
     ACKNOWLEDGES_TO,
+    CHANGEABLE,
     LEGS,
     LOOP_ROLES,
     RECORDER,
@@ -43,7 +47,10 @@ T = TypeVar("T")
 
 _JOIN_TIMEOUT_S = 24 * 3600.0
 """A person may take long to start the other processes; who does not want to wait, interrupts."""
+_ADMISSION_TIMEOUT_S = 10.0
 _GOODBYE_TIMEOUT_S = 5.0
+_CHANGES_AT_ONCE = 2
+"""In the loop, every 50 ms: a machine takes some tenths of a millisecond for each."""
 _GRACE_S = 0.15
 """Wall time after the horizon in which what is still under way arrives."""
 
@@ -58,6 +65,10 @@ class ReportingChannel(Channel[T], Protocol[T]):
 
     def report(self) -> Mapping[str, object]:
         """Counters, for the run's summary."""
+        ...
+
+    def close(self) -> None:
+        """Close what it opened."""
         ...
 
 
@@ -83,7 +94,28 @@ class Node:
         self._signals = signals
         self._ended: str | None = None
         self._joining = False
+        self._admitted_ns = 0
+        self._place: Address | None = None
+        self._changes: list[dict[str, Any]] = []
+        self._changes_heard = 0
+        self._looping = False
+        self.start: Start = BEGINNING
+        """Where in the run it takes up its work."""
+        self.after: str | None = None
+        """What became of the one whose place it takes, if it takes one's."""
         self.report: dict[str, Any] = {}
+
+    def knock(self) -> None:
+        """Ask to be let in; learn whether the run has begun, and another has gone before.
+
+        Raises:
+            PeerError: this process is not let in.
+        """
+        admission = self._ask("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
+        self.start = Start(admission["incarnation"], admission["from_ns"])
+        if self.start.again:
+            self._place, self.after = admission["address"], admission["after"]
+            self._admitted_ns = admission["admitted_ns"]
 
     def join(self, address: Address | None) -> Mapping[str, Address]:
         """Wait at the start barrier; return everyone's address. Sets the common epoch.
@@ -94,22 +126,62 @@ class Node:
         Raises:
             PeerError: the run never started.
         """
-        hello = {"pid": os.getpid(), "address": address}
-        self._joining = True
-        start = self.plane.request(
-            "join", hello, timeout_s=_JOIN_TIMEOUT_S, give_up=lambda: self.stopping
-        )
-        self._joining = False
-        self.clock = RunClock(start["epoch_ns"], self.scenario.speed)
+        begin = self._ask("join", {"address": address}, Begin, _JOIN_TIMEOUT_S)
+        self.clock = RunClock(begin["epoch_ns"], self.scenario.speed)
+        addresses: Mapping[str, Address] = begin["addresses"]
+        self._changes = list(begin.get("changes", ()))
+        if not addresses.keys() >= set(LOOP_ROLES):
+            raise PeerError(f"{self.role}: the coordinator did not say where everyone receives")
         if not self.ticket.launched:
-            print(f"noack {self.role}: started", file=sys.stderr)
-        return {role: (host, port) for role, (host, port) in start["addresses"].items()}
+            verb = f"takes the place of one before ({self.after})" if self.after else "started"
+            print(f"noack {self.role}: {verb}", file=sys.stderr)
+        return addresses
+
+    def _ask(self, what: str, more: dict[str, Any], answer: type[Said], timeout_s: float) -> Any:
+        """Ask the coordinator as this process."""
+        question = {"pid": os.getpid(), "instance": self.plane.instance, **more}
+        self._joining = True
+        try:
+            said = self.plane.request(
+                what, question, timeout_s=timeout_s, give_up=lambda: self.stopping
+            )
+        except PeerError as error:
+            # What it was asked to end for says more than that no answer came.
+            raise PeerError(self._ended) if self._ended else error from None
+        finally:
+            self._joining = False
+        return heard(answer, said)
+
+    def changes(self, at_once: int | None = None) -> list[tuple[Change, Mapping[str, Any]]]:
+        """Changes of the run's settings that have become known, each once and in their order.
+
+        Args:
+            at_once: how many at the most; the rest waits.
+
+        Returns:
+            The changes, and all that was said of each.
+        """
+        while (said := self.plane.announced()) is not None:
+            with contextlib.suppress(PeerError):  # whoever says so is not the coordinator
+                self._changes.append(heard(Announced, said))
+        found: list[tuple[Change, Mapping[str, Any]]] = []
+        while self._changes and (at_once is None or len(found) < at_once):
+            one = self._changes.pop(0)
+            if one["number"] >= self._changes_heard:  # a late joiner hears of some twice
+                self._changes_heard = one["number"] + 1
+                found.append((Change(one["number"], one["t_ns"], one["settings"]), one))
+        return found
 
     def run_messages(self, machine: Machine[Message]) -> None:
         """Run a machine that speaks the loop's wire format over its leg of the topology."""
         leg = LEGS[self.role]
-        dimension = self.loop.m if leg.receives is Flow.ACTUATION else self.loop.n
-        decoder = Decoder(leg.receives, dimension, self.ticket.run_id, self.ticket.key)
+        decoder = Decoder(
+            leg.receives,
+            self.scenario.entries(leg.receives),
+            self.ticket.run_id,
+            self.ticket.key,
+            not_before_ns=self._admitted_ns,
+        )
         encoder = Encoder(self.ticket.run_id, self.ticket.key)
         acknowledged = self.scenario.is_acknowledged
         answers_from = ACKNOWLEDGED_BY.get(self.role) if acknowledged else None
@@ -141,11 +213,14 @@ class Node:
             CallerError: the process's port is taken.
             PeerError: the run never started.
         """
-        rows = tables(self.loop.n, self.loop.m, acknowledged=self.scenario.is_acknowledged)
+        rows = tables_of(self.scenario)
         owned = {table: dtype for table, dtype in rows.items() if OWNER[table] == self.role}
-        telemetry = TelemetryBuffer(owned, self.plane.publish_telemetry)
+        telemetry = TelemetryBuffer(
+            owned, self.plane.publish_telemetry, self.start.incarnation, self._kept_by_recorder
+        )
         grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
+        port = port if self._place is None else self._place[1]
         place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
             closing(bind(port, self.role, f"ports.{self.role}")) as endpoint,
@@ -153,6 +228,9 @@ class Node:
             realtime(settings.enabled, settings.fifo_priority, place) as granted,
         ):
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
+            if self.after is not None:
+                telemetry.notice(Notice(self.start.from_ns, RESTART, f"started anew: {self.after}"))
+            changeable = cast(Changeable[T], machine) if self.role in CHANGEABLE else None
             try:
                 behind_ns = run_loop(
                     machine,
@@ -162,6 +240,7 @@ class Node:
                     end_ns=self.scenario.horizon_ns + grace_ns,
                     stop=lambda: self.stopping,
                     spin_us=settings.spin_us,
+                    news=lambda now_ns: self._announce(changeable, now_ns),
                 )
                 if behind_ns and not self.stopping:
                     behind_s = behind_ns / NS_PER_S
@@ -177,7 +256,10 @@ class Node:
                     "realtime": granted,
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
+                    "incarnation": self.start.incarnation,
+                    "instance": self.plane.instance,
                 }
+                channel.close()
                 self._hand_over(telemetry)
 
     @property
@@ -203,25 +285,53 @@ class Node:
                 self._ended = "the run's coordinator is gone"
         return self._ended
 
+    def _announce(self, machine: Changeable[Any] | None, now_ns: int) -> Sequence[Record | Notice]:
+        """Tell a machine of changes; during the loop a few at a time, as each takes a while."""
+        if machine is None:
+            return ()
+        found: list[Record | Notice] = []
+        for change, _ in self.changes(_CHANGES_AT_ONCE if self._looping else None):
+            try:
+                found += machine.announce(change, now_ns)
+            except CallerError as error:  # the coordinator would not have said so
+                print(f"noack {self.role}: ignored: {error}", file=sys.stderr)
+        self._looping = True
+        return found
+
+    def _kept_by_recorder(self) -> Mapping[str, Sequence[tuple[int, int]]]:
+        """Rows of this process that are on disk, as far as the recorder has said anew."""
+        said = self.plane.kept()
+        if said is None:
+            return {}
+        try:
+            kept = heard(Kept, said)
+        except PeerError:  # whoever says so is not the recorder
+            return {}
+        rows: Mapping[str, Sequence[tuple[int, int]]] = kept["rows"]
+        return rows if kept["incarnation"] == self.start.incarnation else {}
+
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
         reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
+        reachable = reachable and not self.plane.coordinator_gone()  # all else goes through it
         try:
             for _ in range(3 if reachable else 0):
-                missing = self.plane.request("goodbye", self.report, timeout_s=_GOODBYE_TIMEOUT_S)
+                said = self.plane.request("goodbye", self.report, timeout_s=_GOODBYE_TIMEOUT_S)
+                missing = heard(Missing, said)["rows"]
                 if not missing:
                     return
                 telemetry.resend(missing, self.plane.publish_telemetry_blocking)
         except PeerError:
             pass
         # No recorder, or one that does not take it: the run directory's spool does.
-        writer = SpoolWriter(Path(self.ticket.run_dir) / "spool", self.role)
-        everything = {table: [(0, rows)] for table, rows in telemetry.totals().items()}
-        telemetry.resend(
-            everything,
-            lambda table, header, payload: writer.append(
-                notices_of(self.role) if table == NOTICES else table, first_row(header), payload
-            ),
-        )
+        writer = SpoolWriter(Path(self.ticket.run_dir) / "spool", self.plane.instance)
+
+        def spool(table: str, header: bytes, payload: bytes) -> None:
+            incarnation, first = first_row(header)
+            if table == NOTICES:
+                table, first = notices_of(self.role), notice_number(incarnation, first)
+            writer.append(table, first, payload)
+
+        telemetry.resend({table: [(0, n)] for table, n in telemetry.totals().items()}, spool)
         writer.close()
 
 

@@ -1,91 +1,70 @@
 """The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
 
-A star over TCP on loopback: the coordinator listens, everyone else connects. The loop's data never
-travels here, and nothing in the loop waits for it.
+A star over TCP on loopback: the coordinator listens, everyone else connects, with a secret that
+only follows from the run's key. The loop's data never travels here, and nothing in the loop waits
+for it.
 """
 
+import hashlib
 import json
+import secrets
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Self
 
 import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
 from noack.errors import PeerError
+from noack.io.star import Secret, cause_of, open_star
+from noack.io.ticket import Ticket
+from noack.scenario import MOST_CHANGES
 from noack.topology import COORDINATOR
 
-_LEASE_MS = 2000
-_CONNECT_MS = 5000
 
-
-def star_config(
-    endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
-) -> zenoh.Config:
-    """Return the configuration of a star's centre (``listen``), or of one who connects to it.
-
-    Args:
-        endpoint: where the centre listens, e.g. ``tcp/127.0.0.1:7447``.
-        listen: this is the centre.
-        more: further settings of zenoh by their keys.
-    """
-    config = zenoh.Config()
-    side, other = ("listen", "connect") if listen else ("connect", "listen")
-    settings: dict[str, Any] = {
-        "mode": "router" if listen else "client",
-        f"{side}/endpoints": [endpoint],
-        f"{other}/endpoints": [],
-        f"{side}/exit_on_failure": True,
-        f"{side}/timeout_ms": _CONNECT_MS,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "scouting/delay": 0,
-        # Its shared-memory path would take payloads of 3 KiB and more past the socket.
-        "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": _LEASE_MS,
-        # A batch that finds no room is dropped at once; the loop does not wait for it.
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-    }
-    for key, value in (settings | dict(more or {})).items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def cause_of(error: zenoh.ZError) -> str:
-    """Return what went wrong, in zenoh's words."""
-    # zenoh ends its messages with the place in its own source.
-    return str(error).partition(" at /")[0]
+def secret_of(ticket: Ticket) -> Secret:
+    """Return the secret of a run's plane; the run's key cannot be found from it."""
+    keyed = hashlib.blake2b(b"the control plane's password", key=ticket.key, digest_size=32)
+    return Secret(f"{ticket.run_id:016x}", keyed.hexdigest())
 
 
 class Plane:
     """One process's connection to the control plane of a run.
 
     Args:
-        run_id: the run; every key lies below ``noack/RUN``.
+        ticket: admission to the run; every key lies below ``noack/RUN``.
         role: this process.
-        endpoint: where the coordinator listens.
         listen: this is the coordinator.
 
     Raises:
         PeerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
     """
 
-    def __init__(self, run_id: int, role: str, endpoint: str, *, listen: bool = False) -> None:
-        self._prefix = f"noack/{run_id:016x}"
+    def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
+        self._prefix = f"noack/{ticket.run_id:016x}"
         self.role = role
+        self.instance = secrets.token_hex(8)
+        endpoint = ticket.endpoint
         try:
-            self.session = zenoh.open(star_config(endpoint, listen=listen))
+            self.session = open_star(endpoint, secret_of(ticket), listen=listen)
         except zenoh.ZError as error:
             verb = "listen on" if listen else "reach the run's coordinator at"
             raise PeerError(f"{role}: cannot {verb} {endpoint}: {cause_of(error)}") from None
-        self._token = self.session.liveliness().declare_token(self.key("alive", role))
+        self._token = self.session.liveliness().declare_token(
+            self.key("alive", role, self.instance)
+        )
         self._stops = self.session.declare_subscriber(self.key("stop"), RingChannel(8))
         self._stop_reason: str | None = None
         self._coordinator = self.session.liveliness().declare_subscriber(
-            self.key("alive", COORDINATOR), RingChannel(8), history=True
+            self.key("alive", COORDINATOR, "*"), RingChannel(8), history=True
         )
         self._coordinator_gone = False
+        # As many as there can be: none is ever pushed out.
+        self._changes = self.session.declare_subscriber(
+            self.key("change"), RingChannel(MOST_CHANGES)
+        )
+        self._kept = self.session.declare_subscriber(self.key("kept", role), RingChannel(1))
 
     def __enter__(self) -> Self:
         return self
@@ -121,9 +100,33 @@ class Plane:
         """Ask every process of the run to end."""
         self.session.put(self.key("stop"), reason, priority=Priority.REAL_TIME)
 
+    def say_kept(self, role: str, content: object) -> None:
+        """Tell a process what of it is on disk."""
+        self.session.put(
+            self.key("kept", role),
+            json.dumps(content),
+            congestion_control=CongestionControl.DROP,
+        )
+
+    def kept(self) -> bytes | None:
+        """The recorder's newest word on what it has of this process, if there is a new one."""
+        sample = self._kept.try_recv()
+        return None if sample is None else sample.payload.to_bytes()
+
+    def announce(self, content: object) -> None:
+        """Tell every process of the run of a change of settings."""
+        self.session.put(self.key("change"), json.dumps(content), priority=Priority.REAL_TIME)
+
+    def announced(self) -> bytes | None:
+        """The next change that was announced; None if there is none."""
+        sample = self._changes.try_recv()
+        return None if sample is None else sample.payload.to_bytes()
+
     def leave(self, reason: str) -> None:
         """Tell the coordinator that this process ends, and why; without it, it counts as dead."""
-        self.session.put(self.key("left", self.role), reason, priority=Priority.REAL_TIME)
+        self.session.put(
+            self.key("left", self.role, self.instance), reason, priority=Priority.REAL_TIME
+        )
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
         """Publish a batch; it never blocks, and is dropped when the recorder does not keep up."""
@@ -163,8 +166,8 @@ class Plane:
         *,
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
-    ) -> Any:
-        """Ask the queryable ``what/ROLE`` and return its JSON answer.
+    ) -> bytes:
+        """Ask the queryable ``what/ROLE`` and return its answer.
 
         An answer may take as long as ``timeout_s``; a queryable that does not exist yet is asked
         again.
@@ -187,8 +190,8 @@ class Plane:
                     time.sleep(0.002)
                     continue
                 if reply.ok is not None:
-                    return json.loads(reply.ok.payload.to_string())
+                    return reply.ok.payload.to_bytes()
                 if reply.err is not None:
-                    raise PeerError(reply.err.payload.to_string())
+                    raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
         raise PeerError(f"{self.role}: no answer to {what!r} within {timeout_s:g} s")

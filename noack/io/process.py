@@ -29,9 +29,10 @@ def run_process(
     with Signals().handled() as signals:
         try:
             ticket = _admission(role, session, signals)
-            with Plane(ticket.run_id, role, ticket.endpoint) as plane:
+            with Plane(ticket, role) as plane:
                 node = Node(role, ticket, plane, signals)
                 try:
+                    node.knock()
                     body(node)
                 finally:
                     plane.leave(node.ended)

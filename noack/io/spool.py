@@ -5,10 +5,11 @@ endian. A killed writer leaves at most one broken chunk at the end, which reader
 rows may come twice, from two writers; row numbers tell.
 """
 
+import contextlib
 import errno
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -38,10 +39,7 @@ class SpoolWriter:
             MachineError: the disk is full or the folder cannot be written.
         """
         try:
-            file = self._files.get(table)
-            if file is None:
-                path = self._folder / f"{table}.{self._writer}"
-                file = self._files[table] = path.open("ab", buffering=0)
+            file = self._open(table)
             chunk = _CHUNK.pack(first, len(payload)) + payload
             written = file.write(chunk)
             if written != len(chunk):  # what a full disk leaves must not be read as rows later
@@ -49,6 +47,25 @@ class SpoolWriter:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+
+    def prepare(self, tables: Iterable[str]) -> None:
+        """Open the files of tables before there is anything to write.
+
+        Raises:
+            MachineError: the folder cannot be written.
+        """
+        try:
+            for table in tables:
+                self._open(table)
+        except OSError as error:
+            raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+
+    def _open(self, table: str) -> BinaryIO:
+        file = self._files.get(table)
+        if file is None:
+            path = self._folder / f"{table}.{self._writer}"
+            file = self._files[table] = path.open("ab", buffering=0)
+        return file
 
     def close(self) -> None:
         """Close all files."""
@@ -60,10 +77,48 @@ class SpoolWriter:
 def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
     """Yield ``(first row, rows)`` of every whole batch of a table, of all writers."""
     for path in sorted(folder.glob(f"{table}.*")):
-        size = path.stat().st_size
         with path.open("rb") as file:
-            while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
-                first, length = _CHUNK.unpack(head)
-                if file.tell() + length > size:
-                    break
+            yield from _whole_chunks(file)
+
+
+class SpoolTail:
+    """Reads a spool while it is written, and what was written before its files were removed.
+
+    Args:
+        folder: the spool's directory; it need not exist yet.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: dict[str, BinaryIO] = {}
+
+    def read(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield ``(table, first row, rows)`` of every whole batch that was not read before."""
+        for path in sorted(self._folder.glob("*.*")):
+            if path.name not in self._files:
+                with contextlib.suppress(FileNotFoundError):  # removed a moment ago
+                    self._files[path.name] = path.open("rb")
+        for name, file in self._files.items():
+            for first, payload in _whole_chunks(file):
+                yield name.partition(".")[0], first, payload
+
+    def close(self) -> None:
+        """Close all files."""
+        for file in self._files.values():
+            file.close()
+        self._files.clear()
+
+
+def _whole_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield the batches that are whole; the file is left after the last of them."""
+    size = os.fstat(file.fileno()).st_size
+    while True:
+        start = file.tell()
+        head = file.read(_CHUNK.size)
+        if len(head) == _CHUNK.size:
+            first, length = _CHUNK.unpack(head)
+            if file.tell() + length <= size:
                 yield first, file.read(length)
+                continue
+        file.seek(start)
+        return

@@ -1,26 +1,64 @@
 """The telemetry buffer: rows of the record, gathered in the loop and handed over in batches.
 
 Appending a row costs well under a microsecond (one assignment into a preallocated array); handing a
-batch over is one non-blocking publication. Batches are kept until the recorder has confirmed that
-it has them all, up to a bound.
+batch over is one non-blocking publication. A batch is kept until the recorder has said that it is
+on disk, up to a bound.
 """
 
 import json
+from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 
 from noack.io.messages import BatchHeader, heard
-from noack.machine import Notice, Record
+from noack.machine import INCARNATION, Notice, Record
 
 _BATCH_ROWS = 256
 _KEPT_BYTES = 256 * 1024 * 1024
+_AGAIN_AT_ONCE = 8
+"""Batches that are sent again at a time: the loop waits meanwhile."""
+
+_Batch = tuple[str, int, int, bytes]
+"""Table, number of the first row, rows, and the rows themselves."""
 
 Publish = Callable[[str, bytes, bytes], None]
 """Takes a batch: its table, its header (JSON), its rows."""
 
 NOTICES = "notices"
+
+Ranges = Sequence[tuple[int, int]]
+"""Half-open ranges of row numbers."""
+
+
+class Received:
+    """Row numbers that have arrived, in any order, as few ranges as possible."""
+
+    def __init__(self) -> None:
+        self.ranges: list[tuple[int, int]] = []
+        """Disjoint, ascending, half-open."""
+
+    @property
+    def end(self) -> int:
+        """What follows the highest number."""
+        return self.ranges[-1][1] if self.ranges else 0
+
+    def add(self, first: int, end: int) -> None:
+        """Add the numbers from ``first`` to before ``end``."""
+        low = bisect_left(self.ranges, first, key=lambda known: known[1])
+        high = bisect_right(self.ranges, end, key=lambda known: known[0])
+        if low < high:
+            first = min(first, self.ranges[low][0])
+            end = max(end, self.ranges[high - 1][1])
+        self.ranges[low:high] = [(first, end)]
+
+    def missing(self, total: int) -> list[tuple[int, int]]:
+        """The ranges that have not arrived, of ``total`` numbers from 0."""
+        edges = [0, *(edge for known in self.ranges for edge in known), total]
+        gaps = zip(edges[::2], edges[1::2], strict=True)
+        return [(low, min(high, total)) for low, high in gaps if low < min(high, total)]
 
 
 class TelemetryBuffer:
@@ -29,14 +67,26 @@ class TelemetryBuffer:
     Args:
         tables: row type of each table that the process fills.
         publish: takes a full batch; must not block.
+        incarnation: of the process.
+        confirmed: asked for rows that are on disk.
     """
 
-    def __init__(self, tables: Mapping[str, np.dtype[np.void]], publish: Publish) -> None:
+    def __init__(
+        self,
+        tables: Mapping[str, np.dtype[np.void]],
+        publish: Publish,
+        incarnation: int = 0,
+        confirmed: Callable[[], Mapping[str, Ranges]] = dict,
+    ) -> None:
         self._publish = publish
+        self._incarnation = incarnation
+        self._confirmed = confirmed
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
         self._filled = dict.fromkeys(tables, 0)
         self._published = dict.fromkeys([*tables, NOTICES], 0)
-        self._kept: deque[tuple[str, int, int, bytes]] = deque()
+        self._kept: deque[_Batch] = deque()
+        self._lost: deque[_Batch] = deque()
+        self._old = 0
         self._kept_bytes = 0
 
     def append(self, record: Record) -> None:
@@ -57,6 +107,11 @@ class TelemetryBuffer:
         for table, filled in self._filled.items():
             if filled:
                 self._hand_over(table)
+        if rows := self._confirmed():
+            self._forget(rows)
+        for _ in range(min(len(self._lost), _AGAIN_AT_ONCE)):
+            table, first, count, payload = self._lost.popleft()
+            self._publish(table, self._header(first, count), payload)
 
     def totals(self) -> dict[str, int]:
         """Rows published so far, by table."""
@@ -75,7 +130,7 @@ class TelemetryBuffer:
         sent = 0
         for table, first, rows, payload in self._kept:
             if any(low < first + rows and first < high for low, high in missing.get(table, ())):
-                publish(table, _header(first, rows), payload)
+                publish(table, self._header(first, rows), payload)
                 sent += 1
         return sent
 
@@ -91,39 +146,44 @@ class TelemetryBuffer:
         self._kept_bytes += len(payload)
         while self._kept_bytes > _KEPT_BYTES:
             self._kept_bytes -= len(self._kept.popleft()[3])
-        self._publish(table, _header(first, rows), payload)
+            self._old = max(self._old - 1, 0)
+        self._publish(table, self._header(first, rows), payload)
+
+    def _forget(self, rows: Mapping[str, Ranges]) -> None:
+        """Keep no longer what is on disk; what should be there and is not is sent again."""
+        kept: deque[_Batch] = deque()
+        old = 0
+        for i, batch in enumerate(self._kept):
+            table, first, count, _ = batch
+            ranges = rows.get(table, ())
+            if not any(low <= first and first + count <= high for low, high in ranges):
+                kept.append(batch)
+                old += i < self._old
+        # What the recorder's last word could not know of, may have been under way.
+        self._lost = deque(islice(kept, old))
+        self._kept, self._old = kept, len(kept)
+        self._kept_bytes = sum(len(batch[3]) for batch in kept)
+
+    def _header(self, first: int, rows: int) -> bytes:
+        header = {"first": first, "rows": rows, "incarnation": self._incarnation}
+        return json.dumps(header).encode()
 
 
-def _header(first: int, rows: int) -> bytes:
-    return json.dumps({"first": first, "rows": rows}).encode()
-
-
-def first_row(header: bytes) -> int:
-    """Number of a batch's first row, from its header.
+def first_row(header: bytes) -> tuple[int, int]:
+    """Incarnation and number of a batch's first row, from its header.
 
     Raises:
         PeerError: it is no header of a batch.
     """
-    first: int = heard(BatchHeader, header)["first"]
-    return first
+    found = heard(BatchHeader, header)
+    return found.get("incarnation", 0), found["first"]
+
+
+def notice_number(incarnation: int, first: int) -> int:
+    """Number under which a process's notice is spooled; it says of which incarnation it is."""
+    return incarnation * INCARNATION + first
 
 
 def notices_of(role: str) -> str:
     """Name under which a process's notices are spooled."""
     return f"{NOTICES}_{role}"
-
-
-def missing_ranges(got: Iterable[tuple[int, int]], total: int) -> list[tuple[int, int]]:
-    """Return what lies between batches, and after the last one.
-
-    Args:
-        got: half-open ranges of row numbers that have arrived, in any order.
-        total: rows that were sent.
-    """
-    missing: list[tuple[int, int]] = []
-    following = 0
-    for first, end in sorted(got):
-        if first > following:
-            missing.append((following, first))
-        following = max(following, end)
-    return [*missing, (following, total)] if following < total else missing

@@ -1,14 +1,19 @@
 """UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
 
 import errno
-import os
 import socket
+import struct
+from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
+from typing import Generic, TypeVar
 
 from noack.errors import CallerError
 from noack.io.address import Address, text_of
+from noack.io.shield import FloodWatch, open_beside
+from noack.io.sources import SourceCount
+from noack.machine import Notice
 from noack.wire import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
 
 LOOPBACK = "127.0.0.1"
@@ -17,10 +22,21 @@ LOOPBACK = "127.0.0.1"
 # lost without a trace, and an unintended loss breaks the MANSD guarantee.
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
-_REPORTED_SOURCES = 16
-_READ_BYTES = MAX_DATAGRAM_BYTES + 1
-"""What is longer than any datagram of the loop is cut, and rejected by its length."""
+_STRANGERS_BYTES = 128 * 1024
+"""For the queue of what comes from elsewhere; the kernel doubles it. It holds some 300 datagrams,
+about as many as are looked at between two turns of housekeeping."""
+_STRANGERS_QUEUED = 4096
+"""How many of that queue are looked at in the end: all, unless the flood goes on."""
+_SO_MEMINFO = 55
+_MEMINFO_WORDS = 9
+_MEMINFO_DROPS = 8
+_IN_A_ROW = 8
+"""Datagrams that are looked at before deadlines are again: some 50 µs."""
+SHED = "shed"
+"""Why a datagram was rejected that the kernel dropped, as too many came from elsewhere."""
 MAX_UDP_BYTES = 65_535
+
+T = TypeVar("T")
 
 
 def bind(port: int, who: str, key: str, host: str = LOOPBACK) -> socket.socket:
@@ -82,73 +98,98 @@ def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
             ) from None
 
 
-def kernel_drops(endpoint: socket.socket) -> int | None:
-    """Datagrams that the kernel dropped as nobody took them in time; None if it does not say."""
-    inode = str(os.fstat(endpoint.fileno()).st_ino)
+def drops_of(endpoint: socket.socket) -> int | None:
+    """Datagrams that the kernel dropped at a socket; None if it does not say.
+
+    The count is exact whenever it is asked for, which the one that comes with datagrams
+    (SO_RXQ_OVFL) is only after one more has come; and it costs nothing per datagram.
+    """
     try:
-        lines = Path("/proc/net/udp").read_text().splitlines()
+        found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
     except OSError:
         return None
-    return next((int(f[-1]) for line in lines if (f := line.split())[9] == inode), None)
+    words = struct.unpack(f"={len(found) // 4}I", found[: len(found) // 4 * 4])
+    return words[_MEMINFO_DROPS] if len(words) > _MEMINFO_DROPS else None
 
 
-class SourceCount:
-    """Counts datagrams by source address, cheaply while the source stays the same."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[Address] = Counter()
-        self._last: Address | None = None
-        self._run = 0
-
-    def add(self, source: Address) -> None:
-        """Count one datagram."""
-        if source == self._last:
-            self._run += 1
-            return
-        self._fold()
-        self._last, self._run = source, 1
-
-    def busiest(self) -> dict[str, int]:
-        """The sources that sent most; a flood from many ports must not flood the report."""
-        self._fold()
-        return {text_of(source): n for source, n in self._counts.most_common(_REPORTED_SOURCES)}
-
-    def _fold(self) -> None:
-        if self._last is not None and self._run:
-            self._counts[self._last] += self._run
-            self._run = 0
-
-
-class CountingSocket:
+class CountingSocket(ABC, Generic[T]):
     """A bound socket with one destination that accounts for what passes through it.
 
-    It stays unconnected: a connected one would fail a send for an earlier one's ICMP error, which
-    in the network emulator is a loss beyond the cap.
+    What it sends with stays unconnected: a connected one would fail a send for an earlier one's
+    ICMP error, which in the network emulator is a loss beyond the cap.
 
     Args:
         endpoint: from :func:`bind`.
         destination: where it sends.
+        peers: who sends to it; what comes from elsewhere is kept apart (:mod:`noack.io.shield`).
     """
 
-    def __init__(self, endpoint: socket.socket, destination: Address) -> None:
+    def __init__(
+        self, endpoint: socket.socket, destination: Address, peers: Sequence[Address]
+    ) -> None:
         self._endpoint = endpoint
         self._destination = destination
-        self._sources = SourceCount()
+        self._peers = frozenset(peers)
+        self._beside = open_beside(endpoint, peers)
+        self._strange: int | None = None
+        if self._beside:
+            self._strange = endpoint.fileno()
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _STRANGERS_BYTES)
+            for one in self._beside:
+                enlarge_buffer(one)
+        self._sockets = {one.fileno(): one for one in (*self._beside, endpoint)}
+        self._everyone = list(self._sockets)
+        self._only_peers = [one.fileno() for one in self._beside]
+        self._flood = FloodWatch()
+        self._sources = SourceCount(peers)
         self._sent = 0
         self.send_errors: Counter[str] = Counter()
+        # First what came before there were sockets beside this one: it may be the peers'.
+        self.watched: Sequence[int] = self._everyone[::-1]
+        """File descriptors to wait on now, the most important first."""
 
-    def fileno(self) -> int:
-        """File descriptor to wait on."""
-        return self._endpoint.fileno()
+    @abstractmethod
+    def judge(self, data: bytes, source: Address) -> T | None:
+        """Return the message that a datagram is, None if it is none; counts what is rejected.
 
-    def take(self, most_bytes: int) -> tuple[bytes, Address] | None:
-        """Take one datagram, cut at ``most_bytes``, with its source; None if there was none."""
-        try:
-            data, source = self._endpoint.recvfrom(most_bytes)
-        except OSError:
-            return None
-        self._sources.add(source)
-        return data, source
+        Args:
+            data: as received, cut at :attr:`most_bytes`.
+            source: from where.
+        """
+
+    most_bytes = MAX_DATAGRAM_BYTES + 1
+    """What is longer than any datagram of the loop is cut, and rejected by its length."""
+
+    def receive(self, readable: int) -> T | None:
+        """Take the next message, and some datagrams before it that are none.
+
+        Args:
+            readable: which of the file descriptors has something.
+
+        Returns:
+            None if there was no message among the next few datagrams.
+        """
+        endpoint, strange = self._sockets[readable], readable == self._strange
+        for _ in range(_IN_A_ROW):
+            try:
+                data, source = endpoint.recvfrom(self.most_bytes)
+            except OSError:  # nothing there any more, or an ICMP error, which is nobody's
+                return None
+            self._sources.add(source)
+            message = self.judge(data, source)
+            if strange and source not in self._peers and self._spend():
+                return message
+            if message is not None:
+                return message
+        return None
+
+    def _spend(self) -> bool:
+        """Note that a stranger's datagram was looked at; whether it was the last for now."""
+        self._flood.left -= 1
+        if self._flood.left > 0:
+            return False
+        self.watched = self._only_peers
+        return True
 
     def put(self, data: bytes, destination: Address | None = None) -> None:
         """Send a datagram; a failure is counted, as nobody would learn of it anyway."""
@@ -158,19 +199,54 @@ class CountingSocket:
         except OSError as error:
             self.send_errors[str(error)] += 1
 
+    def tend(self, now_ns: int) -> Sequence[Notice]:
+        """Begin the next interval of housekeeping; return what the log should say of the last."""
+        if self._strange is None:
+            return ()
+        line = self._flood.next_interval(self._shed())
+        self.watched = self._everyone
+        return () if line is None else (Notice(now_ns, "info", line),)
+
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
+        self._look_at_the_rest()
+        receiving = self._beside or (self._endpoint,)
+        drops = [drops_of(one) for one in receiving]
         return {
             "local": text_of(self._endpoint.getsockname()),
             "destination": text_of(self._destination),
             "sent": self._sent,
             "send_errors": dict(self.send_errors),
-            "received_from": self._sources.busiest(),
-            "lost_in_kernel": kernel_drops(self._endpoint),
+            "received_from": self._sources.report(),
+            "shielded": bool(self._beside),
+            "lost_in_kernel": None if None in drops else sum(n for n in drops if n is not None),
         }
 
+    def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
+        """Add to what was rejected what the kernel has shed before anybody looked at it."""
+        shed = {SHED: self._shed()} if self._strange is not None else {}
+        return {reason: n for reason, n in (*by_reason.items(), *shed.items()) if n}
 
-class MessageSocket(CountingSocket):
+    def close(self) -> None:
+        """Close the sockets that it opened itself."""
+        for one in self._beside:
+            one.close()
+
+    def _shed(self) -> int:
+        return drops_of(self._endpoint) or 0
+
+    def _look_at_the_rest(self) -> None:
+        """Name what was kept waiting, so that every datagram is accounted for."""
+        if self._strange is None:
+            return
+        with suppress(OSError):
+            for _ in range(_STRANGERS_QUEUED):
+                data, source = self._endpoint.recvfrom(self.most_bytes)
+                self._sources.add(source)
+                self.judge(data, source)
+
+
+class MessageSocket(CountingSocket[Message]):
     """A process's one socket in the loop: receives one flow, sends another.
 
     Where updates are acknowledged, acknowledgements come or go beside them.
@@ -198,7 +274,8 @@ class MessageSocket(CountingSocket):
         acknowledgements: tuple[Decoder, Address] | None = None,
         acknowledges_to: Address | None = None,
     ) -> None:
-        super().__init__(endpoint, destination)
+        peers = [source] if acknowledgements is None else [source, acknowledgements[1]]
+        super().__init__(endpoint, destination, peers)
         self._decoder = decoder
         self._encoder = encoder
         self._sends = sends
@@ -206,12 +283,8 @@ class MessageSocket(CountingSocket):
         self._acknowledgements = acknowledgements
         self._acknowledges_to = acknowledges_to
 
-    def receive(self) -> Message | None:
-        """Take one datagram; None if there was none or it was rejected."""
-        taken = self.take(_READ_BYTES)
-        if taken is None:
-            return None
-        data, source = taken
+    def judge(self, data: bytes, source: Address) -> Message | None:
+        """Decode a datagram; see :class:`noack.wire.Decoder`."""
         if self._acknowledgements is not None and flow_of(data) == Flow.ACKNOWLEDGEMENT:
             decoder, peer = self._acknowledgements
             return decoder.decode(data, from_peer=source == peer)
@@ -228,7 +301,9 @@ class MessageSocket(CountingSocket):
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        report = super().report() | {"sends": self._sends.name.lower(), **self._decoder.report()}
+        report = super().report() | {"sends": self._sends.name.lower()}
+        rejected = {reason.value: n for reason, n in self._decoder.rejected.items()}
+        report |= {"accepted": self._decoder.accepted, "rejected": self.rejected(rejected)}
         if self._acknowledgements is not None:
             report["acknowledgements"] = self._acknowledgements[0].report()
         return report

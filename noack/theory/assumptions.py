@@ -11,10 +11,21 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.clock import NS_PER_S
+from noack.estimation import SteadyState, steady_state
 from noack.linear import Matrix, spectral_abscissa
 from noack.resolve import Loop, loop_of
 from noack.scenario import Scenario
 from noack.theory.certificate import Conditions, Constants
+from noack.triggers import (
+    Absolute,
+    AnyTrigger,
+    Deadline,
+    Decaying,
+    Dwell,
+    Mixed,
+    Relative,
+    SelfTriggered,
+)
 
 
 class Verdict(StrEnum):
@@ -41,18 +52,121 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
     loop = loop_of(resolved)
     return [
-        _closed_loop(loop),
+        *([_closed_loop(loop)] if resolved.is_linear else _not_linear(loop, resolved)),
         *_trigger(loop, resolved),
         *_protocol(resolved),
-        _unstable_and_distinct(loop.A),
+        *([_unstable_and_distinct(loop.A)] if resolved.is_linear else []),
         _mansd(resolved),
         _continuous_time(resolved),
+        *_disturbed(resolved),
+        *_estimated(loop, resolved),
     ]
+
+
+def _not_linear(loop: Loop, resolved: Scenario) -> list[Assumption]:
+    nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
+    return [
+        Assumption(
+            "the plant is ẋ = Ax + Bu", "eq:plant", Verdict.VIOLATED,
+            f'it is a "{resolved.plant.system.kind}": the theorems and the certificates say '
+            "nothing of it",
+        ),
+        Assumption(
+            "the gain stabilises the model", "Theorem 2", _verdict(nominal < 0),
+            f"largest real part {nominal:.3g} /s with Â + B̂K",
+        ),
+    ]  # fmt: skip
+
+
+def _disturbed(resolved: Scenario) -> list[Assumption]:
+    if not resolved.plant.disturbances:
+        return []
+    what = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
+    return [
+        Assumption(
+            "nothing disturbs the plant", "eq:plant", Verdict.VIOLATED,
+            f"{what}: the theorems and the certificates say nothing of it",
+        )
+    ]  # fmt: skip
+
+
+def _estimated(loop: Loop, resolved: Scenario) -> list[Assumption]:
+    """What an observer, or noise, makes of "the sensor measures x"."""
+    if resolved.knows_state:
+        return []
+    found = steady_state(resolved)
+    rms = float(np.sqrt(np.trace(found.covariance)))
+    how = (
+        "with noise"
+        if resolved.observer is None
+        else f"by an observer ({resolved.observer.kind}), from y of {resolved.outputs} "
+        + ("entry" if resolved.outputs == 1 else "entries")
+    )
+    measured = Assumption(
+        "the sensor measures x", "Section II", Verdict.VIOLATED,
+        f"it knows x {how}: the theorems and the certificates say nothing of that",
+    )  # fmt: skip
+    if resolved.observer is None:
+        return [measured, *_above_noise(loop, resolved, found)]
+    if not np.isfinite(found.radius):
+        why = "no steady state is found: model and covariances differ by too many magnitudes"
+        decays = Assumption("the observer's error decays", "(I − LC)e^(ÂT)", _verdict(False), why)
+        return [measured, decays]
+    comes_to = (
+        f"by noise and random disturbances alone, ‖x̂ − x‖ comes to {rms:.3g} (RMS)"
+        if found.radius < 1
+        else "‖x̂ − x‖ grows"
+    )
+    decays = Assumption(
+        "the observer's error decays", "(I − LC)e^(ÂT)", _verdict(found.radius < 1),
+        f"its spectral radius is {found.radius:.4g} a measurement in the end; {comes_to}",
+    )  # fmt: skip
+    above = _above_noise(loop, resolved, found) if found.radius < 1 else []
+    return [measured, decays, *above]
+
+
+def _above_noise(loop: Loop, resolved: Scenario, found: SteadyState) -> list[Assumption]:
+    """Whether the trigger's least threshold is above what errors of the estimate make of e_s.
+
+    That is the difference of two errors, at the last event and now: √2 times their RMS if nothing
+    is left of the one in the other, and three times that to be rarely beyond. With time the first
+    one grows as the plant does, and every threshold is reached.
+    """
+    least = least_threshold(resolved.trigger)
+    if least is None:
+        return []
+    weight = np.eye(loop.n) if loop.weight is None else loop.weight
+    size = float(np.sqrt(2 * np.trace(weight @ found.covariance @ weight.T)))
+    return [
+        Assumption(
+            "the threshold stays above the noise", "trigger", _verdict(least >= 3 * size),
+            f"it falls to {least:.3g}; what the sensor errs by makes an ‖e_s‖ of {size:.3g} (RMS) "
+            f"at once: at least {3 * size:.2g} is advised, for the noise not to transmit",
+        )
+    ]  # fmt: skip
+
+
+def least_threshold(trigger: AnyTrigger) -> float | None:
+    """Below what a trigger's threshold of ‖e_s‖_W never falls; None of one that has none."""
+    match trigger:
+        case Decaying() | SelfTriggered():
+            return trigger.floor
+        case Absolute():
+            return trigger.delta
+        case Relative():
+            return 0.0
+        case Mixed():
+            return trigger.epsilon
+        case Deadline() | Dwell():
+            return least_threshold(trigger.rule)
+        case _:
+            return None
 
 
 def _trigger(loop: Loop, resolved: Scenario) -> list[Assumption]:
     if resolved.is_decaying:
-        return [_decay_rate(loop, resolved.decaying.alpha_per_s)]
+        rate = _decay_rate(loop, resolved.decaying.alpha_per_s)
+        return [rate] if resolved.is_linear else []
     policy = resolved.trigger.policy
     return [
         Assumption(

@@ -22,7 +22,7 @@ import numpy as np
 
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 
-_LONGEST_S = 1e6
+_SHORTEST_S, _LONGEST_S = 1e-9, 1e6
 _SETTLED = 1e-3
 _ATTEMPTS = 200
 _PICARD_ROUNDS = 8
@@ -288,7 +288,9 @@ def first_passage_s(
 
 
 def _first_window_s(plant: Plant, level: float, mismatch: float, input_error: float) -> float:
-    """Where to look: twice the time at the speed of the start."""
-    start = plant.growth(1e-9, 1)
+    """Where to look: twice the time at the speed of the start, but not nearer than can matter."""
+    start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error
-    return min(2 * level / speed, _LONGEST_S) if speed > 0 else _LONGEST_S
+    if not speed > 0:
+        return _LONGEST_S
+    return min(max(2 * level / speed, _SHORTEST_S), _LONGEST_S)

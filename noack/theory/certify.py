@@ -26,6 +26,7 @@ from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains, error_gains
 
 OWN_PLANT = "the scenario's plant"
+BOX = "every plant of the uncertainty box"
 _SLOWER = 0.9
 _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 
@@ -117,28 +118,30 @@ def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
     return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
 
 
-def certify(resolved: Scenario, conditions: Conditions) -> Certificate:
-    """The certificate of a scenario's own plant."""
-    return own_plant(resolved).certificate(conditions)
+def certify(resolved: Scenario, conditions: Conditions, start_error: float = 0.0) -> Certificate:
+    """The certificate of a scenario's own plant; see :class:`Scope`."""
+    return own_plant(resolved, start_error).certificate(conditions)
 
 
-def certify_box(resolved: Scenario, conditions: Conditions) -> Certificate | None:
+def certify_box(
+    resolved: Scenario, conditions: Conditions, start_error: float = 0.0
+) -> Certificate | None:
     """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
-    scope = box(resolved)
+    scope = box(resolved, start_error)
     return None if scope is None else scope.certificate(conditions)
 
 
-def own_plant(resolved: Scenario) -> "Scope":
+def own_plant(resolved: Scenario, start_error: float = 0.0) -> "Scope":
     """A scenario's own plant."""
     loop = loop_of(resolved)
 
     def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
         return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
 
-    return Scope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at)
+    return Scope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
 
 
-def box(resolved: Scenario) -> "Scope | None":
+def box(resolved: Scenario, start_error: float = 0.0) -> "Scope | None":
     """All plants in the scenario's uncertainty box; None if it has none."""
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
@@ -150,7 +153,7 @@ def box(resolved: Scenario) -> "Scope | None":
         return BoxGains(error, loop.A_model, loop.B_model, half_A, half_B, start, alpha_per_s)
 
     closed_loop = loop.A_model + loop.B_model @ loop.K
-    return Scope("every plant of the uncertainty box", resolved, closed_loop, plant_at)
+    return Scope(BOX, resolved, closed_loop, plant_at, start_error)
 
 
 def outside_box(resolved: Scenario) -> str | None:
@@ -181,11 +184,20 @@ class Scope:
         resolved: the scenario.
         closed_loop: A + BK, the box's centre for a box, (n, n).
         plant_at: gives their gains.
+        start_error: at the start the plant feels an input already, of an earlier run: sup‖u − Kx‖,
+            scaled, as long as it does. The certificate stands only if its own π is no less, and
+            then that input is one of those it is about.
     """
 
     def __init__(
-        self, name: str, resolved: Scenario, closed_loop: Matrix, plant_at: PlantAt
+        self,
+        name: str,
+        resolved: Scenario,
+        closed_loop: Matrix,
+        plant_at: PlantAt,
+        start_error: float = 0.0,
     ) -> None:
+        self._start_error = start_error
         self.name = name
         self._resolved = resolved
         self._loop = loop_of(resolved)
@@ -213,6 +225,12 @@ class Scope:
             first, void = None, str(error)
         except (OverflowError, np.linalg.LinAlgError):
             first, void = None, _TOO_LARGE
+        if first is not None and first.input_error < self._start_error:
+            void = (
+                f"at its start the input was {self._start_error:.3g} from Kx, and a certificate "
+                f"is of {first.input_error:.3g} at the most"
+            )
+            first, late = None, None
         if not all(_finite(constants) for constants in (first, late)):
             first, late, void = None, None, _TOO_LARGE
         assumptions = certificate_assumptions(
@@ -312,7 +330,8 @@ class Scope:
         key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
         if key not in self._plants:
             self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
-        return solve(error, self._plants[key], conditions, level, background or Background())
+        background = background or Background(input_error=self._start_error)
+        return solve(error, self._plants[key], conditions, level, background)
 
 
 def _finite(constants: Constants | None) -> bool:

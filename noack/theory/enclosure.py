@@ -32,6 +32,9 @@ _SAG = 0.005
 """By how much of ‖e^{Gτ}D‖ a chord may lie below it for a step to be longer than that."""
 _CELLS_PER_BLOCK = 256
 _MOST_CELLS = 60_000
+_MOST_ENTRIES = 4_000_000
+"""Of all matrices of a response: many states have fewer cells, and what is beyond them counts by
+its bound, which is looser."""
 _TAIL_SHARE = 1e-5
 
 
@@ -164,6 +167,7 @@ def response(generator: Matrix, D: Matrix) -> Response:
     parts: list[Stack] = []
     edges: list[Stack] = [np.zeros(1)]
     area, t_s, state, cells = 0.0, 0.0, D, 0
+    most_cells = min(_MOST_CELLS, _MOST_ENTRIES // D.size)
     usual_s = _STEP / _fastest(generator)
     step_s = usual_s * _FIRST_STEP / _STEP
     while True:
@@ -174,7 +178,7 @@ def response(generator: Matrix, D: Matrix) -> Response:
         area += step_s * float(frobenius_norms(states[:-1]).sum())
         cells += _CELLS_PER_BLOCK
         rest = float(decay.bounds(everything, state[None])[0]) / decay.rate_per_s
-        if rest <= _TAIL_SHARE * area or cells >= _MOST_CELLS:
+        if rest <= _TAIL_SHARE * area or cells >= most_cells:
             break
         while step_s > usual_s and not _straight(generator, state, step_s, decay):
             step_s /= 2

@@ -7,14 +7,17 @@ By (I1), e_c = e_s + Σ e^{H(t−t_k)} e_s(t_k⁻) over the missing events. Two 
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.linear import Matrix, Propagator, Vector, norm
+from noack.linear import Matrix, Propagator, Vector, norm, row_norms
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.policy import Policy
+
+_CACHED_AGES = 4096
 
 
 class ErrorBounds(NamedTuple):
@@ -48,7 +51,8 @@ class ErrorMonitor:
         self._thens_ns = np.zeros(0, dtype=np.int64)
         self._thresholds = np.zeros(0)
         self._jumps = np.zeros((0, n))  # e^{H(t−t_k)} e_s(t_k⁻)
-        self._growth: dict[int, float] = {}
+        # Measurements lie on a grid, so that few ages occur.
+        self._grown = lru_cache(_CACHED_AGES)(self._growth)
 
     def sample(self, t_ns: int, e_s: Vector, event: int, received: int) -> ErrorBounds:
         """Take a measurement.
@@ -69,7 +73,7 @@ class ErrorMonitor:
         ages_ns = (t_ns - self._thens_ns).tolist()
         growths = np.array([self._grown(age_ns) for age_ns in ages_ns])
         return ErrorBounds(
-            identity + float(np.linalg.norm(self._jumps @ self._weight.T, axis=1).sum()),
+            identity + float(row_norms(self._jumps @ self._weight.T).sum()),
             self._threshold(t_ns) + float(growths @ self._thresholds),
         )
 
@@ -88,9 +92,7 @@ class ErrorMonitor:
             self._sequences, self._thens_ns = self._sequences[kept], self._thens_ns[kept]
             self._thresholds, self._jumps = self._thresholds[kept], self._jumps[kept]
 
-    def _grown(self, age_ns: int) -> float:
-        """‖e^{Hτ}‖_W; measurements lie on a grid, so that few ages occur."""
-        if age_ns not in self._growth:
-            moved = self._weight @ self._propagate.transition(age_ns) @ self._inverse
-            self._growth[age_ns] = float(np.linalg.norm(moved, 2))
-        return self._growth[age_ns]
+    def _growth(self, age_ns: int) -> float:
+        """‖e^{Hτ}‖_W."""
+        moved = self._weight @ self._propagate.transition(age_ns) @ self._inverse
+        return float(np.linalg.norm(moved, 2))

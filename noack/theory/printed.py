@@ -15,7 +15,7 @@ import numpy as np
 
 from noack.linear import Matrix, Vector, spectral_abscissa
 from noack.resolve import Loop
-from noack.theory.enclosure import response, response_until
+from noack.theory.enclosure import NotDecayingError, response, response_until
 
 _SHARE, _NEAREST = 1e-2, 0.98
 _CELLS = 256
@@ -63,13 +63,16 @@ def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theo
         return _theorem_2(loop, beta, alpha_per_s, delta, rate)
 
     # c grows without bound towards the one end, 1/(ᾱ − α) towards the other.
-    best = minimize_scalar(
-        lambda share: -at(share).inter_event_s,
-        bounds=(0.0, _NEAREST),
-        method="bounded",
-        options={"xatol": _SHARE},
-    )
-    found = at(float(best.x))
+    try:
+        best = minimize_scalar(
+            lambda share: -at(share).inter_event_s,
+            bounds=(0.0, _NEAREST),
+            method="bounded",
+            options={"xatol": _SHARE},
+        )
+        found = at(float(best.x))
+    except NotDecayingError:  # to working precision, which c would need
+        return None
     sizes = (found.c, found.state_start, found.state_forced)
     return None if math.isnan(found.inter_event_s) or not all(map(math.isfinite, sizes)) else found
 
@@ -115,8 +118,9 @@ def longest_interval_s(interval: Interval, beta: float, alpha_per_s: float, kapp
     zeta = float((interval.model_norm * np.exp(kappa * passed_s)).max())
     level = beta * math.exp(-alpha_per_s * float(interval.t_s[0]))
     found_s = math.inf
-    for gamma in np.geomspace(1e-3, 1e3, 61):
-        eta = float((interval.x_norm * np.exp(-gamma * passed_s)).min())
+    gammas = np.geomspace(1e-3, 1e3, 61)
+    etas = (interval.x_norm * np.exp(-gammas[:, None] * passed_s)).min(axis=1)
+    for gamma, eta in zip(gammas.tolist(), etas.tolist(), strict=True):
         if eta > 0:
             ratio = (max(zeta, eta) + level) / eta
             found_s = min(found_s, math.log(ratio) / (gamma + min(kappa, alpha_per_s)))

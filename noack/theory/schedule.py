@@ -39,6 +39,11 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     )
 
 
+def allowed_conditions(resolved: Scenario) -> Conditions:
+    """The conditions of a scenario's certificates: its own schedule, with its allowance."""
+    return nominal_conditions(resolved, resolved.certificate.late_periods)
+
+
 def ideal_conditions(resolved: Scenario) -> Conditions:
     """The paper's: a trigger that watches always, an instant network, an input that is not held."""
     return Conditions(dropouts=resolved.network.mansd)

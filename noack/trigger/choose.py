@@ -42,10 +42,10 @@ def policy_of(resolved: Scenario) -> Policy:
     Raises:
         CallerError: it needs a closed loop Â + B̂K that is stable, and this one is not.
     """
-    return _policy(resolved.trigger, loop_of(resolved))
+    return _policy(resolved.trigger, resolved)
 
 
-def _policy(trigger: AnyTrigger, loop: Loop) -> Policy:
+def _policy(trigger: AnyTrigger, resolved: Scenario) -> Policy:
     W = None if trigger.weight is None else np.array(trigger.weight)
     match trigger:
         case Decaying():
@@ -61,11 +61,12 @@ def _policy(trigger: AnyTrigger, loop: Loop) -> Policy:
                 np.array(trigger.Q), _ns(trigger.period_s), trigger.epsilon, trigger.heartbeat, W
             )
         case Lyapunov():
-            P = _lyapunov(loop, trigger.Q)[0]
+            P = _lyapunov(loop_of(resolved), trigger.Q)[0]
             return LyapunovTrigger(
                 np.ascontiguousarray(np.linalg.cholesky(P).T), trigger.rate_per_s, W
             )
         case Dynamic():
+            loop = loop_of(resolved)
             P, Q = _lyapunov(loop, trigger.Q)
             return DynamicTrigger(
                 trigger.sigma, trigger.theta_s, trigger.decay_per_s, P, Q,
@@ -80,9 +81,9 @@ def _policy(trigger: AnyTrigger, loop: Loop) -> Policy:
                 _ns(trigger.shortest_s), _ns(trigger.longest_s), W,
             )  # fmt: skip
         case Deadline():
-            return DeadlineTrigger(_policy(trigger.rule, loop), _ns(trigger.interval_s))
+            return DeadlineTrigger(_policy(trigger.rule, resolved), _ns(trigger.interval_s))
         case Dwell():
-            return DwellTrigger(_policy(trigger.rule, loop), _ns(trigger.interval_s))
+            return DwellTrigger(_policy(trigger.rule, resolved), _ns(trigger.interval_s))
 
 
 def _lyapunov(loop: Loop, given: Rows | None) -> tuple[Matrix, Matrix]:

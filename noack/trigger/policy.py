@@ -52,15 +52,23 @@ class Trigger:
         self._reserve = policy.first_reserve
         self._gain = 0.0
         self._seen_ns = 0
+        self._began: tuple[int, Vector] | None = None
 
     def start(self, t_ns: int, x: Vector) -> None:
         """Begin, or begin anew after an event, at a state of shape (n,)."""
-        self._guard = self._policy.guards(len(x)).after(t_ns, x)
+        self.renew(t_ns, x)
         self._see(t_ns, x, np.zeros_like(x))
 
     def renew(self, t_ns: int, x: Vector) -> None:
         """Take the rule that follows an event of the past, known now to have reset the model."""
+        self._began = (t_ns, x)
         self._guard = self._policy.guards(len(x)).after(t_ns, x)
+
+    def change(self, policy: Policy) -> None:
+        """Go on with another policy, as if it had been this one at the last event, too."""
+        self._policy = policy
+        if self._began is not None:
+            self.renew(*self._began)
 
     def test(self, t_ns: int, x: Vector, e_s: Vector) -> Verdict:
         """Say of a measurement whether it is an event; :meth:`start` comes first.

@@ -6,17 +6,21 @@ from typing import Any
 
 import pytest
 
-from benchmarks import demo_run, latency, lateness, machines, startup
+from benchmarks import demo_run, latency, lateness, machines, plants, startup
 from benchmarks._report import Benchmark, MeasurementError
 from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS, Ticks
 from benchmarks.latency import Sample
 from benchmarks.lateness import Kernel
+from cosim.progress import account_line
 
 NAMES = (
-    "demo_run", "latency", "lateness", "startup", "machines", "simulation", "batch", "campaign",
-    "relays", "relay_delay", "relay_flows", "relay_soak",
+    "demo_run", "flood", "latency", "lateness", "startup", "recovery", "machines", "plants",
+    "simulation", "batch", "campaign", "relays", "relay_delay", "relay_flows", "relay_soak",
 )  # fmt: skip
+ACCOUNT = {
+    "t_s": 0.0, "events": 1, "deliveries": 1, "longest_drop_run": 0, "x_norm": 1.0, "live": None,
+}  # fmt: skip
 KERNEL = Kernel(12.0, 20.0, 60.0)
 ROOT = Path(__file__).parents[2]
 
@@ -106,11 +110,11 @@ def test_lateness_is_not_judged_without_sched_fifo_or_cyclictest(
 def test_the_first_step_is_bounded_by_the_promptest_progress_line() -> None:
     lines = [
         Line(100.9, "noack: something else"),
-        Line(102.0, "t   0.250 s  events 1  delivered 1"),
-        Line(102.2, "t   0.500 s  events 1  delivered 1"),  # an epoch at 101.7 or before
-        Line(103.0, "t   1.000 s  events 2  delivered 1"),
+        Line(102.0, account_line(ACCOUNT | {"t_s": 0.25}, 20.0)),
+        Line(102.2, account_line(ACCOUNT | {"t_s": 0.5}, 20.0)),  # an epoch at 101.75 or before
+        Line(103.0, account_line(ACCOUNT | {"t_s": 1.0}, 20.0)),
     ]
-    assert first_step_s(100.0, lines) == pytest.approx(1.7)
+    assert first_step_s(100.0, lines) == pytest.approx(1.75)
 
 
 def test_without_a_progress_line_there_is_no_first_step() -> None:
@@ -159,6 +163,18 @@ def test_each_case_gives_a_row_with_its_alternative() -> None:
         assert row.peer is not None
         assert row.ratio is not None
         assert row.goal is None
+
+
+def test_a_plants_step_is_held_against_its_period_and_a_linear_plants() -> None:
+    for case in plants.CASES:
+        ours, linear = plants.timed(case, count=20, pace_ns=0, asked=False)
+        assert len(ours.us) == len(linear.us) == 19
+        p50, p99, share = plants.rows_of(case, ours, linear)
+        assert p50.peer is not None
+        assert p50.value is not None
+        assert p99.value is not None
+        assert p50.value <= p99.value
+        assert share.value == pytest.approx(p99.value / 20)  # per cent of 2 ms of wall time
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a git repository")

@@ -21,10 +21,14 @@ K = np.array([[1.5, -0.7], [0.1, 2.0], [0.0, 1.0]])
 
 
 def new_controller(
-    mansd: int = 2, x0: np.ndarray | None = None, phase_ns: int = MS, horizon_ns: int = 10**9
+    mansd: int = 2,
+    x0: np.ndarray | None = None,
+    phase_ns: int = MS,
+    horizon_ns: int = 10**9,
+    **more: Any,
 ) -> Controller:
     return Controller(
-        H, K, period_ns=2 * MS, phase_ns=phase_ns, horizon_ns=horizon_ns, mansd=mansd, x0=x0
+        H, K, period_ns=2 * MS, phase_ns=phase_ns, horizon_ns=horizon_ns, mansd=mansd, x0=x0, **more
     )
 
 
@@ -123,7 +127,8 @@ def test_an_update_that_is_newer_than_the_model_takes_it_along() -> None:
     np.testing.assert_allclose(row["x_c_before"], propagated(x0, 6 * MS), rtol=1e-13)
     for t_ns in (MS, 3 * MS, 5 * MS):  # caught up, but the model does not go back
         message, row = tick(controller)
-        assert message.t_ns == t_ns
+        assert row["t_ns"] == t_ns
+        assert message.t_ns == 6 * MS  # that of the model behind it
         assert row["model_t_ns"] == 6 * MS
         assert row["x_c"].tolist() == [1.0, -2.0]
     _, row = tick(controller)
@@ -225,6 +230,34 @@ def test_without_a_known_start_the_model_is_at_rest() -> None:
     message, row = tick(new_controller())
     assert message.vector.tolist() == [0.0, 0.0, 0.0]
     assert row["x_c"].tolist() == [0.0, 0.0]
+
+
+def test_a_controller_puts_out_its_safe_input_until_it_knows_a_state() -> None:
+    safe = np.array([0.1, -0.2, 0.3])
+    controller = new_controller(safe_input=safe)
+    for _ in range(3):
+        message, row = tick(controller)
+        assert message.vector.tobytes() == row["u"].tobytes() == safe.tobytes()
+    controller.handle(update(2, 4 * MS), 6 * MS)
+    message, row = tick(controller)
+    assert message.vector.tobytes() == (K @ controller.x_c).tobytes() == row["u"].tobytes()
+
+
+def test_a_controller_that_knows_the_start_needs_no_safe_input() -> None:
+    x0 = np.array([0.3, -1.7])
+    message, _ = tick(new_controller(x0=x0, safe_input=np.full(3, 9.0)))
+    np.testing.assert_allclose(message.vector, K @ propagated(x0, MS), rtol=1e-13)
+
+
+def test_an_actuation_carries_the_state_that_it_was_computed_from() -> None:
+    """And its time, although a newer update took the model ahead of a late tick."""
+    controller = new_controller(predictive=True, safe_input=np.full(3, 0.5))
+    message, _ = tick(controller)
+    assert message.vector.tolist() == [0.5, 0.5, 0.5, 0.0, 0.0]
+    controller.handle(update(0, 20 * MS), 21 * MS)
+    message, row = tick(controller)
+    assert (message.t_ns, row["t_ns"]) == (20 * MS, 3 * MS)
+    assert message.vector.tobytes() == np.append(row["u"], [1.0, -2.0]).tobytes()
 
 
 def test_inputs_are_numbered_in_their_order() -> None:

@@ -289,3 +289,23 @@ def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
     done = noack("compare", tmp_path)
     assert done.exit_code == 2
     assert "not a run directory" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        (SENSOR_MEASUREMENT, "t_ns", 2**62),
+        (SENSOR_MEASUREMENT, "t_ns", -(2**63)),
+        (CONTROLLER_STEP, "model_t_ns", 2**63 - 1),
+        (CONTROLLER_DELIVERY, "model_t_ns", -1),
+    ],
+)
+def test_a_record_with_times_that_no_run_has_is_not_compared(
+    table: str, column: str, value: int
+) -> None:
+    record = lane()
+    rows = {name: record[name].copy() for name in record.tables}
+    rows[table][column][len(rows[table]) // 2] = value
+    damaged = RunRecord(record.scenario, rows, [], record.reports)
+    with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
+        compare(damaged)

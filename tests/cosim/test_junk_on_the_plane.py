@@ -34,18 +34,20 @@ def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
         barrier = coordinator.Coordinator(ticket)
     plane.put("progress", Sample("progress", junk))
     assert barrier.progress() is None
-    bad = Query("noack/0/join/plant", junk)
-    plane.put("join", bad)
-    barrier.poll()
-    assert bad.error is not None
-    assert bad.error.startswith("plant cannot join: ")
+    for question in ("admit", "join"):
+        bad = Query(f"noack/0/{question}/plant", junk)
+        plane.put(question, bad)
+        barrier.poll()
+        assert bad.error is not None
+        assert bad.error.startswith("plant cannot join: ")
     for number, role in enumerate((*LOOP_ROLES, RECORDER)):
         address = None if role == RECORDER else ["127.0.0.1", 1 + number]
-        hello = json.dumps({"pid": 1, "address": address}).encode()
-        plane.put("join", Query(f"noack/0/join/{role}", hello))
-    barrier.poll()
+        hello = json.dumps({"pid": 1, "instance": role, "address": address}).encode()
+        for question in ("admit", "join"):
+            plane.put(question, Query(f"noack/0/{question}/{role}", hello))
+            barrier.poll()
     assert barrier.epoch_ns is not None
-    assert plane.answers[0]["addresses"].keys() == set(LOOP_ROLES)
+    assert plane.answers[-1]["addresses"].keys() == set(LOOP_ROLES)
 
 
 @pytest.mark.parametrize("junk", JUNK)

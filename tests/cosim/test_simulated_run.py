@@ -51,6 +51,17 @@ def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
     }
 
 
+def test_who_wants_no_report_gets_none_and_may_have_it_later(tmp_path: Path) -> None:
+    settings = [word for setting in SHORT for word in ("--set", setting)]
+    done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
+    assert done.exit_code == 0, done.output
+    assert "report.html" not in done.stdout
+    report = (tmp_path / "latest").resolve() / "report.html"
+    assert not report.exists()
+    assert noack("report", "--runs", str(tmp_path)).exit_code == 0
+    assert report.exists()
+
+
 def test_the_record_on_disk_is_the_simulators(runs: Path) -> None:
     again, loaded = simulate(resolve(load(PATH, SHORT))), load_record(runs / "latest")
     assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)

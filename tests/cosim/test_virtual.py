@@ -151,7 +151,26 @@ def test_a_violated_assumption_is_noticed_by_the_controller(busy_content: dict[s
     assert record.notices
     assert {notice["process"] for notice in record.notices} == {"controller"}
     assert {notice["level"] for notice in record.notices} == {"violation"}
-    assert summarise(record, 0, "horizon")["assumption_violations"]
+    deliveries = record[CONTROLLER_DELIVERY]
+    long_gaps = deliveries[deliveries["dropouts"] > 0]
+    violations = summarise(record, 0, "horizon")["assumption_violations"]
+    assert len(violations) == len(long_gaps) > 0
+    for violation, gap in zip(violations, long_gaps, strict=True):
+        assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
+        assert violation["process"] == "controller"
+        assert f"{gap['dropouts']} successive dropouts" in violation["what"]
+
+
+def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str, Any]) -> None:
+    loss = {"model": "worst_case"}
+    busy_content["network"] = {"mansd": 2, "enforce_mansd": False, "loss": loss}
+    record = simulate(resolve(validate(busy_content, "test")))
+    summary = summarise(record, 0, "horizon")
+    (violation,) = summary["assumption_violations"]
+    events = record[SENSOR_MEASUREMENT]
+    event_ns = events["t_ns"][events["event"] >= 0]
+    assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)  # t_0 passes, two may be lost
+    assert summary["longest_drop_run"] == len(event_ns) - 1 > 2
 
 
 def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:

@@ -65,13 +65,19 @@ class FakePlane:
 
     def __init__(self) -> None:
         self.session = self
+        self.instance = "fake"
         self.answers: list[Any] = []
+        self.announced: list[Any] = []
+        self.kept: dict[str, Any] = {}
+        """What each process was told last that is on disk."""
         self._channels: dict[str, _Channel] = {}
 
     def key(self, *parts: str) -> str:
         return "/".join(parts)
 
-    def declare_subscriber(self, key: str, handler: object = None) -> _Channel:
+    def declare_subscriber(
+        self, key: str, handler: object = None, *, history: bool = False
+    ) -> _Channel:
         return self._channels.setdefault(key.partition("/")[0], _Channel())
 
     declare_queryable = declare_subscriber
@@ -89,6 +95,12 @@ class FakePlane:
 
     def refuse(self, query: Query, reason: str) -> None:
         query.reply_err(reason)
+
+    def announce(self, content: Any) -> None:
+        self.announced.append(json.loads(json.dumps(content)))
+
+    def say_kept(self, role: str, content: Any) -> None:
+        self.kept[role] = json.loads(json.dumps(content))
 
     def request_stop(self, reason: str) -> None:
         pass

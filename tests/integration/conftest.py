@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import psutil
 import pytest
 
 EPHEMERAL = ("--set", "ports={}")
+BARE = (*EPHEMERAL, "--no-report")
+"""Nobody looks at most of these runs; what wants a report says ``--report``."""
 ROLE_MODULES = {
     "recorder": "cosim.recorder",
     "netem": "netem",
@@ -21,7 +24,7 @@ ROLE_MODULES = {
     "sensor": "sensor_node",
     "controller": "controller_node",
 }
-PATIENCE_S = 60.0
+PATIENCE_S = 150.0
 
 
 def noack_command(*arguments: str) -> list[str]:
@@ -44,11 +47,43 @@ def settings(**values: object) -> list[str]:
     return pairs
 
 
+def command_of(process: psutil.Process) -> list[str]:
+    """A process's command line; of one that has ended, or has only just been forked, nothing."""
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:  # a zombie, too
+        return []
+
+
+def is_over(process: psutil.Process) -> bool:
+    """Whether a process has ended; its parent need not have noticed."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
+def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
+    """The process of a role that a launcher has started; None if there is none at the moment."""
+    for child in psutil.Process(parent.pid).children():
+        if ROLE_MODULES[role] in command_of(child):
+            return child
+    return None
+
+
+RATE_HZ = 100.0
+AT_RATE = settings(plant__rate_hz=RATE_HZ, controller__rate_hz=RATE_HZ)
+"""A fifth of the scenario's: where the rate is not the point, five processes need less of a CPU."""
+
+
+def private_files(folder: Path) -> list[Path]:
+    """What is kept for the user alone, whose runtime directory a folder is."""
+    return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]
+
+
 def run_scenario(runs: Path, *arguments: str) -> Finished:
     done = subprocess.run(
-        noack_command(
-            "run", "lane_following", "--json", "--runs", str(runs), *EPHEMERAL, *arguments
-        ),
+        noack_command("run", "lane_following", "--json", "--runs", str(runs), *BARE, *arguments),
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
@@ -73,9 +108,15 @@ class Running:
 
     def child(self, role: str) -> psutil.Process:
         for child in self._children:
-            if ROLE_MODULES[role] in child.cmdline():
+            if ROLE_MODULES[role] in command_of(child):
                 return child
         raise AssertionError(f"no process of {role}")
+
+    def udp_port(self, role: str) -> int:
+        """Where a process of the loop hears whoever sends to it."""
+        connections = self.child(role).net_connections("udp4")
+        (port,) = {one.laddr.port for one in connections if not one.raddr}
+        return int(port)
 
     def finish(self) -> Finished:
         stdout, stderr = self.process.communicate(timeout=PATIENCE_S)
@@ -90,8 +131,8 @@ class Running:
         return error
 
     def left_behind(self) -> list[psutil.Process]:
-        _, alive = psutil.wait_procs(self._children, timeout=10)
-        return alive
+        _, alive = psutil.wait_procs(self._children, timeout=PATIENCE_S)
+        return [child for child in alive if not is_over(child)]
 
 
 def wait_for(condition: Callable[[], bool]) -> None:
@@ -104,26 +145,60 @@ def wait_for(condition: Callable[[], bool]) -> None:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
     """Start ``noack run`` in the background; whatever is left is killed at the end."""
+    with begun(tmp_path) as begin:
+        yield begin
+
+
+@contextmanager
+def begun(folder: Path) -> Iterator[Callable[..., Running]]:
+    """What ``start`` is, for fixtures of a module."""
     started: list[Running] = []
 
     def begin(*arguments: str, command: tuple[str, ...] = ("run", "lane_following")) -> Running:
         process = subprocess.Popen(
-            noack_command(
-                *command, "--json", "--runs", str(tmp_path / "runs"), *EPHEMERAL, *arguments
-            ),
+            noack_command(*command, "--json", "--runs", str(folder / "runs"), *BARE, *arguments),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+            env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
         )
-        running = Running(tmp_path / "runs", process)
+        running = Running(folder / "runs", process)
         started.append(running)
         return running
 
+    try:
+        yield begin
+    finally:
+        for running in started:
+            if running.process.poll() is None:
+                for child in psutil.Process(running.process.pid).children(recursive=True):
+                    child.kill()
+                running.process.kill()
+            running.process.communicate()
+
+
+@pytest.fixture
+def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+    """Start one process as a person would; whatever is left is killed at the end."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(role: str) -> subprocess.Popen[str]:
+        started.append(_start_by_hand(role, tmp_path))
+        return started[-1]
+
     yield begin
-    for running in started:
-        if running.process.poll() is None:
-            for child in psutil.Process(running.process.pid).children(recursive=True):
-                child.kill()
-            running.process.kill()
-        running.process.communicate()
+    for process in started:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+def _start_by_hand(role: str, tmp_path: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        noack_command(role, "--json"),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+    )

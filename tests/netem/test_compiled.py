@@ -128,7 +128,7 @@ def assert_equal(decided: Any, verdicts: Any, state: State) -> None:
     assert decided.state.link.tolist() == astuple(state.link)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     links,
     st.lists(

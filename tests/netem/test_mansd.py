@@ -164,7 +164,7 @@ def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: An
     assert link.counters.longest_run == in_force
 
 
-@settings(max_examples=600)
+@settings(max_examples=150)
 @given(links, arrivals, st.integers(0, 100))
 def test_never_more_than_mansd_in_a_row_are_not_delivered(
     settings: LinkSettings, steps: list[tuple[int, int]], seed: int
@@ -174,7 +174,7 @@ def test_never_more_than_mansd_in_a_row_are_not_delivered(
     assert_kept(settings, link, observer, sent)
 
 
-@settings(max_examples=600)
+@settings(max_examples=150)
 @given(links, arrivals, st.integers(0, 2**32), st.sampled_from([0.1, 0.5, 0.9]))
 def test_nor_when_the_shell_is_late(
     settings: LinkSettings, steps: list[tuple[int, int]], seed: int, share: float
@@ -186,7 +186,7 @@ def test_nor_when_the_shell_is_late(
     assert_kept(settings, link, observer, sent)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
 def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count: int) -> None:
     """Times of arrival in any order, timers served too early: the guarantee needs no clock."""
@@ -206,7 +206,7 @@ def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count
         assert observer.longest_run(flow, of_flow) <= (settings.mansd or 0)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32))
 def test_nor_when_the_impairments_change(
     stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int
@@ -224,7 +224,7 @@ def test_nor_when_the_impairments_change(
     assert_kept(first, link, observer, sent)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.lists(links, min_size=2, max_size=4), arrivals, st.integers(0, 2**32))
 def test_another_cap_holds_from_when_it_is_in_force(
     stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int
@@ -277,7 +277,7 @@ def test_nor_when_anything_is_repeated(
     assert_kept(settings, link, observer, sent)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(links, arrivals)
 def test_without_a_cap_the_first_is_still_delivered(
     settings: LinkSettings, steps: list[tuple[int, int]]
@@ -315,7 +315,7 @@ def longest_run_of(releases: Sequence[int | None]) -> int:
     return max(b - a - 1 for a, b in itertools.pairwise(borders))
 
 
-@settings(max_examples=400)
+@settings(max_examples=120)
 @given(st.lists(st.none() | st.integers(0, 12), max_size=24), st.integers(0, 4))
 def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
     wishes: list[int | None], mansd: int

@@ -13,6 +13,7 @@ from noack.linear import (
     Propagator,
     discretise,
     norm,
+    row_norms,
     spectral_abscissa,
     transition,
 )
@@ -159,3 +160,21 @@ def test_the_abscissa_is_the_largest_real_part() -> None:
     # Eigenvalues −0.5 ± 3i and −2, from the block structure.
     matrix = np.array([[-0.5, 3.0, 1.0], [-3.0, -0.5, 4.0], [0.0, 0.0, -2.0]])
     assert spectral_abscissa(matrix) == pytest.approx(-0.5, rel=ROUNDING)
+
+
+def test_row_norms_are_numpys_where_squares_are_numbers() -> None:
+    rows = np.random.default_rng(1).normal(size=(100, 5)) * np.logspace(-130, 130, 100)[:, None]
+    assert row_norms(rows).tobytes() == np.linalg.norm(rows, axis=1).tobytes()
+
+
+@pytest.mark.parametrize("size", [1e300, 1e160, 1e-160, 1e-300, 5e-324])
+def test_row_norms_neither_overflow_nor_vanish(size: float) -> None:
+    rows = np.array([[3.0, 4.0], [0.0, -2.0], [0.0, 0.0]]) * size
+    expected = [norm(row) for row in rows]
+    np.testing.assert_allclose(row_norms(rows), expected, rtol=1e-12)
+
+
+def test_row_norms_of_what_is_not_finite_are_not_finite() -> None:
+    with np.errstate(invalid="ignore"):
+        found = row_norms(np.array([[np.inf, 1.0], [np.nan, 1.0], [1.0, 0.0]]))
+    np.testing.assert_array_equal(found, [np.inf, np.nan, 1.0])

@@ -86,6 +86,19 @@ LANE_MISTAKES = [
     ("ports.recorder=9", "ports.recorder = 9: unknown key; ", "control, controller, netem"),
     ("realtime.spin=9", "realtime.spin = 9: unknown key; ", "did you mean spin_us?"),
     ("model.parameters.a13=1", "model.parameters.a13 = 1: ", "a11, a12, a21, a22, b1, b2"),
+    ("plant.watchdog.timeout=1", "plant.watchdog.timeout = 1: unknown key; ", "timeout_s"),
+    ("plant.watchdog.policy=off", 'plant.watchdog.policy = "off": ', "hold.*zero.*model"),
+    ("plant.watchdog.timeout_s=0", "plant.watchdog.timeout_s = 0: ", "greater than 0"),
+    (
+        "plant.watchdog.timeout_s=0.001",
+        "plant.watchdog.timeout_s = 0.001: ",
+        "shorter than a period of the controller .0.002 s.",
+    ),
+    (
+        "controller.safe_input=[1.0]",
+        "controller.safe_input = [1.0]: ",
+        "expected 2 entries .one per input., found 1",
+    ),
     # Types.
     ("horizon_s=20 s", 'horizon_s = "20 s": ', "should be a valid number"),
     ("trigger.beta=true", "trigger.beta = true: ", "should be a valid number"),
@@ -120,7 +133,7 @@ LANE_MISTAKES = [
     ("plant.draw=corner", 'plant.draw = "corner": ', "'nominal', 'uniform', 'vertex' or 'given'"),
     ("trigger.policy=decayin", 'trigger.policy = "decayin": ', "did you mean decaying?"),
     ("network.initial_sync=0", "network.initial_sync = 0: ", "'first_packet' or 'known_state'"),
-    ("model.name=lane", 'model.name = "lane": ', "'lane_following' or 'double_integrator'"),
+    ("model.name=lane", 'model.name = "lane": ', "'single_track_lane' or 'double_integrator'"),
     ("network.loss.model=bernouli", 'network.loss.model = "bernouli": ', "did you mean bernoulli?"),
     ("network.loss.model=3", "network.loss.model = 3: ", "one of .*bernoulli"),
     ("network.loss={}", "network.loss.model: missing; ", "one of .*bernoulli"),

@@ -8,12 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from noack.linear import Matrix, Vector
 from noack.machine import Record
 from noack.records import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.resolve import resolve
 from noack.scenario_file import validate
 from noack.wire import Flow, Message
 from plant_server.plant import Plant, plant_of
+from plant_server.systems.linear import LinearSystem
+from plant_server.watchdog import Watchdog
 
 H_NS = 2_000_000
 A = np.array([[0.0, 1.0], [-3.0, 0.4]])
@@ -21,14 +24,14 @@ B = np.array([[0.0, 1.0], [2.0, -1.0]])
 
 
 def new_plant(horizon_ns: int = 10**9, measure_every: int = 1) -> Plant:
-    return Plant(
-        A,
-        B,
-        np.array([1.0, -0.5]),
-        period_ns=H_NS,
-        horizon_ns=horizon_ns,
-        measure_every=measure_every,
+    return linear_plant(
+        A, B, np.array([1.0, -0.5]), horizon_ns=horizon_ns, measure_every=measure_every
     )
+
+
+def linear_plant(A: Matrix, B: Matrix, x0: Vector, period_ns: int = H_NS, **settings: int) -> Plant:
+    system = LinearSystem(A, B, x0, step_ns=period_ns)
+    return Plant(system, Watchdog(B.shape[1]), period_ns=period_ns, **settings)
 
 
 def actuation(sequence: int, u: Sequence[float]) -> Message:
@@ -47,7 +50,7 @@ def rows(outputs: Sequence[object], table: str) -> Any:
 
 def test_a_scalar_plant_follows_its_closed_form_through_changing_inputs() -> None:
     a, b, x = -0.7, 2.0, 1.5
-    plant = Plant(
+    plant = linear_plant(
         np.array([[a]]), np.array([[b]]), np.array([x]), period_ns=50_000_000, horizon_ns=10**9
     )
     u = 0.0
@@ -66,7 +69,7 @@ def test_a_scalar_plant_follows_its_closed_form_through_changing_inputs() -> Non
 def test_the_plant_moves_as_an_integrator_does(inputs: list[tuple[float, float]]) -> None:
     h_ns = 40_000_000
     x = np.array([1.0, -0.5])
-    plant = Plant(A, B, x, period_ns=h_ns, horizon_ns=10**9)
+    plant = linear_plant(A, B, x, period_ns=h_ns, horizon_ns=10**9)
     plant.handle(actuation(0, inputs[0]), 0)
     (first,) = measured(plant.on_timer(0))
     assert first.vector.tolist() == x.tolist()
@@ -154,7 +157,7 @@ def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
 
 def test_what_was_measured_stays_as_it_was() -> None:
     x0 = np.array([1.0, -0.5])
-    plant = Plant(A, B, x0, period_ns=H_NS, horizon_ns=10**9)
+    plant = linear_plant(A, B, x0, horizon_ns=10**9)
     (message,) = measured(plant.on_timer(0))
     plant.on_timer(H_NS)
     assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]

@@ -34,7 +34,7 @@ def signed(worst: Worst) -> float:
 
 
 @given(resolved=scenarios(7), objective=st.sampled_from(Objective))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_the_exact_search_finds_what_trying_all_finds(
     resolved: Scenario, objective: Objective
 ) -> None:
@@ -49,7 +49,7 @@ def test_the_exact_search_finds_what_trying_all_finds(
 
 
 @given(resolved=scenarios(7, mansd=3), objective=st.sampled_from(Objective))
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_the_tree_alone_finds_it_too(resolved: Scenario, objective: Objective) -> None:
     """Without guesses to start with, so that nothing but its own branches can find it."""
     _, measure, flow = flow_of(resolved, objective)
@@ -60,7 +60,7 @@ def test_the_tree_alone_finds_it_too(resolved: Scenario, objective: Objective) -
 
 
 @given(resolved=scenarios(12), objective=st.sampled_from(Objective))
-@settings(MANY, max_examples=40)
+@settings(MANY, max_examples=15)
 def test_the_beam_comes_within_a_hundredth(resolved: Scenario, objective: Objective) -> None:
     exact = signed(find_worst(resolved, objective, most_nodes=20_000, beam=0))
     beam = signed(find_worst(resolved, objective, most_nodes=0, beam=64))
@@ -72,7 +72,7 @@ def test_the_beam_comes_within_a_hundredth(resolved: Scenario, objective: Object
     objective=st.sampled_from(Objective),
     most_nodes=st.sampled_from([0, 2000]),
 )
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_every_pattern_is_admissible_and_leads_to_what_is_told(
     resolved: Scenario, objective: Objective, most_nodes: int
 ) -> None:
@@ -111,7 +111,7 @@ def test_the_same_arguments_give_the_same_result(resolved: Scenario, objective: 
     resolved=scenarios(12),
     objective=st.sampled_from([Objective.ERROR, Objective.STATE, Objective.INTER_EVENT]),
 )
-@settings(MANY, max_examples=80)
+@settings(MANY, max_examples=30)
 def test_no_certificate_is_exceeded(resolved: Scenario, objective: Objective) -> None:
     worst = find_worst(resolved, objective, most_nodes=5_000, beam=0)
     assert not worst.breaches, worst

@@ -85,6 +85,49 @@ def test_the_cost_is_the_integral_along_the_held_inputs() -> None:
     assert row["cost"] == pytest.approx(cost, rel=1e-10)
 
 
+def test_what_disturbs_the_plant_is_in_the_integral_and_costs_nothing_itself() -> None:
+    gusts = (
+        'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
+        ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
+    )
+    one = work("horizon_s=0.2", gusts)
+    (row,) = one.run(range(1))
+    steps, loop = record_of(one, 0)["plant_step"], record_of(one, 0).loop
+    cost = 0.0
+    for step in steps[:-1]:
+        moving = loop.B @ (step["u"] + step["d"]) + step["w"]
+        drift = np.zeros((5, 5))
+        drift[:4, :4], drift[:4, 4] = loop.A, moving
+
+        def rate(s: float, z: Any, G: Any) -> float:
+            return float(((expm(G * s) @ z)[:4] ** 2).sum())
+
+        squared = partial(rate, z=np.append(step["x"], 1.0), G=drift)
+        cost += quad_vec(squared, 0.0, 0.02, epsrel=1e-12)[0] + 0.02 * float(step["u"] @ step["u"])
+    assert row["cost"] == pytest.approx(cost, rel=1e-10)
+
+
+def test_a_plant_that_is_not_linear_is_drawn_and_its_cost_is_a_sum() -> None:
+    given = load_scenario(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
+    one = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
+    (row,) = one.run(range(1))
+    record = record_of(one, 0)
+    steps = record["plant_step"]
+    assert row["status"] == OK
+    assert not record.scenario.is_linear
+    of_x = (steps["x"] ** 2).sum(axis=1)
+    expected = np.trapezoid(of_x, dx=0.005) + 0.005 * (steps["u"][:-1] ** 2).sum()
+    assert row["cost"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_every_draw_has_disturbances_and_noise_of_its_own() -> None:
+    noisy = ('plant.disturbances=[{kind = "gaussian", std = [1.0, 1.0]}]',
+             "plant.measurement.noise_std=[0.1, 0.1, 0.1, 0.1]")  # fmt: skip
+    seeds = [drawn_scenario(work(*noisy).scenario, 7, draw).seeds for draw in range(3)]
+    assert len({(s.disturbance, s.noise, s.loss) for s in seeds}) == 3
+    assert len({s.disturbance for s in seeds} | {s.noise for s in seeds}) == 6
+
+
 def test_a_draw_depends_on_its_number_alone() -> None:
     one = work(*NEVER)
     assert one.run(range(2, 4)).tobytes() == one.run(range(4))[2:].tobytes()
@@ -105,6 +148,13 @@ def test_a_run_that_fails_says_how() -> None:
     assert np.isnan(row["cost"])
     (row,) = work("mode=zoh", most_events=2).run(range(1))
     assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
+
+
+def test_nobody_falls_silent_in_virtual_time_whatever_an_actuation_carries() -> None:
+    """So the watchdog never trips, and its policy makes no difference."""
+    rows = [work(f"plant.watchdog.policy={policy}").run(range(2)) for policy in ("hold", "model")]
+    assert rows[0].tobytes() == rows[1].tobytes()
+    assert (rows[0]["status"] == OK).all()
 
 
 PLAN = {

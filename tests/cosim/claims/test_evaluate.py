@@ -268,7 +268,7 @@ def test_numbers_that_are_none_are_null() -> None:
     (found,) = as_json([claim])
     assert found == {
         "what": "w", "source": "s", "bound": "b", "certified": None, "observed": None,
-        "ratio": 0.5, "verdict": "held", "since_s": None, "why": "",
+        "ratio": 0.5, "verdict": "held", "since_s": None, "why": "", "from_s": 0.0, "until_s": None,
     }  # fmt: skip
     assert type(found["ratio"]) is float
 

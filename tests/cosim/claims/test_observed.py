@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.claims.observed import Observed, observe
+from cosim.claims.observed import Observed
+from cosim.claims.observer import observe
 from cosim.record import RunRecord
 from cosim.virtual import simulate
 from noack.records import (

@@ -1,11 +1,15 @@
 """Theorem 1's Δ from a recorded run: against its parts, one by one, and the error it bounds."""
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from cosim.claims.theorem_one import theorem_one
+from cosim.claims.theorem_one import _longest, theorem_one
 from cosim.join import Joined, join_all
 from cosim.record import RunRecord
 from cosim.virtual import simulate
@@ -87,3 +91,20 @@ def test_there_is_none_without_events_or_with_a_weight(make: Make) -> None:
     assert delta_of(of_scenario(record, weighted)) is None
     assert delta_of(record) is not None
     assert record[SENSOR_MEASUREMENT]["t_ns"][1] == 10 * MS
+
+
+@given(st.lists(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=4), min_size=1, max_size=40))
+def test_the_stretches_that_are_left_out_are_exceeded_by_one_that_is_not(
+    stretches: list[list[float]],
+) -> None:
+    def reaches(stretch: Sequence[float]) -> list[float]:
+        sums = list(itertools.accumulate(reversed(stretch)))[::-1]
+        return sums + [0.0] * (4 - len(sums))
+
+    kept = _longest(stretches)
+    for stretch in stretches:
+        assert any(
+            all(a >= b - 1e-9 for a, b in zip(reaches(one), reaches(stretch), strict=True))
+            for one in kept
+        )
+    assert len(kept) <= len(stretches)

@@ -106,7 +106,7 @@ def integrated(case: Case) -> Iterator[tuple[float, Vector]]:
 
 
 @given(cases())
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_events_are_the_integrators(case: Case) -> None:
     """To 1e-8 s: the integrator's error of 1e-12 over the slope of the error norm, grown by far."""
     run = case.run()

@@ -14,16 +14,20 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
+import psutil
 import pytest
 import rerun.chunk
 from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
-from cosim.viewer import blueprint
 from cosim.viewer.live import LiveView, has_display, view_recording
+from cosim.viewer.pictures.lane import Lane
+from cosim.viewer.pictures.network import Diagram
+from cosim.viewer.pictures.picture import TIMELINE, Frames, Picture
 from cosim.viewer.recording import APPLICATION_ID, RunView, ViewError
 from cosim.viewer.server import RECORDING, RecordingServer
 from noack.errors import CallerError, ExitStatus
+from noack.records import Fate
 from tests.integration.conftest import wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -32,6 +36,7 @@ Floats = NDArray[np.float64]
 STATES, INPUTS = ["V", "r", "psi", "Y_g"], ["u_1", "u_2"]
 PROCESSES = ["plant", "sensor", "netem", "controller"]
 STEP_NS = 2_000_000
+S = 1_000_000_000
 K = 100
 
 pytestmark = pytest.mark.skipif(
@@ -39,7 +44,15 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def new_view(path: Path, states: list[str] | None = None, live: LiveView | None = None) -> RunView:
+def new_view(
+    path: Path,
+    states: list[str] | None = None,
+    live: LiveView | None = None,
+    *,
+    indexed: bool = True,
+    picture: Picture | None = None,
+    diagram: Diagram | None = None,
+) -> RunView:
     return RunView(
         path,
         run_id="run-1",
@@ -48,7 +61,10 @@ def new_view(path: Path, states: list[str] | None = None, live: LiveView | None 
         state_names=states or STATES,
         input_names=INPUTS,
         processes=PROCESSES,
+        picture=picture,
+        diagram=diagram,
         live=live,
+        indexed=indexed,
     )
 
 
@@ -96,7 +112,7 @@ def series(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Times in ns (k,) and scalars (k, series) of one entity, in the order of the file."""
     moving = [c for c in chunks[entity] if not c.is_static]
-    assert all(c.timeline_names == [blueprint.TIMELINE] for c in moving)
+    assert all(c.timeline_names == [TIMELINE] for c in moving)
     batches = [c.to_record_batch() for c in moving]
     t_ns = np.concatenate([b.column("t").to_numpy(zero_copy_only=False) for b in batches])
     return t_ns.astype(np.int64), np.array(column(moving, "Scalars:scalars"), dtype=np.float64)
@@ -169,9 +185,10 @@ def live() -> Iterator[LiveView]:
     view.close()
 
 
-def test_every_sample_is_in_the_file_exactly(tmp_path: Path) -> None:
+@pytest.mark.parametrize("indexed", [True, False])
+def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> None:
     path = tmp_path / "recording.rrd"
-    with new_view(path) as view:
+    with new_view(path, indexed=indexed) as view:
         add_samples(view, 5)
         view.inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
     chunks = read(path)
@@ -189,6 +206,15 @@ def test_every_sample_is_in_the_file_exactly(tmp_path: Path) -> None:
     np.testing.assert_allclose(10 ** values[:, 1], t_ns * 1e-9 + 5, rtol=1e-12)
     t_ns, values = series(chunks, "input")
     np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
+
+
+def test_what_was_flushed_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path, indexed=False) as view:
+        add_samples(view, 2)
+        view.flush()
+        t_ns, _ = series(read(path), "state/V")
+        np.testing.assert_array_equal(t_ns, times(0, 2 * K))
 
 
 def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> None:
@@ -617,6 +643,65 @@ def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
         child.send_signal(sent)
         assert child.wait() == status
         wait_for(lambda: not is_left(child.pid))
+
+
+def test_a_browser_is_served_where_there_is_a_display_but_no_window_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On loopback and nowhere else."""
+    pretend_window(tmp_path, monkeypatch, opens=True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    with subprocess.Popen(
+        [sys.executable, "-m", "cosim.cli", "view", str(path), "--web"],
+        stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+    ) as child:  # fmt: skip
+        try:
+            assert child.stdout is not None
+            page = next(word for word in child.stdout.readline().split() if "http" in word)
+            assert get(recording_url(page)) == (200, path.read_bytes())
+            processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
+            listening = [
+                address.laddr.ip
+                for process in processes
+                for address in process.net_connections("inet")
+                if address.status == psutil.CONN_LISTEN
+            ]
+            assert len(listening) == 2  # the page with the recording, and rerun's own files
+            assert set(listening) == {"127.0.0.1"}
+        finally:
+            child.send_signal(signal.SIGINT)
+            assert child.wait() == 0
+
+
+def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    picture = Lane(3, 2, forward_mps=-12.0)
+    with new_view(path, picture=picture, diagram=Diagram()) as view:
+        for first in range(0, 1000, 37):
+            t_ns = times(first, min(37, 1000 - first))
+            x = np.tile(t_ns[:, None] * 1e-9, (1, 4))
+            view.move(t_ns, Frames(t_ns * 1e-9, x, x, x))
+        view.packets(np.array([S]), np.array([S]), np.array([Fate.FORCED]))
+        view.travel(2 * S)
+    chunks = read(path)
+    moving = [c for c in chunks["picture/plant"] if not c.is_static]
+    places = np.array(column(moving, "Transform3D:translation"))[:, 0, :]
+    assert len(places) == 2 * 60  # of 2 s, out of 1000 samples
+    assert (np.diff(places[:, 1]) < 0).all()  # the lateral offset grows; down is +y in the viewer
+    assert static(chunks, "picture/plant/body", "LineStrips2D:colors")
+    shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
+    assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
+    origins = {
+        origin
+        for entity, found in read(path, "blueprint").items()
+        if entity.startswith("view/")
+        for c in found
+        if "ViewBlueprint:space_origin" in c.to_record_batch().schema.names
+        for (origin,) in column([c], "ViewBlueprint:space_origin")
+    }
+    assert {"picture", "network", "log", "about"} <= {o.removeprefix("/") for o in origins}
 
 
 @pytest.mark.parametrize("wanted", ["missing recording", "missing browser"])

@@ -12,7 +12,7 @@ from tests.fuzz.parsers.ticket import _TICKET
 from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.fuzz.tables import damaged
 
-HELLO = {"pid": 1, "address": ["127.0.0.1", 47001]}
+HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001]}
 PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None}
 KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 
@@ -23,15 +23,20 @@ def one_input(data: bytes) -> None:
     with patch.object(coordinator, "Plane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(_TICKET)
     queries: dict[str, list[Query]] = {}
+    admissions: list[Query] = []
     for _ in range(choices.below(12)):
         role = choices.one([*ROLES, "nobody", ""])
-        match choices.below(4):
+        match choices.below(6):
             case 0:
-                plane.put("left", Sample(f"noack/0/left/{role}", _bytes(choices, "gone")))
+                plane.put("left", Sample(f"noack/0/left/{role}/one", _bytes(choices, "gone")))
             case 1:
                 plane.put("progress", Sample("noack/0/progress", _bytes(choices, PROGRESS)))
                 account = barrier.progress()
                 assert account is None or account.keys() >= PROGRESS.keys()
+            case 2 | 3:
+                query = Query(f"noack/0/admit/{role}", _bytes(choices, HELLO))
+                admissions.append(query)
+                plane.put("admit", query)
             case _:
                 query = Query(f"noack/0/join/{role}", _bytes(choices, HELLO))
                 queries.setdefault(role, []).append(query)
@@ -41,8 +46,9 @@ def one_input(data: bytes) -> None:
         if barrier.epoch_ns is not None or role not in ROLES:
             # Who asks again has given up the question before.
             assert asked[-1].answered, "who asks to join waits for an answer"
+    assert all(query.answered == 1 for query in admissions), "who knocks waits for an answer"
     for answer in plane.answers:
-        for host, port in answer["addresses"].values():
+        for host, port in answer.get("addresses", {}).values():
             assert isinstance(host, str)
             assert 0 < port <= 65_535
     barrier.stop("the end")

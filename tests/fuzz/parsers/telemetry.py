@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from cosim.record import tables_of
 from cosim.recorder import Recorder
 from cosim.run_dir import SCENARIO_FILE
 from noack.io.telemetry import NOTICES
 from noack.records import OWNER
-from noack.resolve import resolve
+from noack.resolve import resolve, tables_of
 from noack.scenario_file import dumps, validate
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
@@ -26,10 +25,11 @@ RESOLVED = resolve(validate(SCENARIO, "short"))
 REPORT = {
     "pid": 1, "ended": "horizon", "realtime": {},
     "channel": {"accepted": 1, "rejected": {"tag": 1}},
-    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1},
+    "rows": {"plant_step": 4, "plant_actuation": 0, "notices": 1}, "incarnation": 0,
+    "instance": "one",
 }  # fmt: skip
 _TYPES = tables_of(RESOLVED)
-HEADER = {"first": 0, "rows": 4}
+HEADER = {"first": 0, "rows": 4, "incarnation": 0}
 KNOWN = Vocabulary(
     (*REPORT, *HEADER, *NOTICE, *OWNER, "accepted", "rejected"), (*OWNER, "horizon", "violation")
 )
@@ -50,13 +50,16 @@ def one_input(data: bytes) -> None:
                 queries.append(_goodbye(choices))
                 plane.put("goodbye", queries[-1])
             case 1:
-                plane.put("alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}"))
+                plane.put(
+                    "alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one")
+                )
             case _:
                 plane.put("telemetry", _batch(choices))
     with redirect_stderr(io.StringIO()) as told:
         recorder.poll()
     assert told.getvalue().count("\n") <= 1, "junk must not fill the log"
     recorder.show()
+    recorder.confirm()
     assert isinstance(recorder.finished, bool)
     assert all(query.answered == 1 for query in queries), "who says goodbye waits for an answer"
     # Whatever came, what was good of it is on record.

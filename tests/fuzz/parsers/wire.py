@@ -57,7 +57,7 @@ def _junk(data: bytes) -> None:
 
 
 def _sound(choices: Choices, encoder: Encoder, flow: Flow, dimension: int) -> bytes:
-    """What a process of the run may send."""
+    """What a process of the run may send, or nearly."""
     sequence, t_ns = choices.integer() % 2**64, choices.integer()
     t_ns = (t_ns + 2**63) % 2**64 - 2**63
     vector = np.array([choices.real() for _ in range(dimension)])
@@ -98,10 +98,11 @@ def _is_sound(datagram: bytes, flow: Flow, dimension: int, newest: int) -> bool:
     """Whether a datagram must be accepted: by ``docs/wire.md``, not by the code."""
     if len(datagram) != 48 + 8 * dimension or _tag(datagram[:-16]) != datagram[-16:]:
         return False
-    magic, version, kind, n, _, run, sequence, _ = struct.unpack_from("<2sBBHHQQq", datagram)
+    magic, version, kind, n, _, run, sequence, t_ns = struct.unpack_from("<2sBBHHQQq", datagram)
     vector = struct.unpack_from(f"<{dimension}d", datagram, 32)
     return (
         (magic, version, kind, n, run) == (b"NA", 1, flow.value, dimension, RUN)
-        and sequence > newest
+        and newest < sequence < 2**63
+        and 0 <= t_ns < 2**62
         and all(math.isfinite(entry) for entry in vector)
     )

@@ -4,19 +4,20 @@ import json
 import threading
 from typing import Any
 
+import psutil
 import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
 from netem.control.client import Client
 from netem.control.errands import Errands
-from netem.control.server import USER, ControlServer
+from netem.control.server import ControlServer, secret_of
 from netem.control.session import Session, find, running
 from netem.records import Counters
 from netem.words.parser import settings_of
 from noack.errors import CallerError
 from noack.impairments import LinkSettings
-from noack.io.plane import star_config
+from noack.io.star import open_star, star_config
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 
@@ -120,8 +121,8 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_changed(
 
 def ask_with(session: Session, payload: str | bytes | None, what: str = "change") -> str:
     """Ask on a connection that is let in; return the error."""
-    secret = {"transport/auth/usrpwd/user": USER, "transport/auth/usrpwd/password": session.token}
-    with zenoh.open(star_config(session.endpoint, listen=False, more=secret)) as connection:
+    secret = secret_of(session.token)
+    with open_star(session.endpoint, secret, listen=False) as connection:
         key = f"netem/{session.name}/{what}"
         replies = connection.get(key, FifoChannel(4), payload=payload, timeout=60)
         (error,) = [reply.err for reply in replies if reply.err is not None]
@@ -149,7 +150,7 @@ def test_what_is_no_query_is_refused(
 
 @pytest.mark.parametrize(
     "secret",
-    [{}, {"user": USER, "password": "0" * 64}, {"user": "root"}],
+    [{}, {"user": "netem", "password": "0" * 64}, {"user": "root"}],
     ids=["none", "wrong", "other user"],
 )
 def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict[str, str]) -> None:
@@ -159,6 +160,13 @@ def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict
     more["connect/timeout_ms"] = 500
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
         zenoh.open(star_config(session.endpoint, listen=False, more=more))
+
+
+def test_it_listens_on_loopback_only(server: ControlServer) -> None:
+    port = int(find("lab").endpoint.rpartition(":")[2])
+    own = psutil.Process().net_connections()
+    listening = [c.laddr for c in own if c.status == psutil.CONN_LISTEN and c.laddr.port == port]
+    assert [address.ip for address in listening] == ["127.0.0.1"]
 
 
 def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) -> None:

@@ -16,7 +16,7 @@ from netem.engine.start import Engine, open_relay
 from noack.impairments import LinkSettings
 from noack.io.udp import enlarge_buffer
 
-PATIENCE_S = 20
+PATIENCE_S = 60
 """What never happens fails by then; nothing is measured."""
 HOSTS = {4: "127.0.0.1", 6: "::1"}
 

@@ -33,7 +33,7 @@ def test_socket_addresses_come_back(host: str) -> None:
     assert place_of((found, port), "test") == place_of((host, 4711), "test")
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(st.lists(st.tuples(st.booleans(), addresses, st.integers(0, 1)), max_size=200))
 def test_the_table_of_clients_is_a_dictionary(
     steps: list[tuple[bool, tuple[str, int], int]],
@@ -58,7 +58,7 @@ def test_the_table_of_clients_is_a_dictionary(
     assert sorted(table[table >= 0].tolist()) == sorted(model.values())
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(st.lists(st.integers(-3, 5), max_size=150), st.data())
 def test_the_store_is_a_queue_by_time_and_arrival(steps: list[int], data: st.DataObject) -> None:
     """Negative steps take out what is due first; others keep something until then."""

@@ -67,7 +67,7 @@ def ascending(batch: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
     return [(flow, size, t) for (flow, size, _), t in zip(batch, times, strict=True)]
 
 
-@settings(max_examples=400)
+@settings(max_examples=120)
 @given(own=impairments.settings, other=st.none() | impairments.settings, batch=arrivals)
 def test_compiled_and_plain_rules_agree(
     own: LinkSettings, other: LinkSettings | None, batch: list[tuple[int, int, int]]
@@ -88,7 +88,7 @@ def test_compiled_and_plain_rules_agree(
         assert expected is None or found == expected
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(own=impairments.settings, batch=arrivals, sizes=st.lists(st.integers(1, 30), min_size=1))
 def test_batches_do_not_matter(
     own: LinkSettings, batch: list[tuple[int, int, int]], sizes: list[int]

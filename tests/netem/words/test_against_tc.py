@@ -170,7 +170,7 @@ def tcs_settings(draw: st.DrawFn) -> imp.LinkSettings:
     return imp.LinkSettings(impairments=tuple(chain), limit=draw(st.integers(1, 1_000_000)))
 
 
-@example_settings(max_examples=200)
+@example_settings(max_examples=80)
 @given(settings=tcs_settings())
 def test_tc_understands_the_command_that_it_is_given(tc: Tc, settings: imp.LinkSettings) -> None:
     command = tc_command(settings)
@@ -223,7 +223,7 @@ def test_where_nothing_remains_there_is_no_command(words: str) -> None:
     assert command.lacks
 
 
-@example_settings(max_examples=200)
+@example_settings(max_examples=80)
 @given(settings=any_settings.settings)
 def test_nothing_is_left_out_in_silence(settings: imp.LinkSettings) -> None:
     command = tc_command(settings)

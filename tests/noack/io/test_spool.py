@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cosim.record import merge_rows
 from noack.errors import MachineError
-from noack.io.spool import SpoolWriter, read_chunks
+from noack.io.spool import SpoolTail, SpoolWriter, read_chunks
 
 ROW = np.dtype([("input", "<i8")])
 
@@ -106,3 +106,39 @@ def test_a_disk_that_fills_up_is_told_by_the_batch_it_cuts_short(tmp_path: Path)
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         writer.close()
     assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
+
+
+def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
+    tail = SpoolTail(tmp_path / "spool")
+    assert list(tail.read()) == []
+    writer = SpoolWriter(tmp_path / "spool", "recorder")
+    writer.append("plant_step", 0, numbers(0, 2))
+    assert list(tail.read()) == [("plant_step", 0, numbers(0, 2))]
+    assert list(tail.read()) == []
+    writer.append("plant_step", 2, numbers(2, 3))
+    writer.append("notices_plant", 0, b"{}")
+    assert sorted(tail.read()) == [("notices_plant", 0, b"{}"), ("plant_step", 2, numbers(2, 3))]
+    writer.close()
+    tail.close()
+
+
+def test_half_a_batch_waits_for_its_other_half(tmp_path: Path) -> None:
+    chunk = struct.pack("<QQ", 0, 3) + b"abc"
+    tail, path = SpoolTail(tmp_path), tmp_path / "plant_step.recorder"
+    for size in range(len(chunk)):
+        path.write_bytes(chunk[:size])
+        assert list(tail.read()) == []
+    path.write_bytes(chunk)
+    assert list(tail.read()) == [("plant_step", 0, b"abc")]
+    tail.close()
+
+
+def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> None:
+    path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
+    tail = SpoolTail(tmp_path)
+    next(tail.read())
+    with path.open("ab") as file:
+        file.write(struct.pack("<QQ", 3, 2) + b"de")
+    path.unlink()
+    assert list(tail.read()) == [("plant_step", 3, b"de")]
+    tail.close()

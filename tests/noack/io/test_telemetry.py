@@ -1,4 +1,5 @@
 import json
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,9 @@ from hypothesis import strategies as st
 from noack.io import telemetry
 from noack.io.telemetry import (
     NOTICES,
+    Received,
     TelemetryBuffer,
     first_row,
-    missing_ranges,
     notices_of,
 )
 from noack.machine import Notice, Record
@@ -29,7 +30,7 @@ class Wire:
 
     def __call__(self, table: str, header: bytes, payload: bytes) -> None:
         fields = json.loads(header)
-        assert first_row(header) == fields["first"]
+        assert first_row(header) == (fields["incarnation"], fields["first"])
         self.batches.append((table, fields["first"], fields["rows"], payload))
 
     def rows(self, table: str) -> list[tuple[int, Any]]:
@@ -115,21 +116,84 @@ def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject)
     sent = len(wire.batches)
     lost = data.draw(st.sets(st.integers(0, sent - 1)))
     arrived = [batch for k, batch in enumerate(wire.batches) if k not in lost]
-    missing = missing_ranges([(first, first + n) for _, first, n, _ in arrived], count)
+    received = Received()
+    for _, first, n, _ in data.draw(st.permutations(arrived)):
+        received.add(first, first + n)
+    missing = received.missing(count)
     again = Wire()
     assert buffer.resend({"one": missing}, again) == len(lost) == len(again.batches)
     assert again.batches == [batch for k, batch in enumerate(wire.batches) if k in lost]
     everything = arrived + again.batches
-    assert missing_ranges([(first, first + n) for _, first, n, _ in everything], count) == []
+    for _, first, n, _ in again.batches:
+        received.add(first, first + n)
+    assert received.missing(count) == []
+    assert received.ranges == [(0, count)]
     payloads = [p for _, _, _, p in sorted(everything, key=lambda batch: batch[1])]
     rows = np.frombuffer(b"".join(payloads), ROW)
     assert rows["number"].tolist() == list(range(count))
 
 
-def test_missing_ranges_are_half_open() -> None:
-    assert missing_ranges([(7, 9), (2, 4), (3, 5)], 12) == [(0, 2), (5, 7), (9, 12)]
-    assert missing_ranges([], 0) == []
-    assert missing_ranges([(0, 5), (2, 3)], 5) == []
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 8))), st.integers(0, 45))
+def test_what_was_received_is_known_in_as_few_ranges_as_can_be(
+    parts: list[tuple[int, int]], total: int
+) -> None:
+    received, numbers = Received(), set[int]()
+    for first, count in parts:
+        received.add(first, first + count)
+        numbers |= set(range(first, first + count))
+    assert {n for low, high in received.ranges for n in range(low, high)} == numbers
+    assert all(one[1] < other[0] for one, other in pairwise(received.ranges))
+    assert received.end == max(numbers, default=-1) + 1
+    missing = {n for low, high in received.missing(total) for n in range(low, high)}
+    assert missing == set(range(total)) - numbers
+
+
+def test_what_is_on_disk_is_kept_no_longer() -> None:
+    confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
+    buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed[-1])
+    for number in range(30):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+    buffer.notice(Notice(0, "info", "hello"))
+    confirmed.append({"one": [(0, 10), (12, 30)], NOTICES: [(0, 1)]})
+    buffer.flush()
+    again = Wire()
+    assert buffer.resend({"one": [(0, 30)], NOTICES: [(0, 1)]}, again) == 1
+    assert again.batches[0][1:3] == (10, 10)
+
+
+def test_what_was_lost_under_way_is_sent_again_while_the_run_goes_on() -> None:
+    confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire, 0, lambda: confirmed.pop() if confirmed else {})
+    for number in range(30 * 10):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+    sent = len(wire.batches)
+    confirmed.append({"one": [(0, 50)]})  # what is not there may be under way
+    buffer.flush()
+    assert len(wire.batches) == sent
+    for number in range(300, 310):
+        buffer.append(Record("one", row(number)))
+    buffer.flush()
+    sent = len(wire.batches)
+    confirmed.append({"one": [(0, 50), (250, 300)]})
+    for _ in range(10):
+        before = len(wire.batches)
+        buffer.flush()
+        assert len(wire.batches) - before <= 8
+    assert [first for _, first, _, _ in wire.batches[sent:]] == list(range(50, 250, 10))
+
+
+def test_of_a_long_run_nothing_is_kept_that_was_confirmed() -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire, 0, lambda: {"one": [(0, 10**9)]})
+    for number in range(20 * BATCH):
+        buffer.append(Record("one", row(number)))
+    buffer.flush()
+    assert buffer.resend({"one": [(0, 20 * BATCH)]}, Wire()) == 0
 
 
 def test_every_batch_that_overlaps_a_missing_range_is_sent_again() -> None:

@@ -21,6 +21,7 @@ from noack.scenario_file import load, validate
 from noack.theory.assumptions import Verdict
 from noack.theory.certificate import Conditions, Constants, VoidError
 from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box
+from noack.theory.gains import ErrorGains
 from noack.theory.printed import theorem_2
 from noack.theory.schedule import ideal_conditions
 from tests.noack.theory.loops import STEPS, System, Trace, networks, simulate, systems, times_s
@@ -359,3 +360,24 @@ def test_the_lane_example_in_a_weight_from_any_lyapunov_function() -> None:
     for found in (plain, constants):
         assert found.inter_event_s is not None
         assert found.inter_event_s >= 100 * printed.inter_event_s
+
+
+@pytest.mark.parametrize("beta", [1e-300, 1e-310, 5e-324])
+def test_a_threshold_that_no_time_is_short_enough_for_takes_few_looks(
+    beta: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks, growth = 0, ErrorGains.growth
+
+    def counted(*arguments: Any) -> Any:
+        nonlocal looks
+        looks += 1
+        return growth(*arguments)
+
+    monkeypatch.setattr(ErrorGains, "growth", counted)
+    path = ROOT / "scenarios" / "lane_following.toml"
+    resolved = resolve(load(path, [f"trigger.beta={beta}"]))
+    for found in (certify, certify_box):
+        certificate = found(resolved, ideal_conditions(resolved))
+        assert certificate is not None
+        assert (certificate.constants is None) == (certificate.void is not None)
+    assert looks < 500

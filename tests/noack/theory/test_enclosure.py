@@ -342,3 +342,18 @@ def test_what_neither_grows_nor_decays() -> None:
     kernel = constant_kernel(2.5)
     np.testing.assert_array_equal(kernel.sups(np.array([0.0, 0.3, 1.0, 1e9])), [2.5] * 4)
     assert kernel.integral() == math.inf
+
+
+def test_many_states_take_little_memory_and_their_bounds_hold() -> None:
+    n = 40
+    rng = np.random.default_rng(2)
+    modes = np.diag(-np.logspace(-2, 3, n))  # on so few cells the slowest modes are far from over
+    generator = modes + np.triu(rng.normal(size=(n, n)), 1) * 0.01
+    everything = np.eye(n)
+    followed = response(generator, everything)
+    assert followed.states.size < 6_000_000
+    kernel = followed.through(everything)
+    end_s = float(kernel.edges_s[-1])
+    for t_s in (0.0, 0.3 * end_s, end_s, 3 * end_s, 100.0):
+        assert np.linalg.norm(expm(generator * t_s), 2) <= kernel.sup(t_s) * (1 + 1e-12)
+    assert math.isfinite(kernel.integral())

@@ -1,0 +1,135 @@
+"""Cost per step of each plant, in its loop: beside a linear plant's, and of its period.
+
+The inputs are those of a simulated run of its scenario. Plant and linear plant take turns, a step
+every 2 ms and with the real-time settings, so that both find the processor's caches as in a run.
+Figures are the thread's CPU time: what others take on a busy machine is not the plant's cost.
+"""
+
+import argparse
+import os
+import sys
+import time
+from typing import NamedTuple
+
+# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks._report import Benchmark, Goal, Peer, Row, run, say
+from benchmarks._ticks import FIFO_PRIORITY
+from cosim.cli import find_scenario
+from cosim.virtual import simulate
+from noack.clock import NS_PER_S
+from noack.io.realtime import realtime
+from noack.records import PLANT_STEP
+from noack.resolve import resolve
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.wire import Flow, Message
+from plant_server.plant import Plant, plant_of
+
+STEPS = 2000
+"""At most; a run that is shorter has fewer."""
+PACE_NS = 2_000_000
+SHARE = Goal("<", 20.0)
+"""Per cent of its period that a step may take at p99."""
+LINEAR = "lane_following"
+
+
+class Case(NamedTuple):
+    """A plant: its scenario, and what is set in it."""
+
+    name: str
+    scenario: str
+    settings: tuple[str, ...] = ()
+    goal: Goal | None = None
+
+
+CASES = (
+    Case("cart_pole", "cart_pole"),
+    Case("four_tank", "four_tank"),
+    Case("quadrotor", "quadrotor_hover"),
+    *(
+        Case(f"vehicle, {model}", "lane_vehicle", (f"plant.system.model={model}",), SHARE)
+        for model in ("kinematic", "single_track", "drift", "multi_body")
+    ),
+)
+
+
+class Steps:
+    """A plant that makes the steps of a simulated run of its scenario, one by one."""
+
+    def __init__(self, scenario: str, settings: tuple[str, ...], count: int) -> None:
+        self.resolved: Scenario = resolve(load(find_scenario(scenario), settings))
+        horizon_s = min(self.resolved.horizon_s, count * self.resolved.plant_period_ns / NS_PER_S)
+        record = simulate(self.resolved.model_copy(update={"horizon_s": horizon_s}))
+        self._plant: Plant = plant_of(self.resolved)
+        self._period_ns = self.resolved.plant_period_ns
+        self._inputs = iter(record[PLANT_STEP]["u"])
+        self._step = 0
+        self.cpu_ns: list[int] = []
+
+    def make(self) -> bool:
+        """Make a step; False at the run's end."""
+        u = next(self._inputs, None)
+        if u is None:
+            return False
+        t_ns = self._step * self._period_ns
+        self._plant.handle(Message(Flow.ACTUATION, self._step, t_ns, u), t_ns)
+        begun_ns = time.thread_time_ns()
+        self._plant.on_timer(t_ns)
+        self.cpu_ns.append(time.thread_time_ns() - begun_ns)
+        self._step += 1
+        return True
+
+    @property
+    def us(self) -> NDArray[np.float64]:
+        """CPU time of the steps so far, µs; the first, of no length, left out."""
+        return np.array(self.cpu_ns[1:]) / 1e3
+
+
+def timed(
+    case: Case, count: int = STEPS, pace_ns: int = PACE_NS, *, asked: bool = True
+) -> tuple[Steps, Steps]:
+    """Make steps of a case and of a linear plant in turn, asking for the real-time settings."""
+    ours, linear = Steps(case.scenario, case.settings, count), Steps(LINEAR, (), count)
+    with realtime(asked, FIFO_PRIORITY):
+        due_ns = time.monotonic_ns()
+        for steps in (ours, linear) * count:
+            if not steps.make():
+                break
+            due_ns += pace_ns
+            time.sleep(max(due_ns - time.monotonic_ns(), 0) / NS_PER_S)
+    return ours, linear
+
+
+def rows_of(case: Case, ours: Steps, linear: Steps) -> list[Row]:
+    """The rows of a case: median, 99 % quantile, and what that is of the period in wall time."""
+    period_us = ours.resolved.plant_period_ns / ours.resolved.speed / 1e3
+    found = {q: (float(np.quantile(ours.us, q)), float(np.quantile(linear.us, q)))
+             for q in (0.5, 0.99)}  # fmt: skip
+    share = 100 * found[0.99][0] / period_us
+    return [
+        *(
+            Row(f"{case.name}: {name}", value, "µs/step", Peer("linear plant", peer))
+            for name, (value, peer) in zip(("p50", "p99"), found.values(), strict=True)
+        ),
+        Row(f"{case.name}: p99, of {period_us / 1e3:g} ms", share, "%", goal=case.goal),
+    ]
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Time all plants."""
+    rows = []
+    for case in CASES:
+        say(case.name)
+        rows += rows_of(case, *timed(case))
+    return rows
+
+
+BENCHMARK = Benchmark("plants", "Cost per step of the plants", measure)
+
+if __name__ == "__main__":
+    sys.exit(run([BENCHMARK]))

@@ -1,0 +1,179 @@
+"""What each machine's rows must be, computed anew from the scenario; batch after batch.
+
+The replay at a run's end compares with the machines themselves. These are other computations of
+the same rules, over whole batches, and to rounding.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record import Rows, updates_in
+from noack.linear import discretise, transition
+from noack.records import NO_SEQUENCE, effective
+from noack.resolve import loop_of
+from noack.scenario import Scenario
+
+Reals = NDArray[np.float64]
+
+_ROUNDING = 1e-12
+"""Of one step, relative to what it is computed from."""
+
+
+class PlantSteps:
+    """x(t_k) = Ad x(t_{k−1}) + Bd u(t_{k−1}), on the grid."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        loop = loop_of(scenario)
+        self._period_ns = scenario.plant_period_ns
+        self._Ad, self._Bd = discretise(loop.A, loop.B, self._period_ns)
+        self._last: Rows | None = None
+
+    def take(self, rows: Rows) -> Iterator[str]:
+        """Take rows of ``plant_step``; yield what is wrong."""
+        if self._last is not None:
+            rows = np.concatenate([self._last, rows])
+        self._last = rows[-1:]
+        yield from _on_grid("plant_step", rows, self._period_ns)
+        before = rows[:-1]
+        x = before["x"] @ self._Ad.T + before["u"] @ self._Bd.T
+        size = np.abs(before["x"]) @ np.abs(self._Ad.T) + np.abs(before["u"]) @ np.abs(self._Bd.T)
+        yield from _unlike("plant_step", rows[1:], "x", x, size)
+        if (np.diff(rows["actuation"]) < 0).any():
+            yield f"plant_step: an older input is latched near t = {rows['t_ns'][0]} ns"
+
+
+class SensorSteps:
+    """x_s follows its model from event to event; an event is where the threshold is exceeded."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        loop, trigger = loop_of(scenario), scenario.decaying
+        self._period_ns = scenario.measurement_period_ns
+        self._step = transition(loop.H, self._period_ns)
+        self._weight = np.eye(loop.n) if loop.weight is None else loop.weight
+        self._trigger = trigger
+        self._first_is_event = scenario.network.initial_sync == "first_packet"
+        self._last: Rows | None = None
+        self._events = 0
+
+    def take(self, rows: Rows) -> Iterator[str]:
+        """Take rows of ``sensor_measurement``; yield what is wrong."""
+        events = rows["event"][rows["event"] != NO_SEQUENCE]
+        if (events != self._events + np.arange(len(events))).any():
+            yield f"sensor_measurement: events are not numbered in turn from {self._events} on"
+        self._events += len(events)
+        exceeds = rows["compared"] > rows["threshold"]
+        if self._last is None and self._first_is_event:
+            exceeds[0] = True
+        wrong = np.flatnonzero(exceeds != (rows["event"] != NO_SEQUENCE))
+        if len(wrong):
+            at_ns = rows["t_ns"][wrong[0]]
+            yield f"sensor_measurement: the trigger is not obeyed at t = {at_ns} ns"
+        faded = self._trigger.beta * np.exp(-self._trigger.alpha_per_s * 1e-9 * rows["t_ns"])
+        threshold = np.maximum(faded, self._trigger.floor)
+        yield from _unlike("sensor_measurement", rows, "threshold", threshold, threshold)
+        weighted = (rows["x_s"] - rows["x"]) @ self._weight.T
+        norms = np.linalg.norm(weighted, axis=1)
+        for column in ("e_s_norm", "compared"):
+            yield from _unlike("sensor_measurement", rows, column, norms, norms)
+        if self._last is not None:
+            rows = np.concatenate([self._last, rows])
+        self._last = rows[-1:]
+        yield from _on_grid("sensor_measurement", rows, self._period_ns)
+        before = rows[:-1]
+        reset = (before["event"] != NO_SEQUENCE)[:, None]
+        x_s = np.where(reset, before["x"], before["x_s"])
+        size = np.abs(x_s) @ np.abs(self._step.T)
+        yield from _unlike("sensor_measurement", rows[1:], "x_s", x_s @ self._step.T, size)
+
+
+class ControllerTicks:
+    """u = K x_c at every tick."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._K = loop_of(scenario).K
+        self._period_ns = scenario.controller_period_ns
+        self._phase_ns = scenario.controller_phase_ns
+        self._next = 0
+
+    def take(self, rows: Rows) -> Iterator[str]:
+        """Take rows of ``controller_step``; yield what is wrong."""
+        if (rows["sequence"] != self._next + np.arange(len(rows))).any():
+            yield f"controller_step: ticks are not numbered in turn from {self._next} on"
+        self._next += len(rows)
+        if (rows["t_ns"] != self._phase_ns + rows["sequence"] * self._period_ns).any():
+            yield f"controller_step: a tick is off the grid near t = {rows['t_ns'][0]} ns"
+        size = np.abs(rows["x_c"]) @ np.abs(self._K.T)
+        yield from _unlike("controller_step", rows, "u", rows["x_c"] @ self._K.T, size)
+
+
+class Network:
+    """What the network lets through, and at most M − 1 in a row that it does not.
+
+    Args:
+        mansd: M − 1.
+    """
+
+    def __init__(self, mansd: int) -> None:
+        self._mansd = mansd
+        self._under_way: dict[int, int] = {}
+        self._packets = 0
+        self.longest_run = 0
+        self.overtaken = 0
+        """Updates that left after a newer one; the controller takes them for old ones."""
+
+    @property
+    def waiting(self) -> int:
+        """Updates that have not left yet."""
+        return len(self._under_way)
+
+    def take(self, packets: Rows, releases: Rows) -> tuple[list[int], list[int], list[str]]:
+        """Take rows of the network's tables that follow one another in the order of inputs.
+
+        Returns:
+            Numbers of the updates that came in, and that left, in order; and what is wrong.
+        """
+        updates, sequences, _ = updates_in(packets)
+        wrong = [] if len(updates) == len(packets) else ["netem_packet: something is no update"]
+        lost = ~effective(updates["fate"])
+        longest = int(updates["drop_run"][lost].max(initial=0))
+        self.longest_run = max(self.longest_run, longest)
+        if longest > self._mansd:
+            wrong.append(f"netem_packet: {longest} dropouts in a row, at most {self._mansd} agreed")
+        places = self._packets + np.arange(len(packets))
+        self._packets += len(packets)
+        if (packets["sequence"] != places).any():
+            wrong.append(f"netem_packet: packets are not numbered in turn from {places[0]} on")
+        left: list[tuple[int, int]] = []
+        for row, sequence in zip(updates[~lost], sequences[~lost].tolist(), strict=True):
+            if row["release_ns"] <= row["now_ns"]:
+                left.append((int(row["input"]), sequence))
+            else:
+                self._under_way[int(row["sequence"])] = sequence
+        for row in releases:
+            sequence = self._under_way.pop(int(row["sequence"]), None)
+            if sequence is None:
+                wrong.append(f"netem_release: packet {row['sequence']} was not under way")
+            elif row["stale"]:
+                self.overtaken += 1
+            else:
+                left.append((int(row["input"]), sequence))
+        return sequences.tolist(), [sequence for _, sequence in sorted(left)], wrong
+
+
+def _on_grid(table: str, rows: Rows, period_ns: int) -> Iterator[str]:
+    grid_ns = rows["sequence"] * period_ns
+    if (np.diff(rows["sequence"]) != 1).any() or (rows["t_ns"] != grid_ns).any():
+        yield f"{table}: not one row for each point of the grid near t = {rows['t_ns'][0]} ns"
+
+
+def _unlike(table: str, rows: Rows, column: str, expected: Reals, size: Reals) -> Iterator[str]:
+    """Yield where a column is not as computed, up to rounding relative to what it comes from."""
+    tiny = np.finfo(float).tiny
+    wrong = ~(np.abs(rows[column] - expected) <= _ROUNDING * (size + tiny))
+    if wrong.ndim == 2:
+        wrong = wrong.any(axis=1)
+    if wrong.any():
+        at_ns = rows["t_ns"][np.argmax(wrong)]
+        yield f"{table}: {column} is not as computed anew at t = {at_ns} ns"

@@ -1,0 +1,260 @@
+"""Carries out a soak: a run as a user starts one, looked at every few seconds."""
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks._report import MeasurementError
+from benchmarks.soak.figure import memory_figure
+from benchmarks.soak.invariants import Invariants
+from benchmarks.soak.result import Result, Watched
+from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
+from cosim.report.save import save
+from cosim.run_dir import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from noack.clock import NS_PER_S
+from noack.io.spool import SpoolTail
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.topology import LOOP_ROLES, RECORDER
+
+RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
+FREE_PORTS = ("--set", "ports={}")
+_POLL_S = 0.25
+_START_PATIENCE_S = 120.0
+_LEAST_LOOKS = 150
+"""As many samples at least, so that each window has several."""
+_LONGEST_PAUSE_S = 5.0
+_LAST_S = 1.0
+"""Before the horizon: then processes begin to end."""
+_SAY_S = 300.0
+_STUCK_S = 120.0
+"""Wall time without a new row, far beyond what a busy machine makes of a poll."""
+_END_PATIENCE = 4.0
+"""The end may take so many times as long as the loop, and ten minutes."""
+_EXIT_PATIENCE_S = 10.0
+
+Say = Callable[[str], None]
+
+
+def soak(path: Path, settings: tuple[str, ...], runs: Path, say: Say) -> Result:
+    """Soak a scenario.
+
+    Args:
+        path: the scenario file; its trigger is the paper's, and nothing is acknowledged.
+        settings: values to replace, as after ``--set``.
+        runs: where the run directory is made, in a folder of its own.
+        say: is told, now and then, how far it is.
+
+    Raises:
+        MeasurementError: the run never began.
+    """
+    runs.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
+    command = [sys.executable, "-m", "cosim.cli", "run", str(path.resolve()), "--json"]
+    command += ["--runs", str(folder), *FREE_PORTS]
+    for setting in settings:
+        command += ["--set", setting]
+    with (
+        (folder / "stdout.json").open("w") as stdout,
+        (folder / "stderr.log").open("w") as stderr,
+        subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr) as run,
+    ):
+        processes = Processes(run.pid)
+        try:
+            run_dir = _started(run, folder)
+            return _Soak(run, run_dir, processes, say).watch()
+        finally:
+            if run.poll() is None:
+                processes.kill()
+
+
+def _started(run: "subprocess.Popen[bytes]", folder: Path) -> Path:
+    deadline_s = time.monotonic() + _START_PATIENCE_S
+    latest = folder / LATEST
+    while time.monotonic() < deadline_s and run.poll() is None:
+        if latest.exists() and (latest / SPOOL).is_dir():
+            return latest.resolve()
+        time.sleep(0.05)
+    said = (folder / "stderr.log").read_text(errors="replace").strip().splitlines()
+    raise MeasurementError(f"the run never began: {said[-1] if said else 'it said nothing'}")
+
+
+class _Soak:
+    def __init__(
+        self, run: "subprocess.Popen[bytes]", run_dir: Path, processes: Processes, say: Say
+    ) -> None:
+        self._run = run
+        self._run_dir = run_dir
+        self._processes = processes
+        self._say = say
+        self._scenario: Scenario = load(run_dir / SCENARIO_FILE)
+        self._length_s = self._scenario.horizon_s / self._scenario.speed
+        self._invariants = Invariants(self._scenario)
+        self._tail = SpoolTail(run_dir / SPOOL)
+        self._looks: dict[str, list[tuple[float, Sample]]] = {}
+        self._faults: list[str] = []
+
+    def watch(self) -> Result:
+        began_s, disk_bytes = self._loop()
+        end_began_s = time.monotonic()
+        peaks = self._end(_END_PATIENCE * self._length_s + 600.0)
+        self._read(final=True)
+        self._tail.close()
+        ended_s = time.monotonic()
+        summary = self._judge_end()
+        watched = self._watched(began_s, min(self._length_s, end_began_s - began_s) - _LAST_S)
+        for role in (*LOOP_ROLES, RECORDER, LAUNCHER):
+            if role not in watched:
+                self._faults.append(f"{role}: was never seen")
+            else:
+                self._faults += watched[role].faults(role)
+        self._faults += self._invariants.broken
+        result = Result(
+            self._scenario.name, self._run_dir, end_began_s - began_s, ended_s - end_began_s, peaks,
+            disk_bytes, watched, self._invariants.account(), summary, self._faults,
+        )  # fmt: skip
+        (self._run_dir / RESULT_FILE).write_text(result.dumps(), encoding="utf-8")
+        if watched:
+            save(memory_figure(result), self._run_dir / PICTURE_FILE)
+        return result
+
+    def _watched(self, began_s: float, length_s: float) -> dict[str, Watched]:
+        """What was seen between the run's first and last second."""
+        found = {}
+        for role in (*LOOP_ROLES, RECORDER, LAUNCHER):
+            looks = [
+                (at_s - began_s, sample)
+                for at_s, sample in self._looks.get(role, ())
+                if 0 <= at_s - began_s <= length_s
+            ]
+            if looks:
+                at_s, samples = zip(*looks, strict=True)
+                found[role] = Watched(at_s, samples, length_s)
+        return found
+
+    def _loop(self) -> tuple[float, int]:
+        """Look at the run until its horizon.
+
+        Returns:
+            When it was at t = 0, by our clock: a row that is read now was made before, so that the
+            earliest that any row gives is the best. And what the run directory had grown to.
+        """
+        pause_s = min(self._length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
+        look_s = told_s = moved_s = time.monotonic()
+        began_s, told, newest_ns, disk_bytes = math.inf, 0, 0, 0
+        while self._run.poll() is None and newest_ns < self._scenario.horizon_ns:
+            self._read()
+            now_s = time.monotonic()
+            if self._invariants.t_ns > newest_ns:
+                newest_ns, moved_s = self._invariants.t_ns, now_s
+                began_s = min(began_s, now_s - newest_ns / NS_PER_S / self._scenario.speed)
+            if newest_ns and now_s >= look_s:
+                self._look(now_s)
+                disk_bytes = size_bytes(self._run_dir)
+                look_s = max(look_s + pause_s, now_s)
+            if now_s - moved_s > _STUCK_S:
+                self._faults.append(f"nothing was recorded for {_STUCK_S:g} s; the run was ended")
+                self._run.terminate()
+                break
+            share = newest_ns / self._scenario.horizon_ns
+            if int(10 * share) > told or now_s - told_s > _SAY_S:
+                told, told_s = int(10 * share), now_s
+                self._say(self._progress(share))
+            time.sleep(min(_POLL_S, pause_s))
+        return min(began_s, time.monotonic()), disk_bytes
+
+    def _end(self, patience_s: float) -> Mapping[str, float]:
+        """Wait until the launcher is through; return most memory meanwhile, by process."""
+        deadline_s = time.monotonic() + patience_s
+        self._say("the loop is at its horizon; the run is replayed and judged")
+        peaks: dict[str, float] = {}
+        while self._run.poll() is None:
+            for role, sample in self._processes.sample().items():
+                if role in (LAUNCHER, RECORDER):
+                    peaks[role] = max(peaks.get(role, 0.0), sample.rss_kib)
+            self._read()
+            if time.monotonic() > deadline_s:
+                self._faults.append(f"the end of the run took more than {patience_s:.0f} s")
+                self._processes.kill()
+            time.sleep(_POLL_S)
+        return peaks
+
+    def _look(self, at_s: float) -> None:
+        for role, sample in self._processes.sample().items():
+            self._looks.setdefault(role, []).append((at_s, sample))
+
+    def _read(self, *, final: bool = False) -> None:
+        for table, first, payload in self._tail.read():
+            self._invariants.take(table, first, payload)
+        self._invariants.advance(final=final)
+
+    def _progress(self, share: float) -> str:
+        memory = ", ".join(
+            f"{role} {looks[-1][1].uss_kib / 1024:.1f}" for role, looks in self._looks.items()
+        )
+        account = self._invariants
+        return (
+            f"{100 * share:.0f} % of {self._scenario.horizon_s:g} s; own memory in MiB: {memory}; "
+            f"{sum(account.rows.values()):,} rows, {account.broken_count} broken"
+        )
+
+    def _judge_end(self) -> dict[str, Any]:
+        """Look at what the run says of itself, and at what it left behind."""
+        faults = self._faults
+        if alive := self._processes.left_behind(_EXIT_PATIENCE_S):
+            faults.append(f"left behind: {', '.join(alive)}")
+            self._processes.kill()
+        if not (self._run_dir / RECORD).is_dir() or (self._run_dir / SPOOL).exists():
+            faults.append("the record was not finished")
+        status = self._run.wait()
+        try:
+            summary: dict[str, Any] = json.loads((self._run_dir / SUMMARY_FILE).read_text())
+        except (OSError, ValueError) as error:
+            faults.append(f"no summary: {error}; exit status {status}")
+            return {}
+        faults += ended_badly(summary, status, self._invariants.rows, self._invariants.overtaken)
+        return summary
+
+
+def ended_badly(
+    summary: Mapping[str, Any], status: int, rows: Mapping[str, int], overtaken: int = 0
+) -> list[str]:
+    """What a run's summary says that it must not say, in words.
+
+    Args:
+        summary: of the run.
+        status: exit status of ``noack run``.
+        rows: how many were seen on the way, by table.
+        overtaken: updates that left the network after a newer one.
+    """
+    faults = []
+    if status or summary["exit"]["status"]:
+        faults.append(f"exit status {status}: {summary['exit']['reason']}")
+    for key, right in (
+        ("missing_samples", 0),
+        ("lost_outside_netem", 0),
+        ("assumption_violations", []),
+        ("rejected_datagrams", {"controller": {"stale": overtaken}} if overtaken else {}),
+    ):
+        if summary[key] != right:
+            faults.append(f"{key}: {summary[key]}")
+    replay = summary["replay"] or {}
+    if not (replay.get("bit_exact") and replay.get("complete")):
+        faults.append(f"the replay: {replay}")
+    elif replay["inputs"] != sum(rows.values()):
+        faults.append(f"{replay['inputs']} inputs in the record, {sum(rows.values())} on the way")
+    faults += [
+        f"claim violated since {claim['since_s']} s: {claim['what']} ({claim['source']})"
+        for claim in summary["claims"]
+        # The paper's own bounds presuppose more than a sampled loop has; then they say so.
+        if claim["verdict"] == "violated" and not claim["why"]
+    ]
+    if not summary["claims"]:
+        faults.append("no claim was judged")
+    return faults

@@ -1,0 +1,96 @@
+"""Watches the processes of a run from outside."""
+
+import contextlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import psutil
+
+LAUNCHER = "launcher"
+MODULES: Mapping[str, str] = {
+    "recorder": "cosim.recorder",
+    "netem": "netem",
+    "plant": "plant_server",
+    "sensor": "sensor_node",
+    "controller": "controller_node",
+}
+
+
+class Sample(NamedTuple):
+    """What the system says of a process."""
+
+    rss_kib: float
+    pss_kib: float
+    uss_kib: float
+    """What is the process's own, and judged: what it shares with others is no leak of its."""
+    fds: int
+    sockets: int
+    threads: int
+    cpu_s: float
+
+
+class Processes:
+    """The launcher of a run and its processes.
+
+    Args:
+        launcher: process id of ``noack run``.
+    """
+
+    def __init__(self, launcher: int) -> None:
+        self._known = {LAUNCHER: psutil.Process(launcher)}
+
+    @property
+    def roles(self) -> set[str]:
+        """Who has been seen."""
+        return set(self._known)
+
+    def sample(self) -> dict[str, Sample]:
+        """Look at every process that is alive."""
+        self._find()
+        found = {}
+        for role, process in self._known.items():
+            with contextlib.suppress(psutil.Error):
+                found[role] = _sample(process)
+        return found
+
+    def left_behind(self, patience_s: float) -> list[str]:
+        """Who is alive although the run is over."""
+        _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)
+        return sorted(role for role, process in self._known.items() if process in alive)
+
+    def kill(self) -> None:
+        """End them all; the launcher last."""
+        for process in reversed(self._known.values()):
+            with contextlib.suppress(psutil.Error):
+                process.kill()
+
+    def _find(self) -> None:
+        if len(self._known) > len(MODULES):
+            return
+        with contextlib.suppress(psutil.Error):
+            for child in self._known[LAUNCHER].children(recursive=True):
+                for role, module in MODULES.items():
+                    if role not in self._known and module in child.cmdline():
+                        self._known[role] = child
+
+
+def _sample(process: psutil.Process) -> Sample:
+    with process.oneshot():
+        memory = process.memory_full_info()
+        cpu = process.cpu_times()
+        threads = process.num_threads()
+    pss = getattr(memory, "pss", memory.uss)
+    return Sample(
+        memory.rss / 1024, pss / 1024, memory.uss / 1024, process.num_fds(),
+        len(process.net_connections("all")), threads, cpu.user + cpu.system,
+    )  # fmt: skip
+
+
+def size_bytes(folder: Path) -> int:
+    """What a folder takes on the disk; files may vanish meanwhile."""
+    total = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(OSError):
+            total += path.stat().st_blocks * 512
+    return total

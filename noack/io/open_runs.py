@@ -1,0 +1,126 @@
+"""Runs that go on now, and how their owner reaches them from another terminal.
+
+The launcher keeps a file for each (:mod:`noack.io.held`). It holds what opens the run's control
+plane, from which the key that authenticates the loop's datagrams cannot be found.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+from pydantic import TypeAdapter, ValidationError
+
+from noack.errors import CallerError, PeerError
+from noack.io import held
+from noack.io.messages import Answer, heard
+from noack.io.plane import secret_of
+from noack.io.star import Secret, answer_to, cause_of, open_star
+from noack.io.ticket import Ticket
+from noack.mistakes import brief
+
+_KIND = "runs"
+_ANSWER_S = 10.0
+
+
+class OpenRun(NamedTuple):
+    """How to reach a run."""
+
+    run_id: str
+    """As its control plane's keys have it."""
+    run_dir: str
+    session: str | None
+    """Name of the session that people's processes join; None if all were launched."""
+    endpoint: str
+    """zenoh endpoint of the control plane."""
+    user: str
+    password: str
+
+
+_OPEN_RUN = TypeAdapter(OpenRun)
+
+
+@contextmanager
+def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
+    """Keep a run's file while the context lasts.
+
+    Raises:
+        CallerError: the folder is not the user's own.
+        OSError: the file cannot be written.
+    """
+    secret = secret_of(ticket)
+    run_id = f"{ticket.run_id:016x}"
+    run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
+    with ExitStack() as stack:
+        path = held.make_folder(_KIND) / f"{run_id}.json"
+        yield stack.enter_context(held.held(path, run._asdict()))
+
+
+def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
+    """Return the newest run of this user that goes on.
+
+    Args:
+        session: the one of this session.
+        run_dir: the one with this run directory.
+
+    Raises:
+        CallerError: there is none.
+    """
+    found = [run for path in _newest_first() if (run := _read(path)) is not None]
+    fitting = [
+        run
+        for run in found
+        if (session is None or run.session == session)
+        and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
+    ]
+    if fitting:
+        return fitting[0]
+    if not found:
+        raise CallerError("no run goes on; start one, e.g. `noack demo`")
+    which = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
+    others = ", ".join(run.run_dir for run in found)
+    raise CallerError(f"no run goes on {which}; there is {others}")
+
+
+def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Ask a run for a change of settings, or with none what they are; return its answer.
+
+    Raises:
+        CallerError: what was asked for is wrong; one line per mistake.
+        PeerError: the run does not answer.
+    """
+    secret = Secret(run.user, run.password)
+    try:
+        star = open_star(run.endpoint, secret, listen=False)
+    except zenoh.ZError as error:
+        raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
+    try:
+        question = json.dumps({"settings": dict(settings)})
+        answer = answer_to(star, f"noack/{run.run_id}/knobs", question, _ANSWER_S)
+    finally:
+        star.close()  # type: ignore[no-untyped-call]
+    if answer is None:
+        raise PeerError(f"{run.run_dir}: the run does not answer")
+    return heard(Answer, answer)
+
+
+def _newest_first() -> list[Path]:
+    def written_ns(path: Path) -> int:
+        try:
+            return path.stat().st_mtime_ns
+        except FileNotFoundError:  # it has ended meanwhile
+            return 0
+
+    return sorted(held.running(_KIND), key=written_ns, reverse=True)
+
+
+def _read(path: Path) -> OpenRun | None:
+    try:
+        return _OPEN_RUN.validate_json(path.read_bytes(), strict=True)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValidationError) as error:
+        what = brief(error) if isinstance(error, ValidationError) else error.strerror
+        raise PeerError(f"{path}: what tells of a run cannot be read: {what}") from None

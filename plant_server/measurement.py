@@ -1,0 +1,61 @@
+"""What is measured of a plant: y = C x + v, v a function of the measurement's number."""
+
+import numpy as np
+
+from noack.linear import Matrix, Vector
+from noack.rng import normals, uniforms
+from noack.scenario import Scenario
+
+_BLOCK = 256
+"""Measurements whose noise is computed at once."""
+
+
+class Measuring:
+    """Measures, with noise.
+
+    Args:
+        C: shape (p, n); None for the identity, whose y = x + v is exact.
+        std: standard deviation of the normally distributed part of v, shape (p,).
+        bound: bound of the uniformly distributed part, shape (p,).
+        seed: of the noise.
+    """
+
+    def __init__(self, C: Matrix | None, std: Vector, bound: Vector, seed: int) -> None:
+        self._C = C
+        self._std = std
+        self._bound = bound
+        self._seed = seed
+        self._noisy = bool(std.any() or bound.any())
+        self._first = -1
+        self._v = np.zeros((0, len(std)))
+
+    def __call__(self, x: Vector, number: int) -> Vector:
+        """Return y of a measurement, shape (p,)."""
+        y = x if self._C is None else self._C @ x
+        return y + self._noise(number) if self._noisy else y
+
+    def _noise(self, number: int) -> Vector:
+        first = number - number % _BLOCK
+        if first != self._first:
+            self._first = first
+            rows, width = range(first, first + _BLOCK), len(self._std)
+            name = ("plant", "measurement")
+            normal = normals(self._seed, *name, "normal", rows=rows, width=width)
+            unit = uniforms(self._seed, *name, "uniform", rows=rows, width=width)
+            self._v = self._std * normal + self._bound * (2.0 * unit - 1.0)
+        noise: Vector = self._v[number - first]
+        return noise
+
+
+def measuring_of(resolved: Scenario) -> Measuring | None:
+    """Return how the plant of a resolved scenario is measured; None: x itself, and exactly."""
+    settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
+    if settings.selects_all(n) and not settings.is_noisy:
+        return None
+    p = resolved.outputs
+    std, bound = (
+        np.zeros(p) if given is None else np.array(given)
+        for given in (settings.noise_std, settings.noise_bound)
+    )
+    C = None if settings.selects_all(n) else np.array(settings.C)
+    return Measuring(C, std, bound, resolved.seeds.noise)

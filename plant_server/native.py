@@ -1,0 +1,82 @@
+"""What running somebody else's native code needs: a folder to unpack it in, and quiet around it."""
+
+import ctypes
+import fcntl
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_PREFIX = "noack-native-"
+_STREAMS = (1, 2)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Make a folder of this user alone; remove it at the end, and those of the killed before it.
+
+    A lock on the folder, which ends with its process however that ends, tells that it is in use.
+    """
+    for left in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        _remove_if_left(left)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+        lock = _locked(folder)
+        if lock is not None and folder.is_dir():
+            break
+        if lock is not None:  # another process took it for left before it was locked
+            os.close(lock)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
+
+
+def _remove_if_left(folder: Path) -> None:
+    with suppress(OSError):
+        if folder.lstat().st_uid != os.getuid():
+            return
+        lock = _locked(folder)
+        if lock is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(lock)
+
+
+def _locked(folder: Path) -> int | None:
+    """A lock on a folder, as a file descriptor; None if there is one already, or no folder."""
+    try:
+        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Let nothing through that native code prints meanwhile: it might do so at every step."""
+    kept = []
+    with suppress(OSError):  # a stream that is closed stays closed
+        for stream in _STREAMS:
+            kept.append((stream, os.dup(stream)))  # noqa: PERF401
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream, _ in kept:
+        os.dup2(null, stream)
+    os.close(null)
+    try:
+        yield
+    finally:
+        _LIBC.fflush(None)  # or its buffer is printed later
+        for stream, copy in kept:
+            os.dup2(copy, stream)
+            os.close(copy)
+
+
+_LIBC = ctypes.CDLL(None)

@@ -1,0 +1,182 @@
+"""A run under attack: started by hand, so that its ticket with the key can be read by its owner."""
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from cosim.record import RunRecord, load_record
+from noack.io.ticket import Ticket, loads
+from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, PLANT_ACTUATION, SENSOR_MEASUREMENT
+from noack.resolve import loop_of
+from noack.topology import LEGS, LOOP_ROLES, SENDER
+from noack.wire import Flow
+from tests.attacks.kinds import Target
+from tests.attacks.sender import Plan
+
+PATIENCE_S = 150.0
+Sent = Mapping[str, Mapping[str, Mapping[str, Mapping[str, int]]]]
+"""By role, sender, kind and expected reason."""
+
+
+@dataclass(frozen=True)
+class Attacked:
+    """What became of a run under attack."""
+
+    status: int
+    summary: Mapping[str, Any]
+    stderr: str
+    record: RunRecord
+    sent: Sent
+
+    def channel(self, role: str) -> Mapping[str, Any]:
+        """A process's account of its datagrams."""
+        found: Mapping[str, Any] = self.record.reports[role]["channel"]
+        return found
+
+    def accepted(self, role: str) -> int:
+        """How many datagrams a process took; the network emulator, which verifies none, relayed."""
+        relayed = len(self.record[NETEM_PACKET])
+        return int(self.channel(role).get("accepted", relayed))
+
+    def sent_to(self, role: str) -> Counter[str]:
+        """How many of the attacker's datagrams a process should have rejected, by reason."""
+        total: Counter[str] = Counter()
+        for kinds in self.sent.get(role, {}).values():
+            for reasons in kinds.values():
+                total.update(reasons)
+        return total
+
+
+def may_forge_addresses() -> bool:
+    """Whether this user may send with another's address."""
+    try:
+        socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_UDP).close()
+    except OSError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def run_by_hand(folder: Path, *arguments: str) -> Iterator["Run"]:
+    """Start a run, one process at a time; whatever is left is killed at the end."""
+    environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+
+    def start(*command: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-m", "cosim.cli", *command, "--json"], env=environment, text=True,
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+
+    runs = folder / "runs"
+    recording = start(
+        "record", "lane_following", "--runs", str(runs), "--no-report",
+        "--set", "ports={}", *arguments,
+    )  # fmt: skip
+    processes = {role: start(role) for role in LOOP_ROLES}
+    try:
+        yield Run(folder, recording, processes)
+    finally:
+        for process in (recording, *processes.values()):
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+
+
+class Run:
+    """A run under way."""
+
+    def __init__(
+        self, folder: Path, recording: "subprocess.Popen[str]",
+        processes: Mapping[str, "subprocess.Popen[str]"],
+    ) -> None:  # fmt: skip
+        self.processes = processes
+        self._folder = folder
+        self._recording = recording
+
+    def targets(self) -> list[Target]:
+        """Wait until the loop runs; return its processes, with where they listen."""
+        ticket = self._ticket()
+        run_dir = Path(ticket.run_dir)
+        for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
+            spooled = run_dir / "spool" / f"{table}.recorder"
+            self._wait(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 0)
+        ports = {role: _port(process.pid) for role, process in self.processes.items()}
+        loop = loop_of(ticket.scenario)
+        return [
+            Target(
+                role, ports[role], ports[SENDER[role]], LEGS[role].receives,
+                loop.m if LEGS[role].receives is Flow.ACTUATION else loop.n,
+                ticket.run_id, ticket.key,
+            )
+            for role in LOOP_ROLES
+        ]  # fmt: skip
+
+    def finish(self, sent: Sent) -> Attacked:
+        """Wait for the end."""
+        stdout, stderr = self._recording.communicate(timeout=PATIENCE_S + 600)
+        for process in self.processes.values():
+            process.communicate(timeout=PATIENCE_S)
+        statuses = [self._recording.returncode, *(p.returncode for p in self.processes.values())]
+        record = load_record((self._folder / "runs" / "latest").resolve())
+        return Attacked(max(statuses), json.loads(stdout), stderr, record, sent)
+
+    def _ticket(self) -> Ticket:
+        path = self._folder / f"noack-{os.getuid()}" / "default.json"
+        self._wait(path.exists)
+        return loads(path.read_text())
+
+    def _wait(self, condition: Any) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert self._recording.poll() is None, self._recording.communicate()
+            assert time.monotonic() < deadline_s, "waited in vain"
+            time.sleep(0.02)
+
+
+def _port(pid: int) -> int:
+    (port,) = {
+        connection.laddr.port
+        for connection in psutil.Process(pid).net_connections("udp4")
+        if not connection.raddr
+    }
+    return port
+
+
+def attack(
+    folder: Path, per_port: int, rate_hz: float, *, forge_addresses: bool, speed: float = 1.0
+) -> Attacked:
+    """Attack all four ports of a run of the paper's example while it runs.
+
+    Args:
+        folder: takes the run.
+        per_port: datagrams to each port.
+        rate_hz: how many of them a second.
+        forge_addresses: whether to send in the peers' names, too.
+        speed: of the run.
+    """
+    sending_s = per_port / rate_hz
+    horizon_s = speed * (1.5 * sending_s + 7.0)
+    with run_by_hand(
+        folder, "--set", f"speed={speed}", "--set", f"horizon_s={horizon_s:.0f}"
+    ) as run:
+        targets = run.targets()
+        plan = Plan(
+            targets, per_port, rate_hz, forge_addresses,
+            until_s=time.monotonic() + 1.5 * sending_s + 3.0,
+        )  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-m", "tests.attacks.sender"], input=plan.dumps(), text=True,
+            stdout=subprocess.PIPE, check=True, timeout=2 * sending_s + PATIENCE_S,
+        )  # fmt: skip
+        return run.finish(json.loads(done.stdout))

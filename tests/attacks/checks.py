@@ -1,0 +1,80 @@
+"""What must hold of a run under attack; each check yields what is wrong, a line each."""
+
+from collections.abc import Callable, Iterator, Mapping
+
+from noack.io.udp import SHED
+from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, PLANT_ACTUATION, SENSOR_MEASUREMENT
+from noack.topology import LOOP_ROLES, SENDER
+from tests.attacks.attacked import Attacked
+
+_TAKEN = {
+    "plant": PLANT_ACTUATION,
+    "sensor": SENSOR_MEASUREMENT,
+    "netem": NETEM_PACKET,
+    "controller": CONTROLLER_DELIVERY,
+}
+
+
+def ends_well(run: Attacked) -> Iterator[str]:
+    """The run reaches its horizon, and every process ends by itself."""
+    if run.status != 0:
+        yield f"exit status {run.status}: {run.stderr.strip()}"
+    if run.summary["exit"]["reason"] != "horizon":
+        yield f"ended: {run.summary['exit']['reason']}"
+
+
+def nothing_is_accepted(run: Attacked) -> Iterator[str]:
+    """Each process took as many datagrams as its peer sent, and no others."""
+    for role in LOOP_ROLES:
+        sent = run.channel(SENDER[role])["sent"]
+        taken = len(run.record[_TAKEN[role]])
+        if not sent == run.accepted(role) == taken:
+            yield f"{role}: {sent} from its peer, {run.accepted(role)} accepted, {taken} acted on"
+
+
+def all_are_accounted_for(run: Attacked) -> Iterator[str]:
+    """What was sent was rejected, each for its reason, or shed by the kernel before it was read."""
+    for role in LOOP_ROLES:
+        expected, rejected = run.sent_to(role), dict(run.channel(role)["rejected"])
+        shed = rejected.pop(SHED, 0)
+        if sum(rejected.values()) + shed != expected.total():
+            yield f"{role}: {expected.total()} sent, {rejected} and {shed} shed"
+        for reason, n in rejected.items():
+            if n > expected[reason]:
+                yield f"{role}: {n} rejected for {reason}, {expected[reason]} expected"
+
+
+def nothing_is_lost(run: Attacked) -> Iterator[str]:
+    """The loop's own datagrams all arrive, and all that happened is in the record."""
+    for key in ("lost_outside_netem", "missing_samples"):
+        if run.summary[key]:
+            yield f"{key}: {run.summary[key]}, {run.summary['lost_by_leg']}"
+    for role in LOOP_ROLES:
+        if run.channel(role)["lost_in_kernel"] not in (0, None):
+            yield f"{role}: {run.channel(role)['lost_in_kernel']} lost in the kernel"
+
+
+def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
+    """The machines put out what they put out for these inputs, and (I1) holds to rounding."""
+    if not (run.summary["replay"]["bit_exact"] and run.summary["replay"]["complete"]):
+        yield f"replay: {run.summary['replay']}"
+    if not run.summary["identity_residual_max"] < 1e-11:
+        yield f"identity residual {run.summary['identity_residual_max']}"
+
+
+def no_claim_is_violated(run: Attacked) -> Iterator[str]:
+    """What is certified holds; void it may be, as a busy machine is late."""
+    claims = run.summary["claims"]
+    if not any("state" in claim["what"] and claim["certified"] is not None for claim in claims):
+        yield "no envelope of the state is claimed"
+    yield from (str(claim) for claim in claims if claim["verdict"] == "violated")
+    yield from (str(violation) for violation in run.summary["assumption_violations"])
+
+
+CHECKS: Mapping[str, Callable[[Attacked], Iterator[str]]] = {
+    check.__name__: check
+    for check in (
+        ends_well, nothing_is_accepted, all_are_accounted_for, nothing_is_lost,
+        the_loop_computes_what_it_should, no_claim_is_violated,
+    )
+}  # fmt: skip

@@ -1,0 +1,88 @@
+"""Thousands of hostile datagrams of every kind at every port of a run: none is acted on."""
+
+import random
+from collections.abc import Iterator
+
+import pytest
+
+from noack.topology import LOOP_ROLES
+from noack.wire import Decoder, Encoder, Flow, Message, Rejection
+from tests.attacks.attacked import Attacked, attack, may_forge_addresses
+from tests.attacks.checks import CHECKS
+from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target
+from tests.attacks.sender import PEER, STRANGER
+
+PER_PORT = 10_000
+RATE_HZ = 4000.0
+
+
+@pytest.fixture(scope="module")
+def attacked(tmp_path_factory: pytest.TempPathFactory) -> Attacked:
+    return attack(
+        tmp_path_factory.mktemp("attacked"), PER_PORT, RATE_HZ,
+        forge_addresses=may_forge_addresses(),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("check", CHECKS.values(), ids=CHECKS)
+def test_under_attack(attacked: Attacked, check: "type[Iterator[str]]") -> None:
+    assert list(check(attacked)) == []
+
+
+def test_every_kind_was_sent_to_every_port(attacked: Attacked) -> None:
+    for role in LOOP_ROLES:
+        assert attacked.sent[role][STRANGER].keys() == FROM_ANYWHERE.keys()
+        assert attacked.sent_to(role).total() > 1000  # as many as a busy machine sends in time
+
+
+def test_what_comes_with_a_peers_address_is_rejected_by_its_content(attacked: Attacked) -> None:
+    if not may_forge_addresses():
+        pytest.skip("only an administrator may send with another's address")
+    for role in ("plant", "sensor", "controller"):
+        assert attacked.sent[role][PEER].keys() == FROM_THE_PEER.keys()
+        assert attacked.channel(role)["rejected"]["stale"] > 0
+
+
+@pytest.mark.parametrize("dimension", [1, 4])
+@pytest.mark.parametrize("kind", FROM_ANYWHERE)
+def test_a_kind_is_what_it_says(kind: str, dimension: int) -> None:
+    """Of a stranger and in the peer's name, with the reasons that the kind allows."""
+    target = Target("sensor", 1, 2, Flow.MEASUREMENT, dimension, 9, bytes(range(32)))
+    allowed = {
+        "empty": {"length"},
+        "noise": {"length", "version"},
+        "forged": {"tag"},
+        "flipped": {"version", "length", "run", "flow", "tag"},
+        "truncated": {"length"},
+        "oversized": {"length"},
+        "replayed": {"source", "stale"},
+        "cross_run": {"run", "tag"},
+        "cross_flow": {"flow"},
+        "elsewhere": {"source"},
+    }[kind]
+    expected, draw, seen = Expected(target), random.Random(3), set()
+    for _ in range(300):
+        data = FROM_ANYWHERE[kind](target, draw)
+        seen.add(expected.reason(data, from_peer=False))
+        if kind in FROM_THE_PEER:
+            seen.add(expected.reason(data, from_peer=True))
+    assert seen == {Rejection(reason) for reason in allowed}
+
+
+def test_a_dropped_update_can_be_delivered_late_but_not_twice_nor_after_a_newer_one() -> None:
+    """What is left to somebody who may send in the network's name, and has no key.
+
+    A datagram that the network dropped is authentic and not yet used up. Whoever kept a copy can
+    deliver it, once, as long as no newer one has been: as a network with a delay might have.
+    """
+    key = bytes(range(32))
+    encoder, ear = Encoder(1, key), Decoder(Flow.UPDATE, 1, 1, key)
+    updates = [encoder.encode(Message(Flow.UPDATE, k, k, [float(k)])) for k in range(4)]
+    assert ear.decode(updates[0]) is not None
+    late = ear.decode(updates[1])  # dropped by the network, kept by the attacker
+    assert late is not None
+    assert late.vector.tolist() == [1.0]
+    assert ear.decode(updates[1]) is None
+    assert ear.decode(updates[3]) is not None
+    assert ear.decode(updates[2]) is None
+    assert ear.rejected[Rejection.STALE] == 2

@@ -1,0 +1,107 @@
+"""A soak of a few seconds; whether memory is flat, only a longer one can tell."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import benchmarks.soak
+from benchmarks.soak.__main__ import main
+from benchmarks.soak.result import Result
+from benchmarks.soak.run import PICTURE_FILE, RESULT_FILE, ended_badly, soak
+
+FOLDER = Path(benchmarks.soak.__file__).parent
+ROLES = {"plant", "sensor", "netem", "controller", "recorder", "launcher"}
+GOOD: dict[str, Any] = {
+    "exit": {"status": 0, "reason": "horizon"},
+    "missing_samples": 0,
+    "lost_outside_netem": 0,
+    "rejected_datagrams": {},
+    "assumption_violations": [],
+    "replay": {"bit_exact": True, "complete": True, "inputs": 7},
+    "claims": [
+        {"verdict": "held", "since_s": None, "what": "a", "source": "b", "why": ""},
+        {"verdict": "violated", "since_s": 1.0, "what": "a", "source": "b", "why": "presupposes"},
+        {"verdict": "void", "since_s": 1.0, "what": "a", "source": "b", "why": "late"},
+    ],
+}
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    runs = tmp_path_factory.mktemp("runs")
+    told: list[str] = []
+    found = soak(FOLDER / "day.toml", ("horizon_s=96", "speed=24"), runs, told.append)
+    assert told
+    return found
+
+
+def test_every_process_is_watched(result: Result) -> None:
+    assert set(result.watched) == ROLES
+    for watched in result.watched.values():
+        assert all(sample.uss_kib > 1000 and sample.threads >= 1 for sample in watched.samples)
+
+
+def test_a_real_run_breaks_nothing(result: Result) -> None:
+    assert result.account["broken"] == 0, result.account["first_broken"]
+    assert result.account["rows"]["plant_step"] == 96 * 40 + 1
+    assert result.account["events"] > 100
+    overtaken = result.account["overtaken"]
+    assert ended_badly(result.summary, 0, result.account["rows"], overtaken) == []
+
+
+def test_it_writes_figures_and_a_picture(result: Result) -> None:
+    assert result.run_dir is not None
+    written = json.loads((result.run_dir / RESULT_FILE).read_text())
+    assert set(written["processes"]) == ROLES
+    assert written["invariants"]["broken"] == 0
+    assert (result.run_dir / PICTURE_FILE).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_good_end_has_no_faults() -> None:
+    assert ended_badly(GOOD, 0, {"plant_step": 3, "sensor_measurement": 4}) == []
+
+
+def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
+    rows, stale = {"plant_step": 7}, {"controller": {"stale": 3}}
+    assert ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, 3) == []
+    for overtaken in (0, 2):
+        assert len(ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, overtaken)) == 1
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("exit", {"status": 1, "reason": "plant: too slow"}, "too slow"),
+        ("missing_samples", 3, "missing_samples: 3"),
+        ("lost_outside_netem", 1, "lost_outside_netem: 1"),
+        ("rejected_datagrams", {"plant": {"tag": 1}}, "rejected_datagrams"),
+        ("assumption_violations", [{"what": "MANSD violated"}], "MANSD"),
+        ("replay", {"bit_exact": False, "complete": True, "inputs": 7}, "the replay"),
+        ("replay", None, "the replay"),
+        ("replay", {"bit_exact": True, "complete": True, "inputs": 6}, "7 on the way"),
+        ("claims", [], "no claim"),
+        ("claims", [GOOD["claims"][1] | {"why": ""}], "violated since 1.0 s"),
+    ],
+)
+def test_a_bad_end_is_told(key: str, value: object, told: str) -> None:
+    faults = ended_badly(GOOD | {key: value}, 0, {"plant_step": 7})
+    assert len(faults) == 1
+    assert told in faults[0]
+
+
+@pytest.mark.parametrize("arguments", [["week"], ["--minutes", "x"], ["--minutes", "nan"]])
+def test_a_mistake_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert "error: " in capsys.readouterr().err
+
+
+def test_a_run_that_cannot_begin_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--set", "network.mansd=-1"]
+    assert main(["--minutes", "1", "--runs", str(tmp_path), *settings]) == 2
+    assert "network.mansd" in capsys.readouterr().err

@@ -1,0 +1,97 @@
+"""The flood's process, and what is read off a flooded run's record."""
+
+import socket
+import subprocess
+import sys
+from contextlib import suppress
+
+import numpy as np
+import pytest
+
+from benchmarks import _flood
+from benchmarks._flood import Flood, flood
+from benchmarks.flood import CASES, Measured, measured, recovery_s, rows_of
+from cosim.cli import find_scenario
+from cosim.record import RunRecord
+from cosim.virtual import simulate
+from noack.records import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.resolve import resolve
+from noack.scenario_file import load
+from noack.wire import Decoder, Flow, Rejection
+
+PERIOD_NS = 2_000_000
+
+
+def taken(ear: socket.socket) -> list[bytes]:
+    """All that has come, and close it."""
+    found = []
+    with ear, suppress(BlockingIOError):
+        while True:
+            found.append(ear.recv(2000))
+    return found
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_a_flood_is_shared_out_evenly_and_counted(
+    monkeypatch: pytest.MonkeyPatch, at_once: bool
+) -> None:
+    if at_once and sys.platform != "linux":
+        pytest.skip("sendmmsg is Linux's")
+    monkeypatch.setattr(_flood, "_AtOnce", _flood._AtOnce if at_once else _flood._OneByOne)
+    ears = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3)]
+    for ear in ears:
+        ear.bind(("127.0.0.1", 0))
+        ear.setblocking(False)
+    sent = flood([ear.getsockname()[1] for ear in ears], 0.3, 1000.0).sent
+    decoder = Decoder(Flow.UPDATE, 4, 1, bytes(32))
+    counts = [sum(decoder.decode(data) is None for data in taken(ear)) for ear in ears]
+    assert sum(counts) == sent > 0
+    assert max(counts) - min(counts) <= 1
+    assert decoder.rejected[Rejection.RUN] == sent  # it looks like an update of another run
+
+
+def test_the_floods_process_says_what_it_sent() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks._flood", "--ports", "9", "--seconds", "0.05"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert '"sent": ' in done.stdout
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    settings = ["horizon_s=4", "ports={}"]
+    return simulate(resolve(load(find_scenario("lane_following"), settings)))
+
+
+def test_what_a_flood_did_is_read_off_the_record(record: RunRecord) -> None:
+    rows = {table: record[table].copy() for table in record.tables}
+    for table in (PLANT_STEP, CONTROLLER_STEP, SENSOR_MEASUREMENT):
+        rows[table]["now_ns"] = rows[table]["t_ns"] + 50_000
+    steps, heard = rows[PLANT_STEP], rows[SENSOR_MEASUREMENT]
+    during = (steps["t_ns"] > 1_000_000_000) & (steps["t_ns"] < 2_000_000_000)
+    steps["now_ns"][during] += 7_000_000
+    after = (steps["t_ns"] >= 2_000_000_000) & (steps["t_ns"] < 2_040_000_000)
+    steps["now_ns"][after] += 3_000_000
+    rows[SENSOR_MEASUREMENT] = np.delete(heard, [600, 601, 602])
+    flooded = RunRecord(record.scenario, rows, [], {})
+    found = measured(flooded, 5, Flood(101.0, 102.0, 12_345), epoch_s=100.0)
+    assert (found.rate_hz, found.missed, found.lost) == (12_345.0, 3.0, 5.0)
+    assert found.late_before_us == pytest.approx(50.0)
+    assert found.late_us == pytest.approx(7050.0)
+    last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
+    assert found.back_ms == pytest.approx(1e-6 * last_late_ns - 2000.0)
+
+
+def test_a_late_step_long_after_the_flood_is_not_its_doing() -> None:
+    assert recovery_s(np.array([]), 2.0) == 0.0
+    assert recovery_s(np.array([1.9, 2.1, 2.3, 3.0]), 2.0) == pytest.approx(0.3)
+    assert recovery_s(np.array([1.9, 2.5]), 2.0) == 0.0
+
+
+def test_each_figure_stands_beside_the_one_without_the_shield() -> None:
+    ours, peers = Measured(4e5, 0, 0, 90.0, 100.0, 0.0), Measured(1e5, 3, 4, 90.0, 6000.0, 20.0)
+    rows = rows_of(CASES[0], [ours] * 3, [peers] * 3)
+    assert {row.peer.name for row in rows if row.peer} == {"without the shield"}
+    late = next(row for row in rows if "during" in row.name)
+    assert (late.value, late.ratio) == (100.0, pytest.approx(1 / 60))

@@ -1,0 +1,259 @@
+"""Every shipped scenario, in virtual time; and the classic plants beside their literature.
+
+What is of the reactor, and of Tabuada's example, stands in ``exact/test_published.py``, what is of
+the cart and its pole in ``tests/plant_server/test_systems.py``.
+"""
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import eigvals, solve_continuous_are
+
+from cosim.linearisation import linearisation, said
+from cosim.record import RunRecord
+from cosim.summary import summarise
+from cosim.virtual import simulate
+from noack.linear import Matrix
+from noack.records import PLANT_STEP
+from noack.resolve import Loop, loop_of, resolve
+from noack.scenario import Scenario
+from noack.scenario_file import load
+from noack.systems import FourTank, Quadrotor
+from plant_server.linearise import linearise
+from plant_server.systems.four_tank import four_tank
+from plant_server.systems.quadrotor import quadrotor
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+ENDS_BELOW = {"f16_lateral": 0.5, "pendulum_observed": 0.5}
+"""‖x(T)‖ / ‖x(0)‖; the F-16 starts aslip, in rad, and ends with its rudder a little off, in °; the
+pendulum is balanced from noisy angles."""
+
+
+def shipped(name: str, *settings: str) -> Scenario:
+    return resolve(load(SCENARIOS / f"{name}.toml", list(settings)))
+
+
+@cache
+def run_of(name: str) -> RunRecord:
+    return simulate(shipped(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_scenario_keeps_what_it_assumes_and_settles(name: str) -> None:
+    record = run_of(name)
+    summary = summarise(record, 0, "horizon")
+    assert summary["exit"]["status"] == 0
+    assert summary["reached_s"] == pytest.approx(summary["horizon_s"])
+    assert summary["missing_samples"] == 0
+    assert summary["lost_outside_netem"] == 0
+    assert summary["assumption_violations"] == []
+    assert summary["watchdog"]["trips"] == 0
+    assert summary["longest_drop_run"] <= summary["mansd"]
+    shrunk = summary["final_state_norm"] / summary["initial_state_norm"]
+    assert shrunk < ENDS_BELOW.get(name, 0.1)
+    internal = record.scenario.plant.system.internal_names
+    if internal:
+        assert record[PLANT_STEP]["z"].shape[1] == len(internal)
+
+
+def loop(name: str) -> Loop:
+    return loop_of(shipped(name))
+
+
+def closed(found: Loop) -> Matrix:
+    poles: Matrix = np.linalg.eigvals(found.A_model + found.B_model @ found.K)
+    return poles
+
+
+# The quadruple-tank process: Johansson, IEEE Trans. Control Systems Technology 8(3), 2000.
+
+
+def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
+    settings = FourTank(kind="four_tank", **given)
+    return linearise(lambda x0: four_tank(settings, x0), 4, 2)
+
+
+def zeros(A: Matrix, B: Matrix) -> list[float]:
+    """Of the levels 1 and 2, by the generalised eigenvalues of Rosenbrock's matrix."""
+    C = np.eye(2, 4)
+    pencil = np.block([[A, B], [C, np.zeros((2, 2))]])
+    weight = np.diag([1.0, 1, 1, 1, 0, 0])
+    found = eigvals(pencil, weight)
+    return sorted(found[np.isfinite(found)].real.tolist())
+
+
+def test_the_tanks_time_constants_gains_and_zeros_are_those_that_johansson_prints() -> None:
+    """Of P₋: 62, 90, 23 and 30 s; gains 2.6, 1.5, 1.4 and 2.8; zeros −0.060 and −0.018 /s."""
+    A, B = linear_tanks()
+    np.testing.assert_allclose(-1 / np.diag(A), [62, 90, 23, 30], atol=0.7)
+    gains = 0.5 * np.linalg.solve(-A, B)[:2]  # 0.5 V per cm
+    np.testing.assert_allclose(gains, [[2.6, 1.5], [1.4, 2.8]], atol=0.05)
+    np.testing.assert_allclose(zeros(A, B), [-0.060, -0.018], atol=6e-4)
+
+
+def test_the_other_valves_put_a_zero_into_the_right_half_plane_where_johansson_has_it() -> None:
+    """Of P₊: time constants 63, 91, 39 and 56 s; zeros −0.057 and 0.013 /s."""
+    A, B = linear_tanks(
+        valves=(0.43, 0.34), voltages_v=(3.15, 3.15), pumps_cm3_per_v_s=(3.14, 3.29)
+    )
+    # The levels that he prints and computes with are not quite those that the voltages hold.
+    np.testing.assert_allclose(-1 / np.diag(A), [63, 91, 39, 56], rtol=0.015)
+    np.testing.assert_allclose(zeros(A, B), [-0.057, 0.013], atol=1e-3)
+
+
+def test_the_four_tank_scenarios_model_is_the_linearisation_of_its_plant() -> None:
+    A, B = linear_tanks()
+    found = loop("four_tank")
+    np.testing.assert_allclose(found.A_model, A, atol=2e-6)
+    np.testing.assert_allclose(found.B_model, B, atol=2e-6)
+
+
+def test_a_tank_that_runs_dry_stays_empty() -> None:
+    settings = FourTank(kind="four_tank")
+    system = four_tank(settings, np.array([0.0, 0.0, -1.0, -1.0]))
+    for step in range(600):
+        system.advance(np.array([-5.0, -5.0]), step * 10**9, 10**9)  # a pump does not draw
+    assert (system.z < 1e-3).all()
+    assert (system.z > -1e-6).all()
+
+
+# The F-16: Stevens and Lewis, Aircraft Control and Simulation, Example 5.3-1.
+
+
+def test_the_f16s_modes_are_those_of_the_aircraft() -> None:
+    """Dutch roll −0.42 ± 3.06j, roll −3.615, spiral −0.0163 /s, and servos of 20.2 /s."""
+    found = np.linalg.eigvals(loop("f16_lateral").A_model)
+    expected = [-20.2, -20.2, -3.615, -1.0, -0.4224 - 3.0635j, -0.4224 + 3.0635j, -0.0163]
+    ordered = sorted(found, key=lambda pole: (pole.real, pole.imag))
+    np.testing.assert_allclose(ordered, expected, atol=5e-4)
+
+
+def test_the_f16s_regulator_moves_them_to_where_the_book_has_them() -> None:
+    """−0.82 ± 0.11j, −3.13 ± 0.83j, −11.47 ± 17.18j, −15.02 /s, of a gain of two decimals."""
+    expected = [-15.02, -11.47 - 17.18j, -11.47 + 17.18j, -3.13 - 0.83j, -3.13 + 0.83j,
+                -0.82 - 0.11j, -0.82 + 0.11j]  # fmt: skip
+    found = sorted(closed(loop("f16_lateral")), key=lambda pole: (pole.real, pole.imag))
+    np.testing.assert_allclose(found, expected, atol=0.16)
+
+
+# The double integrator and its linear-quadratic regulator.
+
+
+def test_the_double_integrators_regulator_is_the_textbooks() -> None:
+    """Gain (1, √2), poles (−1 ± j)/√2; ∫ position² + u² = √2 from (1, 0)."""
+    found = loop("double_integrator")
+    P = solve_continuous_are(found.A_model, found.B_model, np.diag([1.0, 0.0]), np.eye(1))
+    np.testing.assert_allclose(found.K, -found.B_model.T @ P, atol=1e-9)
+    poles = sorted(closed(found), key=lambda pole: pole.imag)
+    np.testing.assert_allclose(poles, np.array([-1 - 1j, -1 + 1j]) / math.sqrt(2), atol=1e-9)
+    fine = simulate(shipped("double_integrator", "plant.draw=nominal", "trigger.beta=1e-6",
+                            "trigger.floor=1e-6", "network.loss={model='lossless'}"))  # fmt: skip
+    steps = fine[PLANT_STEP]
+    cost = np.sum(steps["x"][:, 0] ** 2 + steps["u"][:, 0] ** 2) * 2e-3
+    assert cost == pytest.approx(math.sqrt(2), rel=4e-3)  # sampled every 1/700 of its time
+
+
+# A quadrotor: Luukkonen, Modelling and Control of Quadcopter, Aalto University, 2011.
+
+
+def linear_quadrotor() -> tuple[Matrix, Matrix]:
+    settings = Quadrotor(kind="quadrotor")
+    return linearise(lambda x0: quadrotor(settings, x0), 12, 4)
+
+
+def test_the_quadrotor_scenarios_model_is_the_linearisation_of_its_plant() -> None:
+    A, B = linear_quadrotor()
+    found = loop("quadrotor_hover")
+    np.testing.assert_allclose(found.A_model, A, atol=1e-6)
+    np.testing.assert_allclose(found.B_model, B, atol=1e-5)
+
+
+def test_the_quadrotors_gain_is_the_regulator_that_its_scenario_names() -> None:
+    found = loop("quadrotor_hover")
+    Q, R = np.diag([1.0] * 6 + [0.5] * 3 + [0.1] * 3), np.diag([1.0, 100.0, 100.0, 100.0])
+    P = solve_continuous_are(found.A_model, found.B_model, Q, R)
+    np.testing.assert_allclose(found.K, -np.linalg.solve(R, found.B_model.T @ P), atol=1e-5)
+
+
+def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_reports() -> None:
+    """From 1 m and 10° of each angle, by his PD gains (2.5, 1.5 of height; 1.75, 6 of angles)."""
+    settings = Quadrotor(kind="quadrotor")
+    K = np.zeros((4, 12))
+    K[0, [2, 8]] = np.array([-1.5, -2.5]) * settings.mass_kg
+    for axis, inertia in enumerate(settings.inertia_kg_m2):
+        K[1 + axis, [3 + axis, 9 + axis]] = np.array([-6.0, -1.75]) * inertia
+    aslant = math.radians(10)
+    system = quadrotor(settings, np.array([0.0, 0, 1, aslant, aslant, aslant, 0, 0, 0, 0, 0, 0]))
+    h_ns = 2_000_000
+    for step in range(2500):
+        system.advance(K @ system.x, step * h_ns, h_ns)
+    assert np.abs(system.x[3:6]).max() < 0.02 * aslant  # the usual 2 %
+    assert abs(system.x[2]) < 0.07  # of 1 m: its slower pole, −0.62 /s with drag, leaves 6 %
+    assert np.abs(system.x[:2]).max() > 0.3  # nothing brings it back, as he remarks
+
+
+def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_momentum() -> None:
+    settings = Quadrotor(kind="quadrotor", drag_kg_per_s=(0.0, 0.0, 0.0))
+    inertia = np.array(settings.inertia_kg_m2)
+    start = np.array([0, 0, 0, 0.3, -0.2, 0.1, 1.0, -2.0, 3.0, 1.0, 1.5, -0.7])
+    system = quadrotor(settings, start)
+    weight = settings.mass_kg * settings.gravity_m_per_s2
+
+    def energy(x: Matrix) -> float:
+        moving = settings.mass_kg * float(x[6:9] @ x[6:9]) + float(inertia @ x[9:] ** 2)
+        return 0.5 * moving + weight * float(x[2])
+
+    def spin(x: Matrix) -> Matrix:
+        (sr, sp, sy), (cr, cp, cy) = np.sin(x[3:6]), np.cos(x[3:6])
+        about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        turned: Matrix = about_z @ about_y @ about_x @ (inertia * x[9:])
+        return turned
+
+    for step in range(250):
+        system.advance(np.array([-weight, 0, 0, 0]), step * 2_000_000, 2_000_000)
+    assert energy(system.x) == pytest.approx(energy(start), rel=1e-8)
+    np.testing.assert_allclose(spin(system.x), spin(start), rtol=1e-7)
+    assert np.abs(system.x[3:6] - start[3:6]).max() > 0.3
+
+
+# What every summary says of a plant that is not linear.
+
+
+def test_a_summary_holds_the_car_against_what_its_loop_believes() -> None:
+    found = linearisation(shipped("lane_vehicle"))
+    assert found is not None
+    assert found["in_box"] is True
+    assert max(real for real, _ in found["eigenvalues"]) == pytest.approx(-1.157, abs=2e-3)
+    believed = loop("lane_vehicle")
+    np.testing.assert_allclose(np.array(found["A"]) - found["off_A"], believed.A_model, atol=1e-12)
+    np.testing.assert_allclose(np.array(found["B"]) - found["off_B"], believed.B_model, atol=1e-12)
+    assert said(found)[1][1].endswith("inside the box")
+
+
+def test_another_car_is_outside_the_box_and_says_where() -> None:
+    found = linearisation(shipped("lane_vehicle", "plant.system.parameters=vw_vanagon"))
+    assert found is not None
+    assert found["in_box"] is False
+    worst = np.abs(np.array(found["off_B"])).max()
+    assert said(found)[1][1] == f"B[2, 1], by {worst:.3g}, outside the box"
+
+
+def test_without_a_box_nothing_is_inside_and_of_a_linear_plant_nothing_is_said() -> None:
+    found = linearisation(shipped("cart_pole"))
+    assert found is not None
+    assert found["in_box"] is None
+    assert linearisation(shipped("lane_following")) is None
+
+
+def test_of_a_plant_whose_x_is_no_state_the_summary_says_so() -> None:
+    found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
+    assert found is not None
+    assert set(found.values()) == {None}
+    assert said(found) == (("the plant, linearised", "its x does not tell what follows"),)

@@ -1,0 +1,107 @@
+"""Changes of settings: what is asked, what the coordinator says; and files of open runs."""
+
+import fcntl
+import json
+import os
+from typing import Any
+from unittest.mock import patch
+
+from cosim import coordinator
+from noack.changes import Change, Schedule, settings_bytes, settings_of
+from noack.clock import RunClock
+from noack.errors import PeerError
+from noack.io import held, open_runs
+from noack.io.messages import Announced, Answer, Asked, heard
+from noack.knobs import SHORT
+from tests.fuzz.choices import Choices
+from tests.fuzz.edits import Vocabulary, edited
+from tests.fuzz.harness import refusal, workspace
+from tests.fuzz.parsers.ticket import _SCENARIO, _TICKET
+from tests.fuzz.plane import FakePlane, Query
+from tests.fuzz.tables import damaged
+
+SETTINGS: dict[str, Any] = {
+    "network.loss.probability": 0.9,
+    "network.loss": {"model": "bernoulli", "probability": 0.1},
+    "network.mansd": 2,
+    "trigger.beta": 0.3,
+}
+ANNOUNCED = {
+    "number": 0, "t_ns": 10**9, "settings": SETTINGS, "said_ns": 0, "said_at": "now",
+}  # fmt: skip
+ANSWER = {"name": "x", "run_dir": "runs/x", "t_s": 0.5, "from_s": 0.7, "knobs": SETTINGS}
+RUN = {
+    "run_id": "00", "run_dir": "runs/x", "session": None, "endpoint": "tcp/127.0.0.1:1",
+    "user": "u", "password": "p",
+}  # fmt: skip
+KNOWN = Vocabulary(
+    (*ANNOUNCED, *ANSWER, *RUN, *SHORT.values(), *_SCENARIO.keys), (*SHORT, *_SCENARIO.words)
+)
+
+
+def one_input(data: bytes) -> None:
+    choices = Choices(data)
+    match choices.below(4):
+        case 0:
+            _asked(_bytes(choices, {"settings": SETTINGS}))
+        case 1:
+            _announced(_bytes(choices, ANNOUNCED))
+        case 2:
+            with refusal("no answer"):
+                assert isinstance(heard(Answer, _bytes(choices, ANSWER))["run_dir"], str)
+        case _:
+            _found(_bytes(choices, RUN))
+
+
+def _asked(question: bytes) -> None:
+    """The coordinator answers, and what it announces is a change that every process can take."""
+    plane = FakePlane()
+    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+        centre = coordinator.Coordinator(_TICKET)
+    centre._clock = RunClock(0, 1.0, lambda: 0)
+    query = Query("noack/0/knobs", question)
+    plane.put("knobs", query)
+    centre.poll()
+    assert query.answered == 1
+    assert query.error is None or query.error.strip()
+    for content in plane.announced:
+        one = heard(Announced, json.dumps(content))
+        Schedule(_TICKET.scenario).announce(
+            "t", Change(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
+        )
+    try:
+        settings = heard(Asked, question).get("settings", {})
+    except PeerError:
+        assert not plane.announced
+    else:
+        assert len(plane.announced) <= bool(settings)
+
+
+def _announced(said: bytes) -> None:
+    """A process takes it, or refuses it in one line and is as it was."""
+    with refusal("no announced"):
+        one = heard(Announced, said)
+        schedule = Schedule(_TICKET.scenario)
+        change = Change(one["number"], one["t_ns"], one["settings"])
+        with refusal(("the change", "a change"), lines=True):
+            schedule.announce("t", change, 0, 0, -1)
+            assert settings_of(settings_bytes(one["settings"])) == one["settings"]
+            return
+        assert schedule.last is _TICKET.scenario
+
+
+def _found(data: bytes) -> None:
+    with patch.dict(os.environ, {"XDG_RUNTIME_DIR": str(workspace())}):
+        path = held.make_folder("runs") / "up.json"
+        path.write_bytes(data)
+        with path.open() as lock:  # as the launcher has it
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            with refusal(str(path)):
+                run = open_runs.find()
+                assert all(isinstance(field, str) for field in run if field is not None)
+
+
+def _bytes(choices: Choices, content: Any) -> bytes:
+    if choices.flag():
+        return json.dumps(edited(choices, content, KNOWN)).encode()
+    return damaged(choices, json.dumps(edited(choices, content, KNOWN)).encode())

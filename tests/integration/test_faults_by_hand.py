@@ -1,0 +1,90 @@
+"""A run whose processes people start: one never comes, or the one that opened the run is killed."""
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from cosim.conclude import reopen
+from cosim.record import load_record
+from noack.topology import LOOP_ROLES
+from tests.integration.conftest import (
+    AT_RATE,
+    PATIENCE_S,
+    RATE_HZ,
+    Running,
+    private_files,
+    settings,
+    wait_for,
+)
+from tests.integration.test_faults import wait_recording
+
+Start = Callable[..., Running]
+ByHand = Callable[[str], subprocess.Popen[str]]
+RECORD = ("record", "lane_following")
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
+    return process.communicate(timeout=PATIENCE_S)
+
+
+def test_who_waits_for_one_that_never_comes_may_interrupt(
+    start: Start, by_hand: ByHand, tmp_path: Path
+) -> None:
+    recording = start(command=RECORD)
+    own = psutil.Process(recording.process.pid)
+    processes = {role: by_hand(role) for role in LOOP_ROLES if role != "netem"}
+    assert recording.process.stderr is not None
+    wait_for(lambda: recording.process.stderr.readline() == "waiting for netem\n")  # type: ignore[union-attr]
+    children = own.children(recursive=True)
+    recording.process.send_signal(signal.SIGINT)
+    stdout, stderr = ended(recording.process)
+    assert recording.process.returncode == 130
+    (line,) = stderr.splitlines()
+    assert line.startswith("noack: stopped by SIGINT (logs in ")
+    assert json.loads(stdout)["exit"]["status"] == 130
+    for role, process in processes.items():
+        _, stderr = ended(process)
+        assert process.returncode == 1
+        why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
+        assert why in ("stopped by SIGINT", "the run's coordinator is gone"), stderr
+    assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
+    assert private_files(tmp_path) == []
+
+
+def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand, tmp_path: Path) -> None:
+    """It goes on to its horizon, and each process writes down all of its rows by itself."""
+    recording = start(*AT_RATE, *settings(speed=4.0, horizon_s=12.0), command=RECORD)
+    processes = {role: by_hand(role) for role in LOOP_ROLES}
+    wait_recording(recording)
+    run_dir = (recording.runs / "latest").resolve()
+    recording.process.kill()
+    ended(recording.process)
+    for role, process in processes.items():
+        stdout, stderr = ended(process)
+        assert process.returncode == 0, stderr
+        assert stderr.splitlines()[-1] == f"noack {role}: ended: horizon"
+        assert json.loads(stdout)["ended"] == "horizon"
+    assert recording.left_behind() == []
+    outcome = reopen(run_dir)
+    assert outcome.status == 1
+    assert outcome.reason == "the launcher did not live to see the end"
+    assert outcome.summary["reached_s"] == 12.0
+    assert outcome.summary["missing_samples"] == 0
+    replay = outcome.summary["replay"]
+    assert replay is not None
+    assert replay["bit_exact"]
+    steps = load_record(run_dir)["plant_step"]
+    assert np.array_equal(steps["sequence"], np.arange(12 * RATE_HZ + 1))
+    # The next run of the session takes the place of what was left there.
+    again = start(*settings(speed=4.0), command=RECORD)
+    ticket = tmp_path / f"noack-{os.getuid()}" / "default.json"
+    wait_for(lambda: json.loads(ticket.read_text())["run_dir"] != str(run_dir))
+    again.process.terminate()
+    ended(again.process)
+    assert not ticket.exists()

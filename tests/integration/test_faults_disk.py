@@ -1,0 +1,178 @@
+"""A disk that is full, or is taken away: said in a line, and all that reached it stays readable."""
+
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.conclude import reopen
+from cosim.record import load_record
+from noack.errors import MachineError
+from tests.integration.conftest import (
+    AT_RATE,
+    EPHEMERAL,
+    PATIENCE_S,
+    RATE_HZ,
+    Running,
+    noack_command,
+    settings,
+)
+from tests.integration.test_faults import wait_recording
+
+Start = Callable[..., Running]
+
+
+class Disk:
+    """A small disk of its own."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._filler = path / "filler"
+
+    def fill(self, *, but_bytes: int = 0) -> None:
+        """Leave no more than so much room."""
+        self.empty()
+        room = shutil.disk_usage(self.path).free - but_bytes
+        with self._filler.open("wb") as file:
+            while room > 0:  # others may write meanwhile
+                try:
+                    room -= file.write(bytes(min(room, 1 << 16)))
+                    file.flush()
+                except OSError:
+                    break
+
+    def empty(self) -> None:
+        """Make room again."""
+        self._filler.unlink(missing_ok=True)
+
+
+def mounted(path: Path, *options: str) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may mount a disk")
+    done = subprocess.run(
+        ["mount", *options, str(path)], capture_output=True, text=True, check=False
+    )
+    if done.returncode != 0:
+        pytest.skip(f"no disk can be mounted here: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def small(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Disk]:
+    """A disk of so many MiB, where the runs of ``start`` lie."""
+    path = tmp_path / "runs"
+    path.mkdir()
+    mounted(path, "-t", "tmpfs", "-o", f"size={request.param}m", "noack-test")
+    try:
+        yield Disk(path)
+    finally:
+        subprocess.run(["umount", "--lazy", str(path)], check=True)
+
+
+def noack(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        noack_command(*arguments), capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+
+
+def one_line(done: subprocess.CompletedProcess[str]) -> str:
+    (line,) = done.stderr.strip().splitlines()
+    return line
+
+
+@pytest.mark.parametrize("small", [64], indirect=True)
+def test_a_disk_that_fills_up(
+    start: Start, small: Disk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=60.0))
+    wait_recording(running)
+    run_dir = (running.runs / "latest").resolve()
+    small.fill()
+    stdout, stderr = running.process.communicate(timeout=PATIENCE_S)
+    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
+    assert running.process.returncode == 1
+    assert len(lines) == 1, stderr
+    assert str(run_dir / "record") in lines[0]
+    assert "No space left on device" in lines[0]
+    assert f"kept in {run_dir / 'spool'}" in lines[0]
+    assert "No space left on device" in stdout  # as JSON
+    assert running.left_behind() == []
+    spooled = {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()}
+
+    with pytest.raises(MachineError, match=f"^{run_dir}.*: No space left on device;[^\n]*$"):
+        reopen(run_dir)
+    assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
+
+    small.empty()
+    assert noack("summary", str(run_dir)).returncode == 0
+    record = load_record(run_dir)
+    for table in ("plant_step", "sensor_measurement", "controller_step"):
+        rows = record[table]
+        bytes_on_disk = sum(size for name, size in spooled.items() if name.startswith(table))
+        batches_at_most = len(rows) / 4 + 2
+        assert len(rows) * rows.itemsize >= bytes_on_disk - 16 * batches_at_most - rows.itemsize
+        assert np.array_equal(rows["sequence"], np.arange(len(rows)))
+    assert not (run_dir / "spool").exists()
+    assert (run_dir / "report.html").stat().st_size > 100_000
+
+    missing = json.loads((run_dir / "summary.json").read_text())["missing_samples"]
+    # Full again, before the summary is written; and before the report is.
+    for path in (run_dir / "summary.json", run_dir / "report.html"):
+        path.unlink()
+    small.fill()
+    line = f"^{run_dir / 'summary.json'}: cannot be written: No space left on device;[^\n]*$"
+    with pytest.raises(MachineError, match=line):
+        reopen(run_dir)
+    small.fill(but_bytes=1 << 16)
+    assert reopen(run_dir).summary["missing_samples"] == missing
+    warning = capsys.readouterr().err
+    assert warning.startswith(f"noack: warning: no report.html: {run_dir}")
+    assert warning.endswith("No space left on device\n")
+    assert not list(run_dir.rglob("*.partial"))
+
+
+@pytest.mark.parametrize("small", [8], indirect=True)
+def test_a_run_does_not_begin_on_a_full_disk(small: Disk) -> None:
+    done = noack("run", "lane_following", "--runs", str(small.path), *EPHEMERAL)
+    assert done.returncode == 1
+    assert one_line(done).startswith(f"noack: {small.path}: only ")
+    assert list(small.path.iterdir()) == []
+
+
+@pytest.mark.parametrize("small", [64], indirect=True)
+def test_a_folder_that_becomes_read_only(start: Start, small: Disk) -> None:
+    """What is open may still be written; nothing new may be made."""
+    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=16.0))
+    wait_recording(running)
+    run_dir = (running.runs / "latest").resolve()
+    mounted(small.path, "--bind", str(small.path))
+    try:
+        mounted(small.path, "-o", "remount,bind,ro")
+        _, stderr = running.process.communicate(timeout=PATIENCE_S)
+        assert running.process.returncode == 1
+        lines = [line for line in stderr.splitlines() if line.startswith("noack")]
+        assert len(lines) == 1, stderr
+        assert f"{run_dir}: the run cannot be written: Read-only file system" in lines[0]
+        assert running.left_behind() == []
+    finally:
+        subprocess.run(["umount", "--lazy", str(small.path)], check=True)
+    assert noack("summary", str(run_dir)).returncode == 0
+    steps = load_record(run_dir)["plant_step"]
+    assert np.array_equal(steps["sequence"], np.arange(16 * RATE_HZ + 1))
+
+
+def test_a_folder_that_is_removed(start: Start) -> None:
+    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=16.0))
+    wait_recording(running)
+    run_dir = (running.runs / "latest").resolve()
+    shutil.rmtree(run_dir)
+    _, stderr = running.process.communicate(timeout=PATIENCE_S)
+    assert running.process.returncode == 1
+    lines = [line for line in stderr.splitlines() if line.startswith("noack")]
+    assert len(lines) == 1, stderr
+    assert f"{run_dir}: the run cannot be written: No such file or directory" in lines[0]
+    assert running.left_behind() == []

@@ -1,0 +1,190 @@
+"""Somebody else on the same machine, at the control plane's port, while a run goes on."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import zenoh
+
+from cosim.record import load_record
+from noack.io.plane import secret_of
+from noack.io.star import star_config
+from noack.io.ticket import Ticket, loads
+from noack.topology import LOOP_ROLES
+from tests.integration.conftest import PATIENCE_S, Finished, Running, settings, wait_for
+
+GARBAGE_BYTES = 10 * 2**20
+HALF_OPEN = 300
+ATTACKS = ("flood", "half_open", "garbage", "guess")
+
+
+class Intruder:
+    """Knocks at a port in every way that needs no secret, until told to stop."""
+
+    def __init__(self, ticket: Ticket) -> None:
+        self._ticket = ticket
+        self._port = int(ticket.endpoint.rpartition(":")[2])
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._again_and_again, args=(attack,), daemon=True)
+            for attack in (getattr(self, name) for name in ATTACKS)
+        ]
+        self.done: Counter[str] = Counter()
+        self.let_in = 0
+
+    @contextlib.contextmanager
+    def at_work(self) -> Iterator[None]:
+        for thread in self._threads:
+            thread.start()
+        try:
+            yield
+        finally:
+            self._stop.set()
+            for thread in self._threads:
+                thread.join(30)
+
+    def _again_and_again(self, attack: Callable[[], None]) -> None:
+        while not self._stop.wait(0.1):
+            with contextlib.suppress(OSError):  # the run is over, or its queue is full
+                attack()
+                self.done[attack.__name__] += 1
+
+    def _connect(self) -> socket.socket:
+        return socket.create_connection(("127.0.0.1", self._port), timeout=5)
+
+    def flood(self) -> None:
+        for _ in range(200):
+            self._connect().close()
+
+    def half_open(self) -> None:
+        with contextlib.ExitStack() as stack:
+            for _ in range(HALF_OPEN):
+                stack.enter_context(self._connect())
+            self._stop.wait(0.5)
+
+    def garbage(self) -> None:
+        """Behind a length that zenoh believes, and without; it hangs up soon."""
+        left = GARBAGE_BYTES
+        while left > 0 and not self._stop.is_set():
+            with self._connect() as connection, contextlib.suppress(OSError):
+                left -= connection.send(b"\xff\xff" + os.urandom(2**18))
+                left -= connection.send(os.urandom(2**18))
+
+    def guess(self) -> None:
+        own = secret_of(self._ticket)
+        other = secret_of(self._ticket._replace(key=bytes(32)))
+        for secret in ({}, own._replace(password="guess")._asdict(), other._asdict()):
+            more: dict[str, Any] = {f"transport/auth/usrpwd/{k}": v for k, v in secret.items()}
+            more["connect/timeout_ms"] = 200
+            config = star_config(self._ticket.endpoint, listen=False, more=more)
+            with contextlib.suppress(zenoh.ZError), zenoh.open(config) as session:
+                self.let_in += 1
+                session.put(f"noack/{self._ticket.run_id:016x}/stop", "intruded")
+
+
+class Attacked:
+    """A run by hand that was attacked until it had been in every way, and what was seen of it."""
+
+    def __init__(
+        self,
+        start: Callable[..., Running],
+        by_hand: Callable[[str], subprocess.Popen[str]],
+        private: Path,
+    ) -> None:
+        recording = start(
+            *settings(speed=2.0, horizon_s=400.0), command=("record", "lane_following")
+        )
+        path = private / "default.json"
+        wait_for(path.exists)
+        self.ticket = loads(path.read_text())
+        processes = [by_hand(role) for role in LOOP_ROLES]
+        recording.wait_started()
+        self.intruder = Intruder(self.ticket)
+        with self.intruder.at_work():
+            run_dir = (recording.runs / "latest").resolve()
+            self.seen = {
+                "command lines and environments": _told_by_processes(recording, processes),
+                "the run directory": _files(run_dir),
+                "the private folder": {
+                    name: content
+                    for name, content in _files(private).items()
+                    if name != path.name  # which is for it
+                },
+            }
+            wait_for(lambda: all(self.intruder.done[attack] > 0 for attack in ATTACKS))
+            recording.process.send_signal(signal.SIGINT)
+            self.finished: Finished = recording.finish()
+        self.seen["the finished run directory"] = _files(run_dir)
+        self.seen["what was printed"] = {"recorder": self.finished.stderr.encode()}
+        self.left = _files(private)
+        self.ended = {}
+        for role, process in zip(LOOP_ROLES, processes, strict=True):
+            stdout, stderr = process.communicate(timeout=PATIENCE_S)
+            self.seen["what was printed"][role] = (stdout + stderr).encode()
+            self.ended[role] = (process.returncode, json.loads(stdout)["ended"])
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    found = {}
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError, IsADirectoryError):
+            found[str(path.relative_to(folder))] = path.read_bytes()
+    return found
+
+
+def _told_by_processes(
+    recording: Running, processes: list[subprocess.Popen[str]]
+) -> dict[str, bytes]:
+    """What any user of the machine, or who may look into an environment, sees of the processes."""
+    launcher = psutil.Process(recording.process.pid)
+    pids = [launcher.pid, *(child.pid for child in launcher.children(recursive=True))]
+    pids += [process.pid for process in processes]
+    told = {}
+    for pid in pids:
+        for name in ("cmdline", "environ", "comm"):
+            told[f"{pid}/{name}"] = Path(f"/proc/{pid}/{name}").read_bytes()
+    return told
+
+
+def test_a_run_goes_on_untouched(
+    start: Callable[..., Running],
+    by_hand: Callable[[str], subprocess.Popen[str]],
+    tmp_path: Path,
+) -> None:
+    attacked = Attacked(start, by_hand, tmp_path / f"noack-{os.getuid()}")
+    finished = attacked.finished
+    assert attacked.intruder.let_in == 0
+    assert finished.status == 130, finished.stderr
+    assert finished.summary["exit"]["reason"] == "stopped by SIGINT"
+    assert finished.summary["missing_samples"] == 0
+    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["replay"]["bit_exact"]
+    assert finished.summary["replay"]["complete"]
+    assert finished.summary["identity_residual_max"] < 1e-11
+    assert set(attacked.ended.values()) == {(1, "stopped by SIGINT")}
+    steps = load_record(finished.run_dir)["plant_step"]
+    assert np.array_equal(steps["sequence"], np.arange(len(steps)))
+    secrets = {
+        "key": attacked.ticket.key,
+        "key in words": attacked.ticket.key.hex().encode(),
+        "password": secret_of(attacked.ticket).password.encode(),
+    }
+    own = f"runs/{attacked.ticket.run_id:016x}.json"
+    for where, contents in attacked.seen.items():
+        for name, content in contents.items():
+            for what, secret in secrets.items():
+                if what == "password" and name == own:
+                    continue  # which is for `noack set`, and for the user alone
+                assert secret not in content, f"{what} in {where}: {name}"
+    assert len(attacked.seen["command lines and environments"]) == 3 * 6
+    assert attacked.left == {}

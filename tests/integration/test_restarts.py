@@ -1,0 +1,207 @@
+"""Processes that die while the run goes on, and others that take their place."""
+
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.claims.evaluate import Claims
+from cosim.join import join_all
+from cosim.record import Rows, load_record
+from noack.io.spool import read_chunks
+from noack.machine import INCARNATION
+from noack.resolve import tables_of
+from noack.scenario_file import load
+from tests.integration.conftest import (
+    AT_RATE,
+    Finished,
+    Running,
+    begun,
+    child_of,
+    settings,
+    wait_for,
+)
+
+Start = Callable[..., Running]
+LOOP = ("plant_step", "sensor_measurement", "controller_step")
+KEEPS = {
+    "sensor": "sensor_measurement",
+    "controller": "controller_delivery",
+    "netem": "netem_packet",
+    "recorder": "plant_step",
+}
+RESTARTED = ("recorder", "controller", "sensor", "netem")
+
+
+def spooled(running: Running, table: str) -> Rows:
+    """What is on disk of a table."""
+    spool = running.runs / "latest" / "spool"
+    dtype = tables_of(load(running.runs / "latest" / "scenario.toml"))[table]
+    found = [np.frombuffer(data, dtype) for _, data in read_chunks(spool, table)]
+    return np.concatenate([np.zeros(0, dtype), *found])
+
+
+def is_whole(running: Running, table: str) -> bool:
+    """Whether there are no gaps in a table."""
+    inputs = spooled(running, table)["sequence"] % INCARNATION
+    return bool((np.diff(np.unique(inputs)) == 1).all())
+
+
+def goes_on(running: Running, role: str) -> bool:
+    """Whether the second process of a role does its work, or died in vain."""
+    assert running.process.poll() is None, running.process.communicate()
+    if role == "recorder":
+        written = (running.runs / "latest" / "spool").glob("plant_step.*")
+        return sum(path.stat().st_size > 0 for path in written) > 1
+    return bool((spooled(running, KEEPS[role])["input"] >= INCARNATION).any())
+
+
+def let_run(running: Running, simulated_s: float) -> None:
+    def now_ns() -> int:
+        return int(spooled(running, "plant_step")["t_ns"].max())
+
+    until_ns = now_ns() + simulated_s * 1e9
+    wait_for(lambda: now_ns() > until_ns)
+
+
+def taken(squatter: socket.socket, port: int) -> bool:
+    try:
+        squatter.bind(("127.0.0.1", port))
+    except OSError:
+        return False
+    return True
+
+
+@pytest.fixture(scope="module")
+def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A run in which one process after the other was killed."""
+    folder = tmp_path_factory.mktemp("restarted")
+    with begun(folder) as start:
+        running = start(
+            *settings(speed=3.0, horizon_s=4000.0, recovery__rejoin_within_s=60),
+            *AT_RATE,
+            *settings(realtime__enabled=False, network__mansd=1, trigger__floor=0.02),
+        )
+        running.wait_started()
+        wait_for(lambda: len(spooled(running, "controller_delivery")) > 0)
+        for role in RESTARTED:
+            before = child_of(running.process, role)
+            assert before is not None
+            before.kill()
+            wait_for(lambda role=role: goes_on(running, role))
+            if role == "recorder":
+                # What it had not taken is sent again: only then is everything on disk that was
+                # recorded before the next one dies.
+                let_run(running, 9)
+                wait_for(lambda: all(is_whole(running, table) for table in LOOP))
+        let_run(running, 12)
+        running.process.send_signal(signal.SIGINT)
+        finished = running.finish()
+        assert running.left_behind() == []
+        return finished
+
+
+def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None:
+    assert restarted.status == 130, restarted.stderr
+    assert restarted.summary["exit"]["reason"] == "stopped by SIGINT"
+    restarts = {one["process"]: one for one in restarted.summary["restarts"]}
+    assert restarts.keys() == set(RESTARTED)
+    for role, one in restarts.items():
+        assert one["incarnation"] == 1
+        assert one["what"] == f"started anew: {role} died: killed by SIGKILL"
+        assert role == "recorder" or one["last_s"] < one["first_s"]
+    for role in RESTARTED:
+        assert f"{role} died: killed by SIGKILL at " in restarted.stderr
+        assert f"{role} is back at " in restarted.stderr
+
+
+def test_nothing_recorded_is_lost_and_everything_is_replayed(restarted: Finished) -> None:
+    assert restarted.summary["missing_samples"] == 0
+    verdict = restarted.summary["replay"]
+    assert verdict["bit_exact"], verdict
+    record = load_record(restarted.run_dir)
+    assert verdict["inputs"] == sum(len(record[table]) for table in record.tables)
+    steps = record["plant_step"]["sequence"]  # although its recorder died
+    assert np.array_equal(steps, np.arange(len(steps)))
+
+
+def test_a_restarted_sensor_transmits_its_first_measurement(restarted: Finished) -> None:
+    record = load_record(restarted.run_dir)
+    _, again = record.lives("sensor")
+    first = again.rows["sensor_measurement"][0]
+    assert first["event"] == INCARNATION
+    assert np.array_equal(first["x"], first["x_s"])
+
+
+def test_a_restarted_network_passes_its_first_packet(restarted: Finished) -> None:
+    record = load_record(restarted.run_dir)
+    _, again = record.lives("netem")
+    packets = again.rows["netem_packet"]
+    assert packets["drop_run"][0] == 0
+    assert packets["drop_run"].max() <= 1
+
+
+def test_a_restarted_controller_puts_out_nothing_until_it_knows_a_state(
+    restarted: Finished,
+) -> None:
+    record = load_record(restarted.run_dir)
+    _, again = record.lives("controller")
+    ticks, deliveries = again.rows["controller_step"], again.rows["controller_delivery"]
+    waiting = ticks["input"] < deliveries["input"][0]
+    assert not ticks["u"][waiting].any()
+    assert (ticks["u"][~waiting] != 0).any()
+    assert (
+        ticks["sequence"][0] % INCARNATION
+        == ticks["t_ns"][0] // record.scenario.controller_period_ns
+    )
+
+
+def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) -> None:
+    record = load_record(restarted.run_dir)
+    assert restarted.summary["identity_residual_max"] < 1e-11
+    joined = join_all(record)
+    away = np.isnan(joined.x_c).any(axis=1)
+    _, controller = record.lives("controller")
+    known_ns = controller.rows["controller_delivery"]["model_t_ns"][0]
+    gone = (joined.t_ns > known_ns - 100_000_000) & (joined.t_ns < known_ns)
+    assert away[gone].all()
+    ended_ns = controller.rows["controller_step"]["t_ns"][-1]
+    assert not away[(joined.t_ns > known_ns) & (joined.t_ns <= ended_ns)].any()
+    norms = np.linalg.norm(joined.x, axis=1)
+    assert norms[-100:].max() < 0.1 * norms.max()
+
+
+def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
+    claims = Claims(load_record(restarted.run_dir)).judge()
+    assert {claim.verdict for claim in claims} == {"void"}
+    gone_s = min(one["last_s"] or np.inf for one in restarted.summary["restarts"])
+    assert all(claim.since_s <= gone_s + 0.1 for claim in claims if claim.since_s is not None)
+
+
+def test_nobody_can_mistake_an_old_update_for_news(restarted: Finished) -> None:
+    """Whoever takes over knows nothing of what was accepted before; its own number tells it."""
+    record = load_record(restarted.run_dir)
+    for role, table in (("sensor", "sensor_measurement"), ("controller", "controller_delivery")):
+        before, again = record.lives(role)
+        last_ns = before.rows[table]["t_ns"].max()
+        assert again.rows[table]["t_ns"].min() > last_ns
+
+
+def test_a_process_that_fails_at_its_restart_ends_the_run(start: Start, tmp_path: Path) -> None:
+    running = start(*AT_RATE, *settings(speed=2.0, horizon_s=4000.0, recovery__rejoin_within_s=60))
+    running.wait_started()
+    sensor = running.child("sensor")
+    port = running.udp_port("sensor")
+    sensor.kill()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as squatter:
+        wait_for(lambda: taken(squatter, port))
+        finished = running.finish()
+    assert finished.status != 0
+    assert (
+        "sensor died: killed by SIGKILL; started anew, sensor: "
+        in finished.summary["exit"]["reason"]
+    )
+    assert f"127.0.0.1:{port} is already taken" in finished.summary["exit"]["reason"]

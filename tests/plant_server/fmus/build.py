@@ -1,0 +1,108 @@
+"""Builds FMUs for tests: of C, with a model description that a test may change."""
+
+import inspect
+import shutil
+import subprocess
+import zipfile
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import pytest
+
+SOURCE = Path(__file__).with_name("oscillator.c")
+VARIABLES = (
+    ("x0", "Real", "output", "continuous", "exact", "0"),
+    ("x1", "Real", "output", "continuous", "exact", "0"),
+    ("u", "Real", "input", "continuous", None, "0"),
+    ("mu", "Real", "parameter", "tunable", "exact", "1"),
+    ("k", "Real", "parameter", "tunable", "exact", "1"),
+    ("linear", "Boolean", "parameter", "fixed", "exact", "false"),
+    ("energy", "Real", "local", "continuous", "calculated", None),
+    ("fail_at_s", "Real", "parameter", "fixed", "exact", "1e9"),
+    ("fail_status", "Integer", "parameter", "fixed", "exact", "0"),
+    ("noisy", "Boolean", "parameter", "fixed", "exact", "false"),
+    ("x0_at_the_start", "Real", "parameter", "fixed", "exact", "0"),
+    ("name", "String", "parameter", "fixed", "exact", "o"),
+)
+_TYPES_3 = {"Real": "Float64", "Integer": "Int32"}
+
+
+def build(folder: Path, version: int, *, edit: tuple[str, str] | None = None) -> Path:
+    """Build the oscillator for an FMI version; ``edit`` replaces a text of its description."""
+    fmpy = pytest.importorskip("fmpy")
+    description = _description(version)
+    if edit is not None:
+        assert edit[0] in description
+        description = description.replace(*edit)
+    platform = fmpy.platform if version == 2 else fmpy.platform_tuple
+    path = folder / f"oscillator{version}.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", description)
+        library = f"oscillator{fmpy.sharedLibraryExtension}"
+        archive.writestr(f"binaries/{platform}/{library}", _compiled(version))
+    return path
+
+
+@cache
+def _compiled(version: int) -> bytes:
+    """The shared library, in which the functions that nobody calls fail."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler (cc) to build an FMU with")
+    from fmpy import fmi2, fmi3
+
+    slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
+    source = SOURCE.read_text()
+    wanted = [name for name, _ in inspect.getmembers(slave) if name.startswith(f"fmi{version}")]
+    stubs = [f"int {name}(void) {{ return 3; }}" for name in wanted if f"{name}(" not in source]
+    folder = Path(mkdtemp())
+    try:
+        code, library = folder / "fmu.c", folder / "fmu.so"
+        code.write_text(source + "\n".join(stubs))
+        subprocess.run(
+            [compiler, "-O1", "-ffp-contract=off", "-shared", "-fPIC", f"-DFMI={version}",
+             "-o", library, code, "-lm"],
+            check=True,
+        )  # fmt: skip
+        return library.read_bytes()
+    finally:
+        shutil.rmtree(folder)
+
+
+def _description(version: int) -> str:
+    if version == 2:
+        variables = "\n".join(
+            f'<ScalarVariable name="{name}" valueReference="{number}" causality="{causality}"'
+            f' variability="{variability}"{_given("initial", initial)}>'
+            f"<{kind}{_given('start', start)}/></ScalarVariable>"
+            for number, (name, kind, causality, variability, initial, start) in enumerate(VARIABLES)
+        )
+        return f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="2.0" modelName="Oscillator" guid="{{oscillator}}"
+ generationTool="noack's tests">
+<CoSimulation modelIdentifier="oscillator" canHandleVariableCommunicationStepSize="true"/>
+<ModelVariables>{variables}</ModelVariables>
+<ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/></Outputs></ModelStructure>
+</fmiModelDescription>"""
+    variables = "\n".join(
+        f'<{_TYPES_3.get(kind, kind)} name="{name}" valueReference="{number}"'
+        f' causality="{causality}" variability="{variability}"{_given("initial", initial)}'
+        + (
+            f'><Start value="{start}"/></String>'
+            if kind == "String"
+            else f"{_given('start', start)}/>"
+        )
+        for number, (name, kind, causality, variability, initial, start) in enumerate(VARIABLES)
+    )
+    return f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="3.0" modelName="Oscillator" instantiationToken="{{oscillator}}"
+ generationTool="noack's tests">
+<CoSimulation modelIdentifier="oscillator" canHandleVariableCommunicationStepSize="true"/>
+<ModelVariables>{variables}</ModelVariables>
+<ModelStructure><Output valueReference="0"/><Output valueReference="1"/></ModelStructure>
+</fmiModelDescription>"""
+
+
+def _given(key: str, value: str | None) -> str:
+    return "" if value is None else f' {key}="{value}"'

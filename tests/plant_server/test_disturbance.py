@@ -1,0 +1,176 @@
+"""What disturbs a plant, and how it is measured: laws, independence, and the plant under it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.stats import kstest
+
+from noack.disturbances import Gaussian, Step, Uniform
+from noack.machine import Record
+from noack.resolve import resolve, tables_of
+from noack.rng import normals
+from noack.scenario import Scenario
+from noack.scenario_file import validate
+from noack.wire import Flow, Message
+from plant_server.disturbance import disturbance_of
+from plant_server.measurement import Measuring, measuring_of
+from plant_server.plant import Plant, plant_of
+
+STEPS = 4000
+
+
+@pytest.fixture
+def disturbed(content: dict[str, Any]) -> dict[str, Any]:
+    content["horizon_s"] = 2.0
+    content["plant"] |= {
+        "rate_hz": 100.0,
+        "disturbances": [
+            {"kind": "gaussian", "std": [0.3]},
+            {"kind": "uniform", "at": "state", "bound": [0.2, 0.0]},
+            {"kind": "sine", "at": "state", "amplitude": [0.0, 1.5], "hz": 0.7, "phase_rad": 0.4},
+            {"kind": "step", "amplitude": [2.0], "from_s": 0.5, "until_s": 1.0},
+        ],
+        "measurement": {"noise_std": [0.1, 0.0], "noise_bound": [0.0, 0.05]},
+    }
+    return content
+
+
+def resolved(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "test"))
+
+
+def steps_of(plant: Plant, scenario: Scenario, count: int) -> tuple[Any, list[Message]]:
+    rows, sent = [], []
+    for k in range(count):
+        plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)
+        for out in plant.on_timer(k * scenario.plant_period_ns):
+            if isinstance(out, Record):
+                rows.append(out.row)
+            elif isinstance(out, Message):
+                sent.append(out)
+    return np.array(rows, tables_of(scenario)["plant_step"]), sent
+
+
+def test_each_is_distributed_as_it_says_and_no_two_alike(disturbed: dict[str, Any]) -> None:
+    disturbance = disturbance_of(resolved(disturbed))
+    assert disturbance is not None
+    pairs = [disturbance(step) for step in range(STEPS)]
+    d, w = np.array([d for d, _ in pairs])[:, 0], np.array([w for _, w in pairs])
+    t_s = np.arange(STEPS) * 0.01
+    there = (t_s >= 0.5) & (t_s < 1.0)
+    normal = (d - 2.0 * there) / 0.3
+    assert kstest(normal, "norm").pvalue > 1e-3
+    assert kstest(w[:, 0], "uniform", (-0.2, 0.4)).pvalue > 1e-3
+    np.testing.assert_allclose(w[:, 1], 1.5 * np.sin(2 * np.pi * 0.7 * t_s + 0.4), atol=1e-12)
+    # White, and nothing to do with each other: correlations of 4,000 are within 4/√4000.
+    for one, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
+        assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
+
+
+def test_a_step_is_the_same_wherever_one_begins(disturbed: dict[str, Any]) -> None:
+    one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
+    assert one is not None
+    assert other is not None
+    backward = {step: other(step) for step in range(700, -1, -37)}
+    for step in range(701):
+        d, w = one(step)
+        if step in backward:
+            assert (d.tobytes(), w.tobytes()) == tuple(v.tobytes() for v in backward[step])
+
+
+def test_seeds_change_what_they_are_of_and_nothing_else(disturbed: dict[str, Any]) -> None:
+    base = resolved(disturbed)
+    rows, sent = steps_of(plant_of(base), base, 20)
+    noise = base.model_copy(update={"seeds": base.seeds.model_copy(update={"noise": 1})})
+    other, heard = steps_of(plant_of(noise), noise, 20)
+    assert rows.tobytes() == other.tobytes()
+    assert all(a.vector.tobytes() != b.vector.tobytes() for a, b in zip(sent, heard, strict=True))
+    gusts = base.model_copy(update={"seeds": base.seeds.model_copy(update={"disturbance": 1})})
+    rows_2, sent_2 = steps_of(plant_of(gusts), gusts, 20)
+    assert (rows_2["d"] != rows["d"]).all()
+    v, v_2 = (
+        np.array([m.vector for m in messages]) - some["x"]
+        for messages, some in ((sent, rows), (sent_2, rows_2))
+    )
+    np.testing.assert_allclose(v, v_2, atol=1e-12)
+
+
+def test_the_plant_moves_as_an_integrator_does_under_what_is_on_record(
+    disturbed: dict[str, Any],
+) -> None:
+    scenario = resolved(disturbed)
+    rows, _ = steps_of(plant_of(scenario), scenario, 60)
+    x = np.array(scenario.plant.initial_state)
+    for k in range(59):
+        pushed, w = rows["u"][k] + rows["d"][k], rows["w"][k]
+
+        def derivative(t: float, z: np.ndarray, p: Any = pushed, w: Any = w) -> list[float]:
+            return [z[1] + w[0], p[0] + w[1]]
+
+        x = solve_ivp(derivative, (0, 0.01), x, rtol=1e-12, atol=1e-12).y[:, -1]
+        np.testing.assert_allclose(rows["x"][k + 1], x, atol=1e-10)
+
+
+def test_a_plant_that_is_not_linear_feels_disturbances_of_its_input(
+    content: dict[str, Any],
+) -> None:
+    content["model"] = {
+        "A": [[0.0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 30, 0]],
+        "B": [[0.0], [1.0], [0.0], [-4.0]], "gain": [[1.0, 2.0, 60.0, 10.0]],
+    }  # fmt: skip
+    content["plant"] = {
+        "system": {"kind": "cart_pole"}, "initial_state": [0.0, 0.0, 0.1, 0.0],
+        "disturbances": [{"kind": "step", "amplitude": [0.5]}],
+    }  # fmt: skip
+    pushed = resolved(content)
+    plain = resolved({**content, "plant": {**content["plant"], "disturbances": []}})
+    one, other = plant_of(pushed), plant_of(plain)
+    for k in range(50):
+        one.handle(Message(Flow.ACTUATION, k, 0, np.array([0.1])), 0)
+        other.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
+        one.on_timer(k * 2_000_000)
+        other.on_timer(k * 2_000_000)
+    # Before the first actuation the second plant was pushed by nothing: both start at once.
+    np.testing.assert_array_equal(one.x, other.x)
+
+
+def test_measurements_carry_the_inputs_of_every_step_since_the_last(
+    disturbed: dict[str, Any],
+) -> None:
+    disturbed["plant"] |= {"measure_every": 3}
+    disturbed["observer"] = {"kind": "luenberger", "gain": [[0.1, 0.0], [0.0, 0.1]]}
+    scenario = resolved(disturbed)
+    rows, sent = steps_of(plant_of(scenario), scenario, 31)
+    assert [message.t_ns for message in sent] == [k * 30_000_000 for k in range(11)]
+    assert sent[0].vector[2:].tolist() == [0.0, 0.0, 0.0]
+    for k, message in enumerate(sent[1:], 1):
+        assert message.vector[2:].tolist() == rows["u"][3 * k - 3 : 3 * k, 0].tolist()
+
+
+def test_noise_is_distributed_as_it_says() -> None:
+    C = np.array([[1.0, 2.0]])
+    measuring = Measuring(C, np.array([0.5]), np.array([0.0]), seed=7)
+    y = np.array([measuring(np.array([1.0, 3.0]), k)[0] for k in range(STEPS)])
+    assert kstest((y - 7.0) / 0.5, "norm").pvalue > 1e-3
+    measuring = Measuring(C, np.array([0.0]), np.array([0.2]), seed=7)
+    y = np.array([measuring(np.zeros(2), k)[0] for k in range(STEPS)])
+    assert kstest(y, "uniform", (-0.2, 0.4)).pvalue > 1e-3
+
+
+def test_exact_measurements_are_the_state_itself(content: dict[str, Any]) -> None:
+    content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
+    assert measuring_of(resolved(content)) is None
+
+
+def test_normal_numbers_are_finite_at_the_ends_and_found_at_once() -> None:
+    table = normals(3, "test", rows=range(1000), width=3)
+    assert np.isfinite(table).all()
+    assert normals(3, "test", rows=range(500, 503), width=3).tolist() == table[500:503].tolist()
+
+
+def test_variances_are_those_of_the_distributions() -> None:
+    assert Uniform(kind="uniform", bound=(3.0,)).variance.tolist() == [3.0]
+    assert Gaussian(kind="gaussian", std=(3.0,)).variance.tolist() == [9.0]
+    assert Step(kind="step", amplitude=(3.0,)).variance.tolist() == [0.0]

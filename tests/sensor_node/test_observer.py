@@ -1,0 +1,248 @@
+"""Observers against independent formulas, and the sensor that has one."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_discrete_are
+
+from noack.estimation import EstimationModel, believed_model, steady_state, true_model
+from noack.linear import Matrix, Vector, discretise
+from noack.machine import Notice, Output, Record, Start
+from noack.observability import observer_gain, unseen_mode
+from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.resolve import resolve, tables_of
+from noack.scenario import Scenario
+from noack.scenario_file import validate
+from noack.wire import Flow, Message
+from sensor_node.observer import Following, KalmanObserver, LuenbergerObserver
+from sensor_node.sensor import sensor_of
+
+A = np.array([[0.0, 1.0], [4.0, -0.3]])
+B = np.array([[0.0], [1.5]])
+C = np.array([[1.0, 0.2]])
+H_NS = 10_000_000
+Q = np.array([[1e-4, 2e-5], [2e-5, 4e-4]])
+R = np.array([[0.03]])
+
+
+def model(steps: int = 1) -> EstimationModel:
+    Ad, Bd = discretise(A, B, H_NS)
+    return EstimationModel(Ad, Bd, C, Q, R, steps)
+
+
+@pytest.fixture
+def observed(content: dict[str, Any]) -> dict[str, Any]:
+    """The double integrator, of which the position is measured, with noise."""
+    content["plant"] |= {"rate_hz": 100.0, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.01]}}
+    content["controller"] = {"rate_hz": 100.0}
+    content["observer"] = {
+        "kind": "kalman", "input_std": [0.2], "initial_std": [1.0, 1.0],
+    }  # fmt: skip
+    return content
+
+
+def resolved(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "test"))
+
+
+def measurement(sequence: int, t_ns: int, vector: Sequence[float]) -> Message:
+    return Message(Flow.MEASUREMENT, sequence, t_ns, np.array(vector, dtype=float))
+
+
+def batch_estimate(P0: Matrix, x0: Vector, u: Vector, y: Vector) -> tuple[Vector, Matrix]:
+    """x(t_K) given all of y by the conditional mean of jointly normal numbers: no recursion.
+
+    Stacks ξ = (x(0), q_1 … q_K, v_0 … v_K); x(t_k) and y(t_k) are linear in it.
+    """
+    Ad, Bd, *_ = model()
+    K = len(u)
+    size = 2 + 2 * K + K + 1
+    covariance = np.zeros((size, size))
+    covariance[:2, :2] = P0
+    for k in range(K):
+        covariance[2 + 2 * k : 4 + 2 * k, 2 + 2 * k : 4 + 2 * k] = Q
+    covariance[2 + 2 * K :, 2 + 2 * K :] = R[0, 0] * np.eye(K + 1)
+    mean, state = x0, np.eye(2, size)
+    ys, y_means = [], []
+    for k in range(K + 1):
+        if k > 0:
+            mean, state = Ad @ mean + Bd @ u[k - 1], Ad @ state
+            state[:, 2 * k : 2 * k + 2] += np.eye(2)
+        row = (C @ state)[0]
+        row[2 + 2 * K + k] += 1.0
+        ys.append(row)
+        y_means.append(float((C @ mean)[0]))
+    G = np.array(ys)
+    gain = state @ covariance @ G.T @ np.linalg.inv(G @ covariance @ G.T)
+    conditional = state @ covariance @ state.T - gain @ G @ covariance @ state.T
+    return mean + gain @ (y - np.array(y_means)), conditional
+
+
+def test_the_kalman_filter_is_the_conditional_mean() -> None:
+    rng = np.random.default_rng(1)
+    x0, P0 = np.array([0.3, -0.2]), np.diag([0.5, 0.2])
+    u, y = rng.normal(size=(12, 1)), rng.normal(size=13)
+    following = Following(KalmanObserver(model(), x0, P0), 1, 1, H_NS, None)
+    for k in range(13):
+        inputs = u[k - 1] if k else np.zeros(1)
+        x = following.take(k * H_NS, y[k : k + 1], inputs)
+    expected, covariance = batch_estimate(P0, x0, u, y)
+    np.testing.assert_allclose(x, expected, rtol=1e-10)
+    np.testing.assert_allclose(following._observer.covariance, covariance, rtol=1e-8)  # type: ignore[attr-defined]
+
+
+def test_its_covariance_comes_to_the_riccati_equations() -> None:
+    kalman = KalmanObserver(model(), np.zeros(2), np.eye(2))
+    for _ in range(2000):
+        kalman.predict(np.zeros(1))
+        kalman.correct(np.zeros(1))
+    Ad = expm(A * H_NS * 1e-9)
+    before = solve_discrete_are(Ad.T, C.T, Q, R)
+    after = np.linalg.inv(np.linalg.inv(before) + C.T @ np.linalg.inv(R) @ C)
+    np.testing.assert_allclose(kalman.covariance, after, rtol=1e-9)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
+    """e(t_k) = (I − L C) e^{AT} e(t_{k−1}), whatever the input does in between."""
+    T_s = steps * H_NS * 1e-9
+    Ad_T = expm(A * T_s)
+    poles = (np.exp(-5 * T_s), np.exp(-8 * T_s))
+    L = observer_gain(Ad_T, C, tuple(map(complex, poles)))
+    error_matrix = (np.eye(2) - L @ C) @ Ad_T
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(error_matrix)), np.sort(poles), rtol=1e-9)
+    x, x_hat = np.array([0.4, -1.0]), np.array([0.0, 0.5])
+    following = Following(LuenbergerObserver(model(steps), L, x_hat), 1, 1, H_NS, 0)
+    error = following.take(0, C @ x, np.zeros(steps)) - x
+    rng = np.random.default_rng(2)
+    Ad, Bd, *_ = model()
+    for k in range(1, 20):
+        inputs = rng.normal(size=steps)
+        for u in inputs:
+            x = Ad @ x + Bd @ np.array([u])
+        x_hat = following.take(k * steps * H_NS, C @ x, inputs)
+        expected = error_matrix @ error
+        np.testing.assert_allclose(x_hat - x, expected, atol=1e-12)
+        error = x_hat - x
+
+
+def test_complex_poles_and_more_outputs_are_placed_as_well() -> None:
+    Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
+    wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
+    for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
+        L = observer_gain(Ad, outputs, wanted)
+        found = np.linalg.eigvals((np.eye(3) - L @ outputs) @ Ad)
+        np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
+
+
+def test_what_does_not_show_is_told_by_its_eigenvalue() -> None:
+    Ad = np.diag([1.5, 0.5, 0.9])
+    assert unseen_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
+    assert unseen_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
+    assert unseen_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+
+
+def test_missing_measurements_are_bridged_by_the_first_input_that_is_known() -> None:
+    one = Following(LuenbergerObserver(model(2), np.zeros((2, 1)), np.ones(2)), 1, 1, H_NS, 0)
+    x = one.take(5 * H_NS, np.zeros(1), np.array([0.7, -0.4]))
+    Ad, Bd, *_ = model()
+    expected = np.ones(2)
+    for u in (0.7, 0.7, 0.7, 0.7, -0.4):
+        expected = Ad @ expected + Bd @ np.array([u])
+    np.testing.assert_allclose(x, expected, rtol=1e-14)
+
+
+def test_the_trigger_works_on_the_estimate_and_the_update_carries_it(
+    observed: dict[str, Any],
+) -> None:
+    scenario = resolved(observed)
+    sensor, alone = sensor_of(scenario), sensor_of(resolved(_undisturbed(observed)))
+    types = tables_of(scenario)[SENSOR_MEASUREMENT]
+    rng = np.random.default_rng(3)
+    for k in range(60):
+        t_ns, y, u = k * H_NS, rng.normal(), rng.normal()
+        outputs = sensor.handle(measurement(k, t_ns, [y, u]), t_ns)
+        (record,) = [one for one in outputs if isinstance(one, Record)]
+        row = np.array([record.row], types)[0]
+        assert (row["y"].tolist(), row["u_felt"].tolist()) == ([y], [u])
+        # The sensor that measures the state itself does with x̂ what this one does.
+        expected = alone.handle(measurement(k, t_ns, row["x"].tolist()), t_ns)
+        for mine, others in zip(outputs, expected, strict=True):
+            if isinstance(mine, Message) and isinstance(others, Message):
+                assert mine._replace(vector=0) == others._replace(vector=0)  # type: ignore[arg-type]
+                assert mine.vector.tobytes() == others.vector.tobytes() == row["x"].tobytes()
+            elif isinstance(mine, Record) and isinstance(others, Record):
+                assert str(mine.row[:-2]) == str(others.row)
+    assert row["event"] >= NO_SEQUENCE
+
+
+def _undisturbed(observed: dict[str, Any]) -> dict[str, Any]:
+    plant = {key: value for key, value in observed["plant"].items() if key != "measurement"}
+    return {**{k: v for k, v in observed.items() if k != "observer"}, "plant": plant}
+
+
+def estimates(outputs: Sequence[Output]) -> Vector:
+    (record,) = [one for one in outputs if isinstance(one, Record)]
+    found: Vector = record.row[4]
+    return found
+
+
+def test_a_sensor_that_is_started_anew_begins_its_observer_anew_and_says_so(
+    observed: dict[str, Any],
+) -> None:
+    observed["network"]["initial_sync"] = "known_state"
+    scenario = resolved(observed)
+    t_ns, y, u = 400_000_000, 0.7, 0.1
+    again = sensor_of(scenario, Start(1, t_ns)).handle(measurement(40, t_ns, [y, u]), t_ns)
+    (notice,) = [one for one in again if isinstance(one, Notice)]
+    assert notice.text == "the observer begins anew, from its initial estimate"
+    # From x̂ = 0 and P(0) = I: y weighs P/(P + R), and says nothing of the velocity.
+    np.testing.assert_allclose(estimates(again), [y / (1 + 1e-4), 0.0], rtol=1e-12)
+    first = sensor_of(scenario).handle(measurement(0, 0, [y, 0.0]), 0)
+    assert not [one for one in first if isinstance(one, Notice)]
+    weight = 1 / (1 + 1e-4)
+    expected = [1.0 + weight * (y - 1.0), 0.0]  # x(0) is known
+    np.testing.assert_allclose(estimates(first), expected, rtol=1e-12)
+
+
+def test_what_the_filter_is_not_told_it_takes_from_the_scenario(observed: dict[str, Any]) -> None:
+    observed["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "input", "std": [0.3]},
+        {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
+        {"kind": "sine", "amplitude": [5.0], "hz": 1.0},
+    ]
+    del observed["observer"]["input_std"]
+    scenario = resolved(observed)
+    believed, h = believed_model(scenario), 0.01
+    into = np.array([h**2 / 2, h])  # the double integrator's, of a held input
+    expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
+    np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
+    assert believed.R.tolist() == [[0.01**2]]
+    observed["observer"] |= {"process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5]}
+    told = believed_model(resolved(observed))
+    np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
+    assert told.R.tolist() == [[0.25]]
+    np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
+
+
+def test_the_steady_state_of_a_scalar_is_the_quadratic_equations(content: dict[str, Any]) -> None:
+    """P⁻ = a²P⁻R/(P⁻ + R) + q, solved by hand."""
+    a, h, r, q = 2.0, 0.01, 0.04, 9e-4
+    content["model"] = {"A": [[a]], "B": [[1.0]], "gain": [[-3.0]]}
+    content["plant"] = {
+        "initial_state": [0.0], "rate_hz": 100.0,
+        "measurement": {"noise_std": [0.2]},
+    }  # fmt: skip
+    content["observer"] = {"kind": "kalman", "Q": [[q]], "initial_std": [1.0]}
+    content["plant"]["disturbances"] = [
+        {"kind": "gaussian", "at": "state", "std": [np.sqrt(q) * a / np.expm1(a * h)]}
+    ]
+    f = np.exp(2 * a * h)
+    b = r * (1 - f) - q
+    before = (-b + np.sqrt(b**2 + 4 * q * r)) / 2
+    found = steady_state(resolved(content))
+    assert found.covariance[0, 0] == pytest.approx(before * r / (before + r), rel=1e-9)
+    assert found.gain[0, 0] == pytest.approx(before / (before + r), rel=1e-9)
+    assert found.radius == pytest.approx(np.exp(a * h) * r / (before + r), rel=1e-9)
