@@ -32,8 +32,9 @@ from cosim.exact.fates import network_fates
 from cosim.exact.run import ContinuousRun, simulate_continuous
 from noack.linear import Vector
 from noack.resolve import Loop, loop_of, resolve
-from noack.scenario import Scenario, Seeds
+from noack.scenario import Scenario
 from noack.scenario_file import load
+from noack.sections.run import Seeds
 
 Mode = Literal["model", "zoh"]
 Method = Literal["RK45", "DOP853"]

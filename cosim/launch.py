@@ -215,9 +215,13 @@ class _Run:
             TICKET_ON_STDIN: "1",
             "OPENBLAS_NUM_THREADS": "1",
             "PYTHONUTF8": "1",
-            # What the view's libraries took in a busy moment goes back to the system.
+            # What a busy moment took goes back to the system: glibc raises its own thresholds for
+            # that with each large block unless they are given, and has an arena for each thread.
             "MIMALLOC_PURGE_DELAY": "0",
             "ARROW_DEFAULT_MEMORY_POOL": "system",
+            "MALLOC_ARENA_MAX": "2",
+            "MALLOC_MMAP_THRESHOLD_": "131072",
+            "MALLOC_TRIM_THRESHOLD_": "131072",
         }
         try:
             with (self._run_dir / "logs" / f"{role}.log").open("a") as log:

@@ -16,7 +16,8 @@ from noack.observability import observer_gain, unseen_mode
 from noack.observers import AnyObserver, Luenberger
 from noack.records import tables
 from noack.rng import stream
-from noack.scenario import Model, Scenario
+from noack.scenario import Scenario
+from noack.sections.model import Model
 from noack.setpoint import input_at
 
 _SURELY_FINITE = 600.0

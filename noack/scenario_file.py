@@ -11,7 +11,8 @@ from noack import toml_file
 from noack.errors import CallerError, printable
 from noack.impairment_files import read_impairment, read_loss
 from noack.matrix_files import with_matrices
-from noack.scenario import Acknowledgements, Network, Scenario
+from noack.scenario import Scenario
+from noack.sections.network import Acknowledgements, Network
 from noack.system_files import read_system
 
 

@@ -18,7 +18,7 @@ from noack.linear import Matrix
 from noack.matrices import require_shape
 from noack.matrix_files import GAIN, unfit, write_matrices
 from noack.mistakes import brief
-from noack.scenario import Model
+from noack.sections.model import Model
 
 
 def model_of(

@@ -14,7 +14,8 @@ from cosim.batch.api import Population
 from noack.linear import Matrix, Vector
 from noack.resolve import loop_of, resolve
 from noack.rng import uniforms, words
-from noack.scenario import Scenario, Seeds
+from noack.scenario import Scenario
+from noack.sections.run import Seeds
 
 _STREAM = "campaign"
 

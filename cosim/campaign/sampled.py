@@ -24,7 +24,8 @@ from cosim.virtual import simulate
 from noack.clock import NS_PER_S
 from noack.linear import Matrix
 from noack.records import CONTROLLER_DELIVERY, NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario import Ports, Realtime, Scenario, Seeds
+from noack.scenario import Scenario
+from noack.sections.run import Ports, Realtime, Seeds
 from noack.trigger.choose import policy_of
 
 

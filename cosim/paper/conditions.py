@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from noack.resolve import resolve
-from noack.scenario import Scenario, Seeds
+from noack.scenario import Scenario
 from noack.scenario_file import load
+from noack.sections.run import Seeds
 
 Mode = Literal["model", "zoh"]
 

@@ -10,7 +10,7 @@ from scipy import signal
 from noack.errors import CallerError
 from noack.matrix_files import read_matrices
 from noack.named_file import NamedFile
-from noack.scenario import Model
+from noack.sections.model import Model
 from noack.state_space import model_of, save_model
 
 A = np.array([[0.0, 1.0], [4.0, 0.0]])

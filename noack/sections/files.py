@@ -1,0 +1,11 @@
+"""What a section says of a file of matrices."""
+
+from collections.abc import Mapping
+
+
+def require_read(file: str | None, names: Mapping[str, str] | None) -> None:
+    """Raise ValueError where a section still names a file, which whoever loads a scenario reads."""
+    if file is not None:
+        raise ValueError("file: it is read where a scenario file is loaded; give matrices here")
+    if names is not None:
+        raise ValueError("names: they are of arrays in a file; give file, too")
