@@ -104,7 +104,7 @@ fuzz: setup-dev ## Fuzz every parser, MINUTES=10 in all; exit status 1 if someth
 attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes); 1 if any gets in
 	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)
 
-soak: setup-dev ## Watch a run for an hour, then a day at speed 24; MINUTES=5 is a short one
+soak: setup-dev ## Watch a run for an hour, then a day at speed 48; MINUTES=5 is a short one
 	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules
