@@ -25,7 +25,11 @@ from noack.linear import Matrix
 from noack.scenario_file import dumps, load
 
 
-@command(CAMPAIGNS)
+@command(CAMPAIGNS, [
+    ("noack design lane_following --settling 14", "the fewest transmissions"),
+    ("noack design lane_following --settling 14 --bound error=3 --out mine.toml", ""),
+    ("noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json", ""),
+])  # fmt: skip
 def design(
     scenario: ScenarioArgument,
     settling: Annotated[float, typer.Option(metavar="SECONDS", help="Settle within this time.")],

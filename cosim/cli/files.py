@@ -19,7 +19,10 @@ from noack.scenario_file import dumps as scenario_toml
 from noack.scenario_file import json_schema, load
 
 
-@command(FILES)
+@command(FILES, [
+    ("noack check lane_following", "all its keys, and what the paper assumes"),
+    ("noack check lane_following --set mode=zoh --json", ""),
+])  # fmt: skip
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
     """Check a scenario and print it resolved: defaults, named models and draws made explicit.
 
@@ -51,7 +54,11 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
     return ExitStatus.OK
 
 
-@command(FILES)
+@command(FILES, [
+    ("noack schema > scenario.schema.json", "for an editor that completes keys"),
+    ("noack schema --campaign", ""),
+    ("noack schema --netem", ""),
+])  # fmt: skip
 def schema(
     netem: Annotated[
         bool, typer.Option("--netem", help="Of the emulator's links files instead.")
