@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from pydantic import BaseModel
 
@@ -44,14 +43,16 @@ def knobs(incomplete: str) -> list[str]:
 
 def keys(section: type[BaseModel], prefix: str = "") -> list[str]:
     """Keys of a settings file, those of whatever its tables may be among them, each once."""
-    return list(dict.fromkeys(_keys(section, prefix)))
+    return list(dict.fromkeys(_keys(section, prefix, ())))
 
 
-def _keys(section: type[BaseModel], prefix: str) -> Iterator[str]:
+def _keys(
+    section: type[BaseModel], prefix: str, within: tuple[type[BaseModel], ...]
+) -> Iterator[str]:
     for name, field in section.model_fields.items():
-        inner: list[Any] = sections_of(field.annotation)
-        for one in inner:
-            yield from _keys(one, f"{prefix}{name}.")
+        inner = [one for one in sections_of(field.annotation) if one not in within]
+        for one in inner:  # a trigger may hold another
+            yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
         if not inner:
             yield f"{prefix}{name}"
 

@@ -104,17 +104,19 @@ def _cores(machine: Machine) -> Finding:
 
 
 def _settings(machine: Machine, wanted: Wanted) -> Iterator[Finding]:
+    granted = [said for name, said in _SETTINGS.items() if machine.granted.get(name) == "granted"]
+    what = "real-time settings"
+    if granted:
+        yield Finding(what, Verdict.GOOD, f"granted: {', '.join(granted)}", "")
     for name, said in _SETTINGS.items():
         answer = machine.granted.get(name, "not known")
-        refused = answer.startswith("refused")
-        what = f"real time: {said}"
-        if not refused:
-            yield Finding(what, Verdict.GOOD, answer, "")
-        elif not wanted.realtime:
-            yield Finding(what, Verdict.GOOD, answer, f"{wanted.name} does not ask for it")
+        if not answer.startswith("refused"):
+            continue
+        if wanted.realtime:
+            means, verdict = "a run goes on without it, and says so", Verdict.LIMITED
         else:
-            means = "a run goes on without it, and says so"
-            yield Finding(what, Verdict.LIMITED, answer, means, _REMEDIES.get(name, ""))
+            means, verdict = f"{wanted.name} does not ask for it", Verdict.GOOD
+        yield Finding(what, verdict, f"{said} {answer}", means, _REMEDIES.get(name, ""))
 
 
 def _timer(machine: Machine) -> Finding:
