@@ -28,9 +28,7 @@ def find_shipped(name: str, folder: str) -> Path:
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]}? There" if close else "there"
     kind = folder.removesuffix("s")
-    raise CallerError(
-        f"{name}: no such file, nor a shipped {kind}; {hint} are {', '.join(names)}"
-    )
+    raise CallerError(f"{name}: no such file, nor a shipped {kind}; {hint} are {', '.join(names)}")
 
 
 def shipped_names(folder: str) -> list[str]:

@@ -14,7 +14,6 @@ import typer
 from rich.markup import escape
 
 from cosim.cli import complete
-from cosim.cli.complete import DEFAULT_RUNS
 from cosim.cli.program import NAME, Program, be_patient
 from cosim.shipped import find_shipped
 from noack.errors import ExitStatus, NoackError

@@ -7,7 +7,8 @@ import typer
 from rich.console import Console
 
 from cosim.cli import complete
-from cosim.cli.app import CAMPAIGNS, DEFAULT_RUNS, JsonOption, command, cores, print_json
+from cosim.cli.app import CAMPAIGNS, JsonOption, command, cores, print_json
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import CallerError, ExitStatus
 
 _PER_CORE = 4

@@ -1,17 +1,14 @@
 """What a shell may complete: names of shipped files, run directories, keys of a scenario."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 from pydantic import BaseModel
 
-from cosim.run_dir import LATEST, SCENARIO_FILE
+from cosim.run_dir import DEFAULT_RUNS, LATEST, SCENARIO_FILE
 from cosim.shipped import shipped_names
 from noack.knobs import SHORT
 from noack.mistakes import sections_of
 from noack.scenario import Scenario
-
-DEFAULT_RUNS = Path("runs")
 
 
 def scenarios(incomplete: str) -> list[str]:

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from cosim.cli.app import (
     CAMPAIGNS,
-    DEFAULT_RUNS,
     JsonOption,
     ScenarioArgument,
     SetOption,
@@ -20,6 +19,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import CallerError, ExitStatus, MachineError
 from noack.linear import Matrix
 from noack.scenario_file import dumps, load

@@ -6,7 +6,6 @@ import typer
 from rich.console import Console
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     FILES,
     JsonOption,
     RunsOption,
@@ -16,6 +15,7 @@ from cosim.cli.app import (
     print_json,
 )
 from cosim.cli.complete import scenarios
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import ExitStatus
 from noack.scenario_file import load
 

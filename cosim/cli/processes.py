@@ -3,7 +3,6 @@
 import typer
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     PROCESSES,
     JsonOption,
     LiveOption,
@@ -16,6 +15,7 @@ from cosim.cli.app import (
     find_scenario,
 )
 from cosim.cli.runs import run_processes
+from cosim.run_dir import DEFAULT_RUNS
 from noack.scenario_file import load
 from noack.topology import RECORDER
 

@@ -26,14 +26,26 @@ class Program(TyperGroup):
             one.hidden = one.hidden or one.name in _COMPLETION
         return found
 
-    def main(self, args: Any = None, *rest: Any, standalone_mode: bool = True, **more: Any) -> Any:
-        """Run the program; see :class:`typer.core.TyperGroup`."""
+    def main(
+        self,
+        args: Any = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run the program; the arguments are those of :class:`typer.core.TyperGroup`."""
         words = list(sys.argv[1:] if args is None else args)
         try:
-            status = super().main(words, *rest, standalone_mode=False, **more)
+            status = super().main(
+                words, prog_name, complete_var, False, windows_expand_args, **extra
+            )
         except typer.TyperException as error:
             status = ExitStatus.CALLER
-            if said := self._line(error, words):  # of an empty command line it is the help, printed already
+            if said := self._line(
+                error, words
+            ):  # of an empty command line it is the help, printed already
                 failed(said, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help goes to a full disk
             status = failed(

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from cosim.cli import complete
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     RUNS,
     JsonOption,
     LiveOption,
@@ -24,7 +23,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
-from cosim.run_dir import RECORDING_FILE, latest_run
+from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, latest_run
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
 from noack.scenario_file import load

@@ -8,7 +8,6 @@ import typer
 from rich.console import Console
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     THEORY,
     JsonOption,
     ScenarioArgument,
@@ -18,6 +17,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import ExitStatus
 from noack.scenario_file import load
 

@@ -50,7 +50,7 @@ def wanted_of(resolved: Scenario) -> Wanted:
 class Lateness(NamedTuple):
     """How late a loop of the plant's rate woke up that had nothing to do."""
 
-    count: int
+    wakes: int
     p50_us: float
     p99_us: float
     max_us: float

@@ -136,15 +136,15 @@ def _wake_ups(what: str, found: Lateness | str, wanted: Wanted, *, in_force: boo
         return Finding(what, Verdict.LIMITED, found, "how late a run will be is not known")
     late = (
         f"{_time(found.p50_us)} late in the median, {_time(found.p99_us)} p99, "
-        f"{_time(found.max_us)} at the most, of {found.count:,} at {wanted.rate_hz:g} Hz"
+        f"{_time(found.max_us)} at the most, of {found.wakes:,} at {wanted.rate_hz:g} Hz"
     )
     allowed = f"the {_time(wanted.allowance_ns * 1e-3)} that {wanted.name}'s certificates allow"
     if not found.beyond:
         near = found.max_us * 1e3 > wanted.allowance_ns / 2
         means = f"all within {allowed}" + (", some by less than a half of it" if near else "")
         return Finding(what, Verdict.GOOD, late, f"{means}; a longer run may meet a later one")
-    share = 100 * found.beyond / found.count
-    first_s = found.count / found.beyond / wanted.rate_hz
+    share = 100 * found.beyond / found.wakes
+    first_s = found.wakes / found.beyond / wanted.rate_hz
     means = (
         f"{found.beyond:,} of them ({share:.2g} %) beyond {allowed}: at this rate a run would void "
         f"them every {first_s:.2g} s, of its {wanted.duration_s:g} s"

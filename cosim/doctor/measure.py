@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from contextlib import closing, suppress
-from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
@@ -112,9 +111,7 @@ def _wake_ups(
         said = one_line(error)
         return said, said, {}
     found: dict[str, Any] = json.loads(done.stdout)
-    plain, realtime = (
-        lateness(found[name], wanted.allowance_ns) for name in ("plain", "realtime")
-    )
+    plain, realtime = (lateness(found[name], wanted.allowance_ns) for name in ("plain", "realtime"))
     return plain, realtime, found["granted"]
 
 
@@ -275,4 +272,3 @@ def _read(path: Path) -> str | None:
         return path.read_text().strip() or None
     except OSError:
         return None
-

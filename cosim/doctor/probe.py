@@ -23,13 +23,12 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
     Returns:
         ``plain`` and ``realtime``, nanoseconds late each time, and ``granted``, the settings.
     """
-    late: dict[str, Sequence[int]] = {}
-    granted: dict[str, str] = {}
+    found: dict[str, object] = {}
     # Timer slack and locked memory stay for the life of a process: without them comes first.
     for name, enabled in (("plain", False), ("realtime", True)):
         with realtime(enabled, priority, place=0) as granted:
-            late[name] = _lateness(period_ns, duration_s, spin_us)
-    return {**late, "granted": granted}
+            found |= {name: _lateness(period_ns, duration_s, spin_us), "granted": granted}
+    return found
 
 
 def _lateness(period_ns: int, duration_s: float, spin_us: float) -> Sequence[int]:

@@ -72,9 +72,7 @@ def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | Non
     try:
         options = parser.parse_args(given)
     except NoackError as error:
-        return failed(
-            str(error), error.exit_status, who=f"noack {role}", as_json="--json" in given
-        )
+        return failed(str(error), error.exit_status, who=f"noack {role}", as_json="--json" in given)
     return join_run(role, body, options)
 
 

@@ -63,8 +63,6 @@ def test_every_key_is_offered_once_with_those_of_tables_that_may_be_chosen() -> 
             "plant.watchdog.policy", "seeds.loss"} <= set(found)  # fmt: skip
 
 
-def test_without_runs_nothing_is_offered(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_runs_nothing_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert run_directories("") == []

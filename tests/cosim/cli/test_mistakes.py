@@ -23,8 +23,7 @@ MISTAKES = {
     "check lane_following too": "noack: check: got unexpected extra argument(s) (too); "
     "see `noack check --help`",
     "demo --set": "noack: demo: option '--set' requires an argument; see `noack demo --help`",
-    "netem --lisen :9000": "noack netem: unrecognized arguments: --lisen; "
-    "see `noack netem --help`",
+    "netem --lisen :9000": "noack netem: unrecognized arguments: --lisen; see `noack netem --help`",
     "netem --seed many --listen :9000 --to :9001": "noack netem: --seed: invalid int value: "
     "'many'; see `noack netem --help`",
     "netem --session": "noack netem: --session: expected one argument; see `noack netem --help`",

@@ -25,7 +25,7 @@ def test_everything_is_measured_and_judged(tmp_path: Path) -> None:
     assert done.exit_code == (1 if said["verdict"] == "bad" else 0)
     measured = said["measured"]
     for name in ("plain", "realtime"):
-        assert measured[name]["count"] > 0, measured[name]
+        assert measured[name]["wakes"] > 0, measured[name]
         assert measured[name]["p50_us"] <= measured[name]["max_us"]
     assert measured["round_trips"]["sent"] == 1000
     assert measured["buffer"]["datagrams"] > 100

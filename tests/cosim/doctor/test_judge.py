@@ -16,7 +16,8 @@ WANTED = Wanted(
 PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
 ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")
 IDEAL = Machine(
-    cores=4, cores_online=4, load=0.1, governor="performance", granted=dict.fromkeys(ALL, "granted"),
+    cores=4, cores_online=4, load=0.1, governor="performance",
+    granted=dict.fromkeys(ALL, "granted"),
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
