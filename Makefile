@@ -27,7 +27,10 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  CAMPAIGN=NAME  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
+.PHONY: doctor demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
+doctor: setup ## Say what this machine grants, and what that means for a run of SCENARIO
+	@$(BIN)/noack doctor "$(SCENARIO)" $(ARGS)
+
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 

@@ -43,9 +43,7 @@ class Program(TyperGroup):
             )
         except typer.TyperException as error:
             status = ExitStatus.CALLER
-            if said := self._line(
-                error, words
-            ):  # of an empty command line it is the help, printed already
+            if said := self._line(error, words):
                 failed(said, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help goes to a full disk
             status = failed(
