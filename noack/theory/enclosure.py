@@ -14,13 +14,22 @@ the rest, some 1e-12 of a value, by a relative inflation of 1e-9.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.linear import Matrix, spectral_abscissa
-from noack.theory.decay import EPSILON, Decay, Stack, decay_of, frobenius_norms, logarithmic_norm
+from noack.theory.decay import (
+    EPSILON,
+    Decay,
+    Stack,
+    decay_of,
+    frobenius_norms,
+    logarithmic_norm,
+    product,
+)
 
 _ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
@@ -97,11 +106,15 @@ class Response:
     endless: bool
     """Whether bounds beyond the grid are asked for."""
 
+    @cached_property
+    def _derivatives(self) -> tuple[Stack, ...]:
+        return _derivatives(self.generator, self.states[:-1])
+
     def through(self, C: Matrix) -> Kernel:
         """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
         norms = norm_bounds(C, self.states)
-        bend = _second_derivative(self.generator, C, self.states[:-1], steps_s, self.decay)
+        bend = _bend(self.generator, C, self._derivatives, steps_s, self.decay)
         ends = np.maximum(norms[:-1], norms[1:])
         middle = 0.5 * (norms[:-1] + norms[1:])
         rate, beyond = 0.0, math.inf
@@ -120,34 +133,46 @@ class Response:
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), the product's rounding included."""
-    exact = C @ states
+    exact = product(C, states)
     # Of a vector, the Euclidean norm is the spectral one.
     norms = (
         frobenius_norms(exact)
         if min(exact.shape[1:]) == 1
         else np.linalg.norm(exact, 2, axis=(1, 2))
     )
-    return np.asarray(norms + EPSILON * len(C.T) * frobenius_norms(np.abs(C) @ np.abs(states)))
+    rounding = frobenius_norms(product(np.abs(C), np.abs(states)))
+    return np.asarray(norms + EPSILON * len(C.T) * rounding)
 
 
-def _second_derivative(
-    generator: Matrix, C: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None
+def _derivatives(generator: Matrix, nodes: Stack) -> tuple[Stack, ...]:
+    """G^j e^{Gτ} D for j = 2 …, each (k, n, r)."""
+    found = [product(generator, product(generator, nodes))]
+    for _ in range(_TAYLOR_TERMS):
+        found.append(product(generator, found[-1]))
+    return tuple(found)
+
+
+def _bend(
+    generator: Matrix,
+    C: Matrix,
+    derivatives: tuple[Stack, ...],
+    steps_s: Stack,
+    decay: Decay | None,
 ) -> Stack:
-    """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node (k, n, r)."""
+    """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node."""
     exponents = max(logarithmic_norm(generator), 0.0) * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    moved = generator @ (generator @ nodes)
     bound = np.zeros(len(steps_s))
-    least = bound + np.inf if decay is None else decay.bounds(C, moved)
-    for order in range(_TAYLOR_TERMS):
-        bound += steps_s**order / math.factorial(order) * frobenius_norms(C @ moved)
-        moved = generator @ moved
-    rest = float(np.linalg.norm(C, 2)) * growth * frobenius_norms(moved)
+    for order, derivative in enumerate(derivatives[:-1]):
+        bound += steps_s**order / math.factorial(order) * frobenius_norms(product(C, derivative))
+    last = derivatives[-1]
+    rest = float(np.linalg.norm(C, 2)) * growth * frobenius_norms(last)
     if decay is not None:
-        rest = np.minimum(rest, decay.bounds(C, moved))
+        rest = np.minimum(rest, decay.bounds(C, last))
     bound += steps_s**_TAYLOR_TERMS / math.factorial(_TAYLOR_TERMS) * rest
+    least = bound if decay is None else decay.bounds(C, derivatives[0])
     return np.asarray(np.minimum(least, bound))
 
 
@@ -192,7 +217,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> 
     """Whether e^{Gτ} Y hardly differs from its chord over a step from here."""
     size = float(np.linalg.norm(state))
     everything, steps_s = np.eye(len(generator)), np.array([step_s])
-    bend = _second_derivative(generator, everything, state[None], steps_s, decay)
+    bend = _bend(generator, everything, _derivatives(generator, state[None]), steps_s, decay)
     return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
 
 
@@ -233,11 +258,11 @@ def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> S
     powers, size = np.eye(len(generator))[None], min(_BLOCK, cells)
     leap = expm(generator * step_s)
     while len(powers) < size:
-        powers, leap = np.concatenate([powers, leap @ powers]), leap @ leap
+        powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
     size = len(powers)
     blocks = []
     for _ in range(-(-(cells + 1) // size)):
-        blocks.append(powers @ state)
+        blocks.append((powers.reshape(-1, len(state)) @ state).reshape(size, *state.shape))
         state = leap @ state
     return np.concatenate(blocks)[: cells + 1]
 
