@@ -35,8 +35,15 @@ class Decay(NamedTuple):
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
         """Of ‖C e^{Gs} Y‖ at all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
-        seen = float(np.linalg.norm(C @ self.inverse, 2))
-        return seen * frobenius_norms(product(self.factor, states))
+        return self.seen(C) * self.sizes(states)
+
+    def seen(self, C: Matrix) -> float:
+        """‖C L^{−1}‖."""
+        return float(np.linalg.norm(C @ self.inverse, 2))
+
+    def sizes(self, states: Stack) -> Stack:
+        """‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
+        return frobenius_norms(product(self.factor, states))
 
 
 def decay_of(generator: Matrix) -> Decay | None:

@@ -107,14 +107,14 @@ class Response:
     """Whether bounds beyond the grid are asked for."""
 
     @cached_property
-    def _derivatives(self) -> tuple[Stack, ...]:
-        return _derivatives(self.generator, self.states[:-1])
+    def _bends(self) -> "_Bends":
+        return _bends(self.generator, self.states[:-1], np.diff(self.edges_s), self.decay)
 
     def through(self, C: Matrix) -> Kernel:
         """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
         norms = norm_bounds(C, self.states)
-        bend = _bend(self.generator, C, self._derivatives, steps_s, self.decay)
+        bend = self._bends.over(C)
         ends = np.maximum(norms[:-1], norms[1:])
         middle = 0.5 * (norms[:-1] + norms[1:])
         rate, beyond = 0.0, math.inf
@@ -144,36 +144,48 @@ def norm_bounds(C: Matrix, states: Stack) -> Stack:
     return np.asarray(norms + EPSILON * len(C.T) * rounding)
 
 
-def _derivatives(generator: Matrix, nodes: Stack) -> tuple[Stack, ...]:
-    """G^j e^{Gτ} D for j = 2 …, each (k, n, r)."""
-    found = [product(generator, product(generator, nodes))]
-    for _ in range(_TAYLOR_TERMS):
-        found.append(product(generator, found[-1]))
-    return tuple(found)
+@dataclass(frozen=True)
+class _Bends:
+    """What bounds ‖C G² e^{Gτ} D‖ over each of k cells, but for C."""
+
+    terms: Stack
+    """(4k, n, r), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
+    rest: Stack
+    """(k,), of the remainder, to be multiplied by ‖C‖."""
+    decay: Decay | None
+    rest_decaying: Stack
+    """(k,), of the remainder as the decay bounds it, to be multiplied by ‖C L^{−1}‖."""
+    least: Stack
+    """(k,), of the whole, likewise."""
+
+    def over(self, C: Matrix) -> Stack:
+        """Bounds for an output matrix C, (k,)."""
+        bound = frobenius_norms(product(C, self.terms)).reshape(_TAYLOR_TERMS, -1).sum(axis=0)
+        rest = float(np.linalg.norm(C, 2)) * self.rest
+        if self.decay is None:
+            return np.asarray(bound + rest)
+        seen = self.decay.seen(C)
+        bound += np.minimum(rest, seen * self.rest_decaying)
+        return np.asarray(np.minimum(seen * self.least, bound))
 
 
-def _bend(
-    generator: Matrix,
-    C: Matrix,
-    derivatives: tuple[Stack, ...],
-    steps_s: Stack,
-    decay: Decay | None,
-) -> Stack:
-    """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node."""
+def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None) -> _Bends:
+    """Of the cells that begin at the nodes, (k, n, r), by Taylor's formula."""
     exponents = max(logarithmic_norm(generator), 0.0) * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    bound = np.zeros(len(steps_s))
-    for order, derivative in enumerate(derivatives[:-1]):
-        bound += steps_s**order / math.factorial(order) * frobenius_norms(product(C, derivative))
-    last = derivatives[-1]
-    rest = float(np.linalg.norm(C, 2)) * growth * frobenius_norms(last)
-    if decay is not None:
-        rest = np.minimum(rest, decay.bounds(C, last))
-    bound += steps_s**_TAYLOR_TERMS / math.factorial(_TAYLOR_TERMS) * rest
-    least = bound if decay is None else decay.bounds(C, derivatives[0])
-    return np.asarray(np.minimum(least, bound))
+    terms = [product(generator, product(generator, nodes))]
+    for order in range(1, _TAYLOR_TERMS + 1):
+        terms.append(product(generator, terms[-1]) * (steps_s / order)[:, None, None])
+    none = np.zeros(0)
+    return _Bends(
+        np.concatenate(terms[:-1]),
+        growth * frobenius_norms(terms[-1]),
+        decay,
+        none if decay is None else decay.sizes(terms[-1]),
+        none if decay is None else decay.sizes(terms[0]),
+    )
 
 
 def response(generator: Matrix, D: Matrix) -> Response:
@@ -217,7 +229,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> 
     """Whether e^{Gτ} Y hardly differs from its chord over a step from here."""
     size = float(np.linalg.norm(state))
     everything, steps_s = np.eye(len(generator)), np.array([step_s])
-    bend = _bend(generator, everything, _derivatives(generator, state[None]), steps_s, decay)
+    bend = _bends(generator, state[None], steps_s, decay).over(everything)
     return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
 
 
