@@ -2,6 +2,9 @@
 
 import gc
 import json
+import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -57,6 +60,24 @@ def test_a_live_run_is_a_run(scenario: noack.Scenario) -> None:
     assert run.summary["kind"] == "live"
     assert isinstance(run.plot("latency"), Figure)
     assert run.table("plant_step").num_rows == 250 + 1
+
+
+def test_a_live_run_that_is_interrupted_is_returned() -> None:
+    program = (
+        "import noack\n"
+        "scenario = noack.load('double_integrator', {'horizon_s': 10.0})\n"
+        "run = noack.run(scenario, progress=True)\n"
+        "print(run.ok, run.reason, run.table('plant_step').num_rows > 100)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert any("/10 s" in line for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        stdout, _ = process.communicate(timeout=100)
+    assert stdout.split("\n")[0] == "False stopped by SIGINT True"
+    assert process.returncode == 0
 
 
 def test_a_live_run_is_the_main_threads(scenario: noack.Scenario) -> None:
