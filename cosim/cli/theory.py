@@ -8,7 +8,6 @@ import typer
 from rich.console import Console
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     THEORY,
     JsonOption,
     ScenarioArgument,
@@ -18,11 +17,16 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import ExitStatus
 from noack.scenario_file import load
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack certify lane_following", "its plant and its uncertainty box"),
+    ("noack certify lane_following --weight chosen", "in a norm that certifies more"),
+    ("noack certify lane_weighted --late 6 --json", "a schedule that may be 6 steps late"),
+])  # fmt: skip
 def certify(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -63,7 +67,11 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack adversary lane_following", "all objectives"),
+    ("noack adversary lane_following --objective error --json", "the controller's error"),
+    ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a quicker search"),
+])  # fmt: skip
 def adversary(
     scenario: ScenarioArgument,
     objective: Annotated[
@@ -113,7 +121,10 @@ def adversary(
     return ExitStatus.FAILED if refuted else ExitStatus.OK
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack paper", "1,000 draws, some minutes; into runs/paper"),
+    ("noack paper --draws 50 --out paper --json", "a glance"),
+])  # fmt: skip
 def paper(
     draws: Annotated[int, typer.Option(help="Draws of plant, losses and initial state.")] = 1000,
     out: Annotated[
