@@ -199,4 +199,5 @@ def _matrix(file: NamedFile, name: str, value: Any) -> Matrix:
 
 def _missing(name: str, arrays: Mapping[str, Any]) -> str:
     listed = ", ".join(list(arrays)[:10]) or "none"
-    return f"has no matrix {name} of at most {MAX_DIMENSION} x {MAX_DIMENSION} numbers; it has {listed}"
+    most = f"{MAX_DIMENSION} x {MAX_DIMENSION}"
+    return f"has no matrix {name} of numbers, at most {most}; it has {listed}"
