@@ -94,7 +94,7 @@ def test_a_sparse_matrix_and_whole_numbers_are_matrices(tmp_path: Path) -> None:
     ("arrays", "expected"),
     [
         ({"A": A}, "has no matrix B of numbers, at most 64 x 64; it has A"),
-        ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of at most 64 x 64"),
+        ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of numbers, at most 64 x 64"),
         ({"A": A, "B": B, "K": K, "dt": 0.01}, "dt is 0.01, so it is a system in discrete time"),
         ({"A": A, "B": B, "K": K, "C": np.eye(2)[:1]}, "C is not the identity"),
         ({"A": A, "B": B, "K": K, "C": 2 * np.eye(2)}, "C is not the identity"),
