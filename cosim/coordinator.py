@@ -114,8 +114,6 @@ class Coordinator:
             if (member := self._member(life.key_expr)) is not None:
                 gone = life.kind == zenoh.SampleKind.DELETE
                 member.vanished_s = time.monotonic() if gone else None
-            elif life.kind == zenoh.SampleKind.DELETE:
-                self._candidates.pop(_whose(life.key_expr), None)
         if self._clock is None:
             for role in list(self._members):
                 if self.finished(role):  # another may come in its stead

@@ -49,8 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.soak",
-        description="Run the loop for an hour at speed 1, then for a day of simulated time in half an "
-        "hour, and watch it: memory, descriptors and threads must stay flat, every invariant hold.",
+        description="Run the loop for an hour at speed 1, then for a day of simulated time in half "
+        "an hour, and watch it: memory, descriptors and threads must stay flat, every invariant "
+        "hold.",
     )
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}")
     parser.add_argument(

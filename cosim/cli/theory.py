@@ -43,15 +43,12 @@ def certify(
     json: JsonOption = False,
 ) -> int:
     """Say what is guaranteed of a scenario, with which constants, under which conditions."""
-    from cosim.certify import print_study, study, with_weight
+    from cosim.certify import print_study, study_scenario
     from cosim.progress import work_bar
-    from noack.resolve import resolve
 
-    resolved = resolve(load(find_scenario(scenario), settings or ()))
-    allowed = resolved.certificate.late_periods if late is None else late
+    loaded = load(find_scenario(scenario), settings or ())
     with work_bar("choosing the weight") as progress:
-        weighted, chosen = with_weight(resolved, weight, progress)
-    found = study(weighted, allowed, chosen)
+        found = study_scenario(loaded, weight, late, progress)
     if json:
         print_json(found.to_json())
     else:

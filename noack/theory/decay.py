@@ -35,8 +35,15 @@ class Decay(NamedTuple):
 
     def bounds(self, C: Matrix, states: Stack) -> Stack:
         """Of ‖C e^{Gs} Y‖ at all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
-        seen = float(np.linalg.norm(C @ self.inverse, 2))
-        return seen * frobenius_norms(self.factor @ states)
+        return self.seen(C) * self.sizes(states)
+
+    def seen(self, C: Matrix) -> float:
+        """‖C L^{−1}‖."""
+        return float(np.linalg.norm(C @ self.inverse, 2))
+
+    def sizes(self, states: Stack) -> Stack:
+        """‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
+        return frobenius_norms(product(self.factor, states))
 
 
 def decay_of(generator: Matrix) -> Decay | None:
@@ -97,6 +104,13 @@ def _modal_factor(generator: Matrix) -> Matrix | None:
 def logarithmic_norm(generator: Matrix) -> float:
     """μ with ‖e^{Gs}‖ ≤ e^{μs}, for the Euclidean norm."""
     return float(np.linalg.eigvalsh(0.5 * (generator + generator.T)).max())
+
+
+def product(matrix: Matrix, stack: Stack) -> Stack:
+    """M Y for a stack of Y, (k, n, r) → (k, q, r): one product of M with all columns."""
+    k, n, r = stack.shape
+    columns = stack.transpose(1, 0, 2).reshape(n, k * r)
+    return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
 
 
 def frobenius_norms(stack: Stack) -> Stack:

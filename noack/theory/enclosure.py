@@ -14,13 +14,22 @@ the rest, some 1e-12 of a value, by a relative inflation of 1e-9.
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from noack.linear import Matrix, spectral_abscissa
-from noack.theory.decay import EPSILON, Decay, Stack, decay_of, frobenius_norms, logarithmic_norm
+from noack.theory.decay import (
+    EPSILON,
+    Decay,
+    Stack,
+    decay_of,
+    frobenius_norms,
+    logarithmic_norm,
+    product,
+)
 
 _ROUNDING = 1.0 + 1e-9
 _TAYLOR_TERMS = 4
@@ -97,11 +106,15 @@ class Response:
     endless: bool
     """Whether bounds beyond the grid are asked for."""
 
+    @cached_property
+    def _bends(self) -> "_Bends":
+        return _bends(self.generator, self.states[:-1], np.diff(self.edges_s), self.decay)
+
     def through(self, C: Matrix) -> Kernel:
         """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
         norms = norm_bounds(C, self.states)
-        bend = _second_derivative(self.generator, C, self.states[:-1], steps_s, self.decay)
+        bend = self._bends.over(C)
         ends = np.maximum(norms[:-1], norms[1:])
         middle = 0.5 * (norms[:-1] + norms[1:])
         rate, beyond = 0.0, math.inf
@@ -120,35 +133,59 @@ class Response:
 
 def norm_bounds(C: Matrix, states: Stack) -> Stack:
     """Upper bounds of ‖C Y‖ for a stack of Y, (k, n, r) → (k,), the product's rounding included."""
-    exact = C @ states
+    exact = product(C, states)
     # Of a vector, the Euclidean norm is the spectral one.
     norms = (
         frobenius_norms(exact)
         if min(exact.shape[1:]) == 1
         else np.linalg.norm(exact, 2, axis=(1, 2))
     )
-    return np.asarray(norms + EPSILON * len(C.T) * frobenius_norms(np.abs(C) @ np.abs(states)))
+    rounding = frobenius_norms(product(np.abs(C), np.abs(states)))
+    return np.asarray(norms + EPSILON * len(C.T) * rounding)
 
 
-def _second_derivative(
-    generator: Matrix, C: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None
-) -> Stack:
-    """Bound of ‖C G² e^{Gτ} D‖ over each cell, by Taylor's formula from its left node (k, n, r)."""
+@dataclass(frozen=True)
+class _Bends:
+    """What bounds ‖C G² e^{Gτ} D‖ over each of k cells, but for C."""
+
+    terms: Stack
+    """(4k, n, r), Taylor's terms G^j e^{Gτ} D s^{j−2}/(j−2)! at the left nodes, by order."""
+    rest: Stack
+    """(k,), of the remainder, to be multiplied by ‖C‖."""
+    decay: Decay | None
+    rest_decaying: Stack
+    """(k,), of the remainder as the decay bounds it, to be multiplied by ‖C L^{−1}‖."""
+    least: Stack
+    """(k,), of the whole, likewise."""
+
+    def over(self, C: Matrix) -> Stack:
+        """Bounds for an output matrix C, (k,)."""
+        bound = frobenius_norms(product(C, self.terms)).reshape(_TAYLOR_TERMS, -1).sum(axis=0)
+        rest = float(np.linalg.norm(C, 2)) * self.rest
+        if self.decay is None:
+            return np.asarray(bound + rest)
+        seen = self.decay.seen(C)
+        bound += np.minimum(rest, seen * self.rest_decaying)
+        return np.asarray(np.minimum(seen * self.least, bound))
+
+
+def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None) -> _Bends:
+    """Of the cells that begin at the nodes, (k, n, r), by Taylor's formula."""
     exponents = max(logarithmic_norm(generator), 0.0) * steps_s
     growth = np.where(
         exponents < _LARGEST_EXPONENT, np.exp(exponents.clip(max=_LARGEST_EXPONENT)), np.inf
     )
-    moved = generator @ (generator @ nodes)
-    bound = np.zeros(len(steps_s))
-    least = bound + np.inf if decay is None else decay.bounds(C, moved)
-    for order in range(_TAYLOR_TERMS):
-        bound += steps_s**order / math.factorial(order) * frobenius_norms(C @ moved)
-        moved = generator @ moved
-    rest = float(np.linalg.norm(C, 2)) * growth * frobenius_norms(moved)
-    if decay is not None:
-        rest = np.minimum(rest, decay.bounds(C, moved))
-    bound += steps_s**_TAYLOR_TERMS / math.factorial(_TAYLOR_TERMS) * rest
-    return np.asarray(np.minimum(least, bound))
+    terms = [product(generator, product(generator, nodes))]
+    for order in range(1, _TAYLOR_TERMS + 1):
+        terms.append(product(generator, terms[-1]) * (steps_s / order)[:, None, None])
+    none = np.zeros(0)
+    return _Bends(
+        np.concatenate(terms[:-1]),
+        growth * frobenius_norms(terms[-1]),
+        decay,
+        none if decay is None else decay.sizes(terms[-1]),
+        none if decay is None else decay.sizes(terms[0]),
+    )
 
 
 def response(generator: Matrix, D: Matrix) -> Response:
@@ -192,7 +229,7 @@ def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> 
     """Whether e^{Gτ} Y hardly differs from its chord over a step from here."""
     size = float(np.linalg.norm(state))
     everything, steps_s = np.eye(len(generator)), np.array([step_s])
-    bend = _second_derivative(generator, everything, state[None], steps_s, decay)
+    bend = _bends(generator, state[None], steps_s, decay).over(everything)
     return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
 
 
@@ -233,11 +270,11 @@ def _propagate(generator: Matrix, state: Matrix, step_s: float, cells: int) -> S
     powers, size = np.eye(len(generator))[None], min(_BLOCK, cells)
     leap = expm(generator * step_s)
     while len(powers) < size:
-        powers, leap = np.concatenate([powers, leap @ powers]), leap @ leap
+        powers, leap = np.concatenate([powers, product(leap, powers)]), leap @ leap
     size = len(powers)
     blocks = []
     for _ in range(-(-(cells + 1) // size)):
-        blocks.append(powers @ state)
+        blocks.append((powers.reshape(-1, len(state)) @ state).reshape(size, *state.shape))
         state = leap @ state
     return np.concatenate(blocks)[: cells + 1]
 

@@ -129,7 +129,9 @@ def test_a_taken_port_is_one_clear_line(tmp_path: Path, role: str) -> None:
 def test_a_run_that_diverges_says_when_and_keeps_its_record(tmp_path: Path) -> None:
     finished = run_scenario(
         tmp_path,
-        *settings(speed=2.0, horizon_s=4.0, model__parameters__a11=500.0),
+        *settings(
+            horizon_s=4.0, model__parameters__a11=500.0, plant__rate_hz=100, controller__rate_hz=100
+        ),
         "--report",
     )
     assert finished.status == 1

@@ -12,7 +12,7 @@ from tests.cosim.adversary.scenarios import every_run, flow_of, scenarios
 
 
 @given(resolved=scenarios(8))
-@settings(max_examples=10)
+@settings(max_examples=5)
 def test_no_run_ever_costs_more_than_the_ceiling(resolved: Scenario) -> None:
     system, _, flow = flow_of(resolved, Objective.COST)
     ceiling = cost_ceiling(system, resolved.network.mansd, resolved.horizon_s)
@@ -28,7 +28,7 @@ def test_no_run_ever_costs_more_than_the_ceiling(resolved: Scenario) -> None:
 
 
 @given(resolved=scenarios(12, mansd=2, beta=0.01))
-@settings(max_examples=10)
+@settings(max_examples=5)
 def test_what_the_ceiling_leaves_out_is_not_missed(resolved: Scenario) -> None:
     system, _, flow = flow_of(resolved, Objective.COST)
     ceiling = cost_ceiling(system, 2, resolved.horizon_s)
@@ -43,7 +43,7 @@ def test_the_ceiling_leaves_something_out() -> None:
     saved = []
 
     @given(resolved=scenarios(12, mansd=2, beta=0.01, mismatch=0.1))
-    @settings(max_examples=10)
+    @settings(max_examples=5)
     def count(resolved: Scenario) -> None:
         system, _, flow = flow_of(resolved, Objective.COST)
         best = search_tree(flow, 2, 10**5)

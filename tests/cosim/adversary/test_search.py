@@ -49,7 +49,7 @@ def test_the_exact_search_finds_what_trying_all_finds(
 
 
 @given(resolved=scenarios(7, mansd=3), objective=st.sampled_from(Objective))
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_the_tree_alone_finds_it_too(resolved: Scenario, objective: Objective) -> None:
     """Without guesses to start with, so that nothing but its own branches can find it."""
     _, measure, flow = flow_of(resolved, objective)
@@ -60,7 +60,7 @@ def test_the_tree_alone_finds_it_too(resolved: Scenario, objective: Objective) -
 
 
 @given(resolved=scenarios(12), objective=st.sampled_from(Objective))
-@settings(MANY, max_examples=15)
+@settings(MANY, max_examples=8)
 def test_the_beam_comes_within_a_hundredth(resolved: Scenario, objective: Objective) -> None:
     exact = signed(find_worst(resolved, objective, most_nodes=20_000, beam=0))
     beam = signed(find_worst(resolved, objective, most_nodes=0, beam=64))
@@ -72,7 +72,7 @@ def test_the_beam_comes_within_a_hundredth(resolved: Scenario, objective: Object
     objective=st.sampled_from(Objective),
     most_nodes=st.sampled_from([0, 2000]),
 )
-@settings(max_examples=12)
+@settings(max_examples=6)
 def test_every_pattern_is_admissible_and_leads_to_what_is_told(
     resolved: Scenario, objective: Objective, most_nodes: int
 ) -> None:
@@ -111,7 +111,7 @@ def test_the_same_arguments_give_the_same_result(resolved: Scenario, objective: 
     resolved=scenarios(12),
     objective=st.sampled_from([Objective.ERROR, Objective.STATE, Objective.INTER_EVENT]),
 )
-@settings(MANY, max_examples=30)
+@settings(MANY, max_examples=8)
 def test_no_certificate_is_exceeded(resolved: Scenario, objective: Objective) -> None:
     worst = find_worst(resolved, objective, most_nodes=5_000, beam=0)
     assert not worst.breaches, worst
@@ -122,7 +122,7 @@ def test_a_certificate_that_forgets_a_dropout_is_caught() -> None:
     caught = []
 
     @given(resolved=scenarios(16, mansd=1, n=2, alpha_share=0.2))
-    @settings(MANY, max_examples=15)
+    @settings(MANY, max_examples=8)
     def attempt(resolved: Scenario) -> None:
         broken = certify(resolved, ideal_conditions(resolved)._replace(dropouts=0))
         caught.append(find_worst(resolved, Objective.ERROR, certificate=broken).breaches)

@@ -341,7 +341,7 @@ def test_no_simulated_run_violates_its_certificate() -> None:
     judged: dict[ClaimVerdict, int] = {}
 
     @settings(
-        deadline=None, max_examples=35, phases=[Phase.generate],
+        deadline=None, max_examples=20, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(scenarios(), st.integers(0, 2**32))

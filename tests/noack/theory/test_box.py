@@ -20,7 +20,7 @@ from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, simulate, systems
 
 ROUNDING = 1 + 1e-9
-BOXES = 45
+BOXES = 25
 POOL = 10
 
 SEARCH = settings(deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
@@ -189,7 +189,7 @@ def test_a_broken_copy_is_caught(mutant: str) -> None:
     )
 
 
-@settings(SEARCH, max_examples=25)
+@settings(SEARCH, max_examples=12)
 @given(cases(), st.floats(0.01, 0.5), seeds)
 def test_before_the_start_every_plant_falls_freely(case: Case, share: float, seed: int) -> None:
     """p = −Kx then, of every plant in the box; and so do those that change."""
@@ -205,7 +205,7 @@ def test_before_the_start_every_plant_falls_freely(case: Case, share: float, see
             t_s += start_s / 20
 
 
-@settings(SEARCH, max_examples=30)
+@settings(SEARCH, max_examples=15)
 @given(cases(), st.sampled_from([0.3, 1.0, 3.0]), seeds)
 def test_a_box_with_a_plant_that_does_not_decay_is_refused(
     case: Case, size: float, seed: int
@@ -272,7 +272,7 @@ def test_a_box_of_nothing_is_the_model(system: System) -> None:
             assert mine == pytest.approx(theirs, rel=1e-9, abs=1e-9)
 
 
-@settings(SEARCH, max_examples=20)
+@settings(SEARCH, max_examples=10)
 @given(cases(0.05), st.floats(0.1, 0.9))
 def test_a_larger_box_never_has_smaller_bounds(case: Case, share: float) -> None:
     smaller = case._replace(

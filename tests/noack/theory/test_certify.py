@@ -81,7 +81,7 @@ def standing(certificate: Certificate) -> Certificate:
 # --- the floor ------------------------------------------------------------------------------------
 
 
-@settings(SEARCH, max_examples=45)
+@settings(SEARCH, max_examples=12)
 @given(systems(), st.floats(0.01, 0.9), seeds)
 def test_a_run_across_the_floor_exceeds_no_bound(system: System, share: float, seed: int) -> None:
     """t_ε anywhere in the run: what is missing, felt or growing there belongs to both phases."""
@@ -107,7 +107,7 @@ def late_start(mansd: int = 0) -> System:
     )  # fmt: skip
 
 
-@settings(SEARCH, max_examples=20)
+@settings(SEARCH, max_examples=12)
 @given(systems(hold_steps=4, lag_steps=2, step_share=0.03, beta=0.01), st.floats(1e-3, 0.03), seeds)
 def test_a_floor_may_begin_before_the_plant_feels_its_input(
     system: System, share: float, seed: int
@@ -173,7 +173,7 @@ def too_fast(system: System, factor: float) -> System:
     return System(**{**system.__dict__, "alpha": factor * rate})
 
 
-@settings(SEARCH, max_examples=25)
+@settings(SEARCH, max_examples=12)
 @given(systems(), st.sampled_from([1.0, 1.5, 4.0]), seeds)
 def test_where_alpha_is_too_large_bounds_fall_more_slowly(
     system: System, factor: float, seed: int
@@ -190,7 +190,7 @@ def test_where_alpha_is_too_large_bounds_fall_more_slowly(
     assert Verdict.VIOLATED in verdicts.values()
 
 
-@settings(SEARCH, max_examples=15)
+@settings(SEARCH, max_examples=8)
 @given(systems(), st.floats(0.05, 2.0), seeds)
 def test_where_alpha_is_too_large_a_floor_keeps_events_apart(
     system: System, share: float, seed: int
@@ -205,7 +205,7 @@ def test_where_alpha_is_too_large_a_floor_keeps_events_apart(
     assert exceeded(system, certificate, run(system, seed, floor)) == []
 
 
-@settings(SEARCH, max_examples=25)
+@settings(SEARCH, max_examples=12)
 @given(systems(hold_steps=1), st.sampled_from([0.0, 0.3, 1.5]), seeds)
 def test_a_hold_is_bounded(system: System, share: float, seed: int) -> None:
     """H = 0; the plant is the closed loop that the models of the drawn system had."""
@@ -236,7 +236,7 @@ def test_a_hold_under_the_papers_conditions_misses_m_thresholds() -> None:
 HARDER = ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
 
 
-@settings(SEARCH, max_examples=25)
+@settings(SEARCH, max_examples=12)
 @given(systems(), st.sampled_from(HARDER), st.floats(0.05, 2.0))
 def test_harder_conditions_never_have_better_bounds(
     system: System, harder: str, share: float

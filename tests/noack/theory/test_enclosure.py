@@ -103,7 +103,7 @@ ROUNDING = 1 - 1e-10
 def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
     """Cell by cell, beyond the grid, and from any time on; the supremum within 1 %."""
 
-    @settings(max_examples=25)
+    @settings(max_examples=12)
     @given(cases(kind))
     def check(case: tuple[Matrix, Matrix, Matrix]) -> None:
         C, G, D = case
@@ -172,7 +172,7 @@ def test_the_tail_alone_bounds_what_is_beyond_any_grid() -> None:
             assert kernel.tail_area >= rest / 1.01
 
 
-@settings(max_examples=60)
+@settings(max_examples=12)
 @given(
     st.integers(1, 5), st.integers(0, 2**32), st.sampled_from([0.1, 1.0, 10.0, 100.0]),
     st.sampled_from([1, 16, 64]), st.booleans(),
@@ -218,7 +218,7 @@ def test_a_hump_within_a_single_cell_is_seen() -> None:
         assert kernel.integral_on_grid() >= 0.77  # ∫₀¹⁰; over all times it is 1
 
 
-@settings(max_examples=60)
+@settings(max_examples=12)
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
 def test_the_rounding_of_a_product_is_covered(seed: int, n: int, columns: int) -> None:
     """Of factors whose terms cancel, against rational numbers: nothing is known of such a norm."""
@@ -257,7 +257,7 @@ def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
     assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.sampled_from(sorted(KINDS)), st.integers(1, 6), st.integers(0, 2**32))
 def test_in_its_coordinates_a_system_contracts(kind: str, n: int, seed: int) -> None:
     G = KINDS[kind](np.random.default_rng(seed), n)

@@ -15,7 +15,7 @@ from noack.theory.gains import ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import System, systems
 
 SEARCH = settings(
-    deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate], max_examples=25
+    deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate], max_examples=12
 )
 
 ROUNDING = 1 - 1e-9

@@ -95,7 +95,7 @@ def explicit(history: History, trigger: DecayingTrigger, upto: int) -> ErrorBoun
     return ErrorBounds(identity, printed)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(histories(), st.floats(0.01, 2.0), st.sampled_from([0.0, 0.3]))
 def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor: float) -> None:
     trigger = DecayingTrigger(0.5, alpha, floor, history.weight)
@@ -104,7 +104,7 @@ def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
-@settings(max_examples=80)
+@settings(max_examples=40)
 @given(histories())
 def test_the_identity_bounds_the_error_whatever_happens(history: History) -> None:
     """No trigger, no plant, no network is presupposed."""
@@ -164,7 +164,7 @@ def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
 TO_THE_NANOSECOND = 1 + 1e-6
 
 
-@settings(SEARCH, max_examples=25)
+@settings(SEARCH, max_examples=12)
 @given(systems(), seeds)
 def test_the_printed_bound_holds_in_the_papers_loop(system: System, seed: int) -> None:
     """eq:LossEv3, for a trigger that watches always; there, the identity's is the smaller one."""

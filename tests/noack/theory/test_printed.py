@@ -52,7 +52,7 @@ def of(system: System) -> tuple[Loop, Theorem2]:
     return loop, found
 
 
-@settings(SEARCH, max_examples=8)
+@settings(SEARCH, max_examples=4)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
     """Every quantity anew, from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
@@ -82,7 +82,7 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
         assert found.state(np.array([t]), alpha)[0] == pytest.approx(right, rel=1e-12)
 
 
-@settings(SEARCH, max_examples=6)
+@settings(SEARCH, max_examples=4)
 @given(systems(weighted=False))
 def test_no_other_decay_rate_gives_a_longer_inter_event_time(system: System) -> None:
     """c and ᾱ are free: the best of a fine grid is not much better."""
@@ -133,7 +133,7 @@ def test_theorem_2_presupposes_a_threshold_that_decays_more_slowly_than_the_loop
     assert theorem_2(loop, 0.1, 0.0, 1.0) is None
 
 
-@settings(SEARCH, max_examples=12)
+@settings(SEARCH, max_examples=6)
 @given(systems(weighted=False), seeds)
 def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: int) -> None:
     _, found = of(system)
@@ -182,7 +182,7 @@ def deltas(system: System, run: ContinuousRun) -> tuple[list[float], Vector]:
     return claimed, np.array(seen)
 
 
-@settings(SEARCH, max_examples=10)
+@settings(SEARCH, max_examples=5)
 @given(systems(weighted=False, mansd=3, known_start=True, **EVENTFUL), seeds, st.booleans())
 def test_theorem_1_is_never_exceeded_on_its_own_trajectory(
     system: System, seed: int, held: bool
