@@ -108,7 +108,7 @@ def steady_state(resolved: Scenario) -> SteadyState:
     elif isinstance(observer, Kalman):
         try:
             predicted = solve_discrete_are(A.T, C.T, Q, told.R)
-        except np.linalg.LinAlgError:  # the numbers are too far apart for it
+        except (np.linalg.LinAlgError, ValueError):  # the numbers are too far apart for it
             nowhere = np.full((n, n), np.inf)
             return SteadyState(np.full((n, len(C)), np.nan), np.inf, nowhere)
         L = np.linalg.solve(C @ predicted @ C.T + told.R, C @ predicted).T

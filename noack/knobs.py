@@ -57,7 +57,11 @@ def require_knobs(settings: Mapping[str, Any], trigger: BaseModel) -> None:
     known = (LOSS, MANSD, *trigger_knobs(trigger), SETPOINT)
     for key, value in settings.items():
         if key not in known and not key.startswith(f"{LOSS}."):
-            raise ValueError(f"{key}: cannot be changed during a run; what can is {_list(known)}")
+            short = ", ".join(SHORT)
+            raise ValueError(
+                f"{key}: cannot be changed during a run; what can is {_list(known)} "
+                f"(for short: {short})"
+            )
         if _has_none(value):
             raise ValueError(f"{key}: needs a value")
 

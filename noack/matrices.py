@@ -11,6 +11,8 @@ Row = Annotated[tuple[FiniteFloat, ...], Field(min_length=1, max_length=MAX_DIME
 Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A matrix by rows."""
 
+_LARGEST = 1e100
+
 
 def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
     """Return (rows, columns) of a matrix given by rows.
@@ -55,7 +57,9 @@ def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-wid
     """Check half-widths, or what else.
 
     Raises:
-        ValueError: one is negative.
+        ValueError: one is negative, or so large that its square is beyond floating point.
     """
     if any(entry < 0 for entry in row):
         raise ValueError(f"{key}: {what} cannot be negative")
+    if any(entry > _LARGEST for entry in row):
+        raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")

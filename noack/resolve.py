@@ -162,8 +162,9 @@ def _observer(scenario: Scenario, model: Model) -> AnyObserver | None:
         )
     if (mode := unseen_mode(step, C)) is not None:
         rate_per_s = np.log(mode) / (period_ns * 1e-9)
+        rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
         raise CallerError(
-            f"plant.measurement.C: no observer can follow: the mode e^({rate_per_s:.3g} t) of "
+            f"plant.measurement.C: no observer can follow: the mode e^({rate} t) of "
             "the model does not show in what is measured, and does not decay"
         )
     if isinstance(observer, Luenberger) and observer.poles_per_s is not None:

@@ -130,5 +130,6 @@ def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
     for part in path:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
-            raise CallerError(printable(f"{source}: {part} is not a table"))
+            whole = " (a list is set as a whole)" if isinstance(table, list) else ""
+            raise CallerError(printable(f"{source}: {part} is not a table{whole}"))
     table[last] = value

@@ -1,5 +1,6 @@
 """What a system is to the loop near its operating point: ẋ ≈ A x + B u."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -68,5 +69,8 @@ def linearise(
     missed = np.linalg.matrix_power(step, ahead) @ before - later
     if np.linalg.norm(missed) > _MISSED * np.linalg.norm(later[:n]):
         return unknown
-    generator = np.real(logm(step)) / (_STEP_NS * 1e-9)
+    with warnings.catch_warnings(action="ignore"):  # of what is singular, which is seen next
+        generator = np.real(logm(step)) / (_STEP_NS * 1e-9)
+    if not np.isfinite(generator).all():
+        return unknown
     return generator[:n, :n], generator[:n, n:]

@@ -7,12 +7,21 @@ import numpy as np
 from scipy.integrate import ode
 
 from noack.linear import Vector
+from plant_server.system import SystemFailedError
 
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
 """dz/dt = f(t, z, v): seconds, (N,), and the physical input v, (m,)."""
 
 _RELATIVE, _ABSOLUTE = 1e-9, 1e-12
 _MOST_STEPS = 10_000
+_ESCAPE = 1e4
+"""What grows by more within a step of the plant escapes to infinity in finite time."""
+_GAVE_UP = {
+    -2: f"it takes the integrator more than {_MOST_STEPS:,} steps from one sample to the next",
+    -3: "the integrator's steps become too small; they jump there",
+    -4: "they are too stiff for an explicit integrator",
+}
+"""What dopri5 says."""
 
 
 def _same(values: Vector) -> Vector:
@@ -23,8 +32,8 @@ class OdeSystem:
     """``dz/dt = f(t, z, v)`` under a held input: Dormand & Prince's pair of orders 5 and 4.
 
     Every step of the plant starts the integrator anew, as the input jumps there: what it does
-    depends on z, v and t alone, so that a replay repeats it bit for bit. Where it cannot reach its
-    tolerance, or f cannot be evaluated, z is NaN from then on, and the run has diverged.
+    depends on z, v and t alone, so that a replay repeats it bit for bit. Where z escapes to
+    infinity, or f cannot be evaluated, z is NaN from then on, and the run has diverged.
 
     Args:
         derivative: f.
@@ -51,7 +60,7 @@ class OdeSystem:
         self._internal = internal
         self._state = np.array(z0, dtype=np.float64)
         self._derivative = derivative
-        self._raised: list[Exception] = []
+        self._raised: list[BaseException] = []
         self._integrator = ode(self._guarded)
         self._integrator.set_integrator(
             "dopri5", rtol=relative, atol=absolute, nsteps=_MOST_STEPS, verbosity=-1
@@ -71,7 +80,8 @@ class OdeSystem:
         """Integrate over one step.
 
         Raises:
-            Exception: whatever f raises that is not of arithmetic.
+            SystemFailedError: the tolerance cannot be reached, although f is finite.
+            BaseException: whatever f raises that is not of arithmetic.
         """
         t_s = t_ns * 1e-9
         self._raised.clear()
@@ -85,13 +95,27 @@ class OdeSystem:
             if not isinstance(error, ArithmeticError | ValueError):
                 raise error
             reached = np.full_like(self._state, np.nan)
-        self._state = reached if self._integrator.successful() else np.full_like(reached, np.nan)
+        if not self._integrator.successful():
+            self._require_divergence(reached)
+            reached = np.full_like(self._state, np.nan)
+        self._state = reached
+
+    def _require_divergence(self, z: Vector) -> None:
+        """Raise SystemFailedError if the integrator gave up where f is finite, and z not large."""
+        with np.errstate(all="ignore"):
+            slope = np.asarray(self._guarded(self._integrator.t, z, *self._integrator.f_params))
+            escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
+        if np.isfinite(slope).all() and not escaped:
+            why = _GAVE_UP.get(self._integrator.get_return_code(), "its tolerance is out of reach")
+            raise SystemFailedError(
+                f"the plant's equations cannot be followed at {self._integrator.t:.6g} s: {why}"
+            )
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
         """``f``, which raises nothing: the integrator would go on calling it all the same."""
         if not self._raised:
             try:
                 return self._derivative(t_s, z, v)
-            except Exception as error:
+            except BaseException as error:
                 self._raised.append(error)
         return np.full_like(z, np.nan)

@@ -357,12 +357,12 @@ class Claims:
             suffix = "" if certificate.floor_constants is None else ", and the floor's share"
             yield self._upper(
                 "the sensor's error follows its threshold", source,
-                f"‖e_s‖ ≤ {{:.4g}} β{rate}{suffix}", constants.overshoot,
+                f"‖e_s‖ ≤ {{:.4g}} {certificate.level}{suffix}", constants.overshoot,
                 t_s, self.joined.e_s_norm / certificate.sensor_error(t_s), left, "",
             )  # fmt: skip
             yield self._controller_error(
                 "the controller's error is bounded", source,
-                f"‖e_c‖ ≤ {{:.4g}} β{rate}{suffix}", constants.delta,
+                f"‖e_c‖ ≤ {{:.4g}} {certificate.level}{suffix}", constants.delta,
                 certificate.controller_error(t_s), left, "",
             )  # fmt: skip
             yield self._state(

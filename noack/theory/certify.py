@@ -77,6 +77,14 @@ class Certificate:
         known = [value for value in found if value is not None]
         return min(known) if known and len(known) == len(found) else None
 
+    @property
+    def level(self) -> str:
+        """What bounds of errors are multiples of: βe^{−αt}, or without decay β or the floor ε."""
+        rate = 0.0 if self.constants is None else self.constants.rate_per_s
+        if rate:
+            return f"βe^(−{rate:.3g}t)"
+        return "ε" if self.floor > self.beta else "β"
+
     def sensor_error(self, t_s: Matrix) -> Matrix:
         """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
         return self._envelope(t_s, lambda c, level: c.overshoot * level)

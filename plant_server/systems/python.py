@@ -106,7 +106,7 @@ class PythonSystem:
                 # Copies: what the class does to its arguments is nobody else's business.
                 found = plant.derivative(t_s, z.copy(), u.copy())
                 return _vector("derivative(t_s, z, u)", found, size)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise SystemFailedError(self._said(error)) from None
 
         return derivative
@@ -139,7 +139,10 @@ class _Stepping:
 
 def _vector(what: str, value: Any, size: int) -> Vector:
     """A copy of what a class returned, if it has the right shape."""
-    found = np.array(value, dtype=np.float64)
+    given = np.array(value)
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{what} is not of real numbers")
+    found = given.astype(np.float64)
     if found.shape != (size,):
         raise ValueError(f"{what} has shape {found.shape}, expected ({size},)")
     return found

@@ -51,6 +51,11 @@ def settings(folder: Path, code: str, name: str, **more: Any) -> Python:
     return loaded
 
 
+def follow(system: PythonSystem, steps: int) -> None:
+    for step in range(steps):
+        system.advance(np.zeros(1), step * H_NS, H_NS)
+
+
 def made(folder: Path, code: str, name: str, **more: Any) -> PythonSystem:
     return PythonSystem(settings(folder, code, name, **more), X0, 1)
 
@@ -141,7 +146,7 @@ def test_a_shipped_system_is_a_plant_by_entry_point_and_by_module(
         ("class P:\n def __init__(s, g): pass", "missing 1 required positional argument: 'g'"),
         ("class P:\n def derivative(s, t, z, u): return z[:1]",
          "derivative(t_s, z, u) has shape (1,), expected (2,)"),
-        ("class P:\n def derivative(s, t, z, u): return 'ab'", "could not convert string"),
+        ("class P:\n def derivative(s, t, z, u): return 'ab'", "is not of real numbers"),
         ("class P:\n def derivative(s, t, z, u):\n  return 1 / (u[0] * 0)", "(mine.py, line 3)"),
         ("class P:\n def state(s, x): return [[1.0]]\n def derivative(s, t, z, u): return z",
          "state(x0) has shape (1, 1)"),
@@ -208,3 +213,60 @@ def test_a_changed_file_is_not_executed(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("raise SystemExit('executed')")
     with pytest.raises(CallerError, match="is not what it was: its SHA-256 is"):
         PythonSystem(loaded, X0, 1)
+
+
+@pytest.mark.parametrize(
+    ("slope", "expected"),
+    [
+        ("[-1e9 * (z[0] - math.cos(t_s)), 0.0]", "too stiff for an explicit integrator"),
+        ("[1e9 * math.copysign(1.0, math.sin(1e9 * z[0]) - 0.1), 0.0]", "cannot be followed at 2."),
+    ],
+)
+def test_equations_that_cannot_be_followed_have_not_diverged(
+    slope: str, expected: str, tmp_path: Path
+) -> None:
+    code = f"""
+        import math
+
+        class P:
+            def derivative(self, t_s, z, u):
+                return {slope}
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError, match=expected):
+        follow(system, 20)
+    assert np.isfinite(system.x).all()
+
+
+def test_a_state_that_escapes_has_diverged(tmp_path: Path) -> None:
+    code = """
+        class P:
+            def derivative(self, t_s, z, u):
+                return [1e3 * v**3 for v in z]
+    """
+    system = made(tmp_path, code, "P")
+    with np.errstate(all="ignore"):
+        follow(system, 100)
+    assert not np.isfinite(system.x).all()
+
+
+@pytest.mark.parametrize(
+    ("returned", "expected"),
+    [
+        ("[z[1] + 1e-3j, 0.0]", "TypeError: derivative(t_s, z, u) is not of real numbers"),
+        ('["1", "2"]', "TypeError: derivative(t_s, z, u) is not of real numbers"),
+        ("sys.exit(3)", "SystemExit: 3"),
+    ],
+)
+def test_what_is_no_derivative_is_refused(returned: str, expected: str, tmp_path: Path) -> None:
+    code = f"""
+        import sys
+
+        class P:
+            def derivative(self, t_s, z, u):
+                return {returned} if t_s > 0.0201 else 0 * z
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError) as failed:
+        follow(system, 20)
+    assert expected in str(failed.value)
