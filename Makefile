@@ -27,7 +27,10 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  CAMPAIGN=NAME  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
+.PHONY: doctor demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
+doctor: setup ## Say what this machine grants, and what that means for a run of SCENARIO
+	@$(BIN)/noack doctor "$(SCENARIO)" $(ARGS)
+
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
@@ -88,7 +91,7 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock clean
+.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
@@ -141,6 +144,11 @@ lock: setup-dev ## Pin the dependencies anew
 		--no-header pyproject.toml --extra vehicle --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
+
+dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
+	@rm -rf dist
+	$(BIN)/uv build --quiet --no-build-isolation --out-dir dist .
+	@ls dist/*
 
 clean: ## Remove the environment and caches; keep runs/
 	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

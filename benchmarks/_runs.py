@@ -1,12 +1,15 @@
 """Runs of noack as a user starts them: a process of their own, watched from outside."""
 
 import json
+import os
+import pty
 import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,22 +53,31 @@ class NoackRun(NamedTuple):
 def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
     """Run a program to its end, noting when each line of its standard error came.
 
+    That is a terminal which cannot redraw a line: noack shows its progress on terminals only.
+
     Raises:
         MeasurementError: it failed.
     """
     with tempfile.TemporaryFile("w+") as stdout:
+        reading, writing = pty.openpty()
         begun_s = time.monotonic()
         with subprocess.Popen(
-            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
-            text=True,
+            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=writing,
+            env=os.environ | {"TERM": "dumb"},
         ) as process:  # fmt: skip
-            assert process.stderr is not None
-            lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
+            os.close(writing)
+            lines = list(_lines(reading))
         stdout.seek(0)
         if process.returncode != 0:
             said = lines[-1].text if lines else "nothing"
             raise MeasurementError(f"{command[0]} ended with {process.returncode}, said {said!r}")
         return Finished(begun_s, lines, stdout.read())
+
+
+def _lines(terminal: int) -> Iterator[Line]:
+    with os.fdopen(terminal, encoding="utf-8", errors="replace") as said, suppress(OSError):
+        for text in said:  # and an error, when the last who could write has gone
+            yield Line(time.monotonic(), text.rstrip())
 
 
 def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:

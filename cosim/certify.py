@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from rich.console import Console
@@ -11,11 +12,11 @@ from rich.table import Table
 
 from noack.errors import CallerError
 from noack.linear import Matrix
-from noack.resolve import loop_of
+from noack.resolve import loop_of, resolve
 from noack.scenario import Scenario
 from noack.theory.assumptions import Verdict, assumptions
 from noack.theory.certificate import Conditions
-from noack.theory.certify import Certificate, Scope, box, outside_box, own_plant
+from noack.theory.certify import BOX, Certificate, Scope, box, outside_box, own_plant
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.printed import Theorem2, theorem_2
 from noack.theory.schedule import ideal_conditions, nominal_conditions
@@ -26,6 +27,7 @@ IDEAL = "paper"
 SCHEDULE = "schedule"
 """Under the scenario's own schedule and allowance."""
 
+MOST_LATE = 1000
 _MOST_S = 10.0
 _COLOURS = {
     Verdict.HOLDS: "green",
@@ -50,16 +52,32 @@ class Study:
     Args:
         resolved: the resolved scenario.
         certificates: under the paper's conditions and under the schedule's.
-        limits: by scope.
+        scopes: whose certificates they are.
+        scheduled: the schedule's conditions.
         theorem_2: the paper's bounds, with Δ from the ideal certificate.
         weight: W, if the tool chose it.
     """
 
     resolved: Scenario
     certificates: Sequence[tuple[str, Certificate]]
-    limits: dict[str, Limits]
+    scopes: Sequence[Scope]
+    scheduled: Conditions
     theorem_2: Theorem2 | None
     weight: Matrix | None
+
+    @cached_property
+    def limits(self) -> dict[str, Limits]:
+        """By scope; found when first asked for, by a hundred certificates."""
+        return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
+
+    def certificate(self, under: str) -> Certificate:
+        """The certificate of the scenario's own plant, under IDEAL or SCHEDULE."""
+        return next(one for key, one in self.certificates if key == under)
+
+    def box_certificate(self, under: str) -> Certificate | None:
+        """The certificate of the scenario's uncertainty box; None if it has none."""
+        of_box = (one for key, one in self.certificates if key == under and one.scope == BOX)
+        return next(of_box, None)
 
     def to_json(self) -> dict[str, Any]:
         """As one document."""
@@ -98,12 +116,37 @@ def with_weight(
                 progress,
             )  # fmt: skip
         except NotDecayingError as error:
-            raise CallerError(f"--weight chosen: {error}") from None
+            raise CallerError(f"weight chosen: {error}") from None
     elif which != "identity":
-        raise CallerError(f'--weight: given, identity or chosen, not "{which}"')
+        raise CallerError(f'weight: given, identity or chosen, not "{which}"')
     rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
     trigger = resolved.decaying.model_copy(update={"weight": rows})
     return resolved.model_copy(update={"trigger": trigger}), weight
+
+
+def study_scenario(
+    scenario: Scenario,
+    weight: str = "given",
+    late_periods: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Study:
+    """Certify a scenario as :func:`study` does, under a norm and an allowance of one's choice.
+
+    Args:
+        scenario: as loaded; it is resolved here.
+        weight: given, identity or chosen.
+        late_periods: steps of the plant, 0 to 1000; the scenario's own allowance unless given.
+        progress: is told which share of the choice of a weight is done.
+
+    Raises:
+        CallerError: there is no such choice, or no certificates are of this scenario.
+    """
+    resolved = resolve(scenario)
+    allowed = resolved.certificate.late_periods if late_periods is None else late_periods
+    if not 0 <= allowed <= MOST_LATE:
+        raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
+    weighted, W = with_weight(resolved, weight, progress)
+    return study(weighted, allowed, W)
 
 
 def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -> Study:
@@ -120,7 +163,6 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
     scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
     certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]
     certificates += [(SCHEDULE, scope.certificate(scheduled)) for scope in scopes]
-    limits = {scope.name: _limits(scope, scheduled) for scope in scopes}
     first = certificates[0][1].constants
     trigger = resolved.decaying
     theorem = (
@@ -129,7 +171,7 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
         and trigger.weight is None
         else None
     )  # fmt: skip
-    return Study(resolved, certificates, limits, theorem, weight)
+    return Study(resolved, certificates, scopes, scheduled, theorem, weight)
 
 
 def _limits(scope: Scope, scheduled: Conditions) -> Limits:
@@ -172,12 +214,11 @@ def _print_constants(console: Console, found: Study) -> None:
     )
     table.add_column("")
     for under, certificate in found.certificates:
-        whose = "plant" if certificate.source == "certificate" else "box"
-        table.add_column(f"{under},\n{whose}", justify="right")
+        table.add_column(f"{under},\n{whose(certificate)}", justify="right")
     printed = found.theorem_2 is not None
     if printed:
         table.add_column("printed,\nTheorem 2", justify="right")
-    for label, values, of_theorem in _constants(found):
+    for label, values, of_theorem in constants(found):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
     console.print(
@@ -191,7 +232,13 @@ def _print_constants(console: Console, found: Study) -> None:
             )
 
 
-def _constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
+def whose(certificate: Certificate) -> str:
+    """Of which plants a certificate is, in a word."""
+    return "box" if certificate.scope == BOX else "plant"
+
+
+def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
+    """Yield what a person is told: label, the value of each certificate, and of Theorem 2."""
     theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
 
     def row(value: Callable[[Certificate], float | None]) -> list[str]:

@@ -42,7 +42,7 @@ _START_PATIENCE_S = 30.0
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder puts the rows in order, of which a long run has many."""
-_REJOIN_BY_HAND_S = 60.0
+REJOIN_BY_HAND_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class _Run:
     def _rejoin_within_s(self, role: str) -> float:
         given_s = self._ticket.scenario.recovery.rejoin_within_s
         if given_s is None:
-            return 0.0 if role in self._spawn else _REJOIN_BY_HAND_S
+            return 0.0 if role in self._spawn else REJOIN_BY_HAND_S
         return given_s
 
     def _never_back(self) -> tuple[ExitStatus, str] | None:

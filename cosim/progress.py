@@ -32,7 +32,7 @@ def progress_line(
     console: Console, scenario: Scenario, session: str | None = None
 ) -> Iterator[Watcher]:
     """Show a run's progress while the context lasts."""
-    live = console.is_terminal
+    live = console.is_terminal and not console.is_dumb_terminal
     there = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
     shown = 0
@@ -78,7 +78,7 @@ def progress_line(
             if task is not None:
                 progress.update(task, completed=account["t_s"], description=text)
             due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
-            if not live and due > shown:
+            if console.is_dumb_terminal and due > shown:
                 shown = due
                 console.print(text, highlight=False, soft_wrap=True)
 

@@ -375,7 +375,16 @@ def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
             yield name, kind
 
 
-def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
+def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
+    """Read a table's file as it is.
+
+    Args:
+        path: of the Parquet file.
+        dtype: the table's row type.
+
+    Raises:
+        CallerError: it cannot be read, or lacks what rows of that type have.
+    """
     try:
         table = pq.read_table(path)
         table.validate(full=True)
@@ -389,6 +398,11 @@ def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
             raise CallerError(f"{path}: column {column} is not one of {kind}")
         if table.column(found[0]).null_count:
             raise CallerError(f"{path}: column {column} has holes")
+    return table
+
+
+def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
+    table = read_table(path, dtype)
     rows = np.zeros(table.num_rows, dtype)
     for name in dtype.names or ():
         field = dtype[name]

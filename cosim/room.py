@@ -28,6 +28,11 @@ def spool_bytes(resolved: Scenario) -> int:
     return sum(rows * types[table].itemsize for table, rows in counts.items())
 
 
+def needed_bytes(resolved: Scenario) -> int:
+    """What a run takes on the disk until it has ended."""
+    return _UNTIL_THE_END * spool_bytes(resolved)
+
+
 def require_room(resolved: Scenario, runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 

@@ -16,6 +16,8 @@ from noack.scenario_file import dumps
 from noack.system_files import unchanged
 from noack.systems import Fmu, Python
 
+DEFAULT_RUNS = Path("runs")
+"""Where run directories are made, in the folder where a person stands."""
 SCENARIO_FILE = "scenario.toml"
 ENVIRONMENT_FILE = "environment.json"
 REPORTS_FILE = "reports.json"

@@ -9,7 +9,6 @@ from typing import Protocol
 from cosim.environment import write_environment
 from cosim.launch import Ending
 from cosim.record import RunRecord, write_record
-from cosim.recorder import write_view
 from cosim.run_dir import REPORTS_FILE, new_run_dir, point_to_latest, under_way, write_scenario
 from cosim.virtual import Progress, simulate
 from noack.errors import ExitStatus, MachineError
@@ -31,6 +30,8 @@ def simulate_run(
     runs: Path,
     simulator: Simulator = simulate,
     progress: Progress | None = None,
+    *,
+    view: bool = True,
 ) -> Ending:
     """Simulate a scenario into a new run directory; :func:`cosim.conclude.conclude` ends it.
 
@@ -41,6 +42,7 @@ def simulate_run(
         runs: where run directories are made.
         simulator: makes the record.
         progress: is told how far the run is.
+        view: whether to write the recording for the viewer.
 
     Raises:
         CallerError: the scenario's numbers are too large.
@@ -57,7 +59,10 @@ def simulate_run(
             reports = json.dumps(record.reports, indent=2)
             (run_dir / REPORTS_FILE).write_text(reports, encoding="utf-8")
             write_record(record, run_dir)
-            write_view(record, run_dir, run_id)
+            if view:
+                from cosim.recorder import write_view  # imports rerun
+
+                write_view(record, run_dir, run_id)
     except BaseException as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         if isinstance(error, OSError):

@@ -21,9 +21,13 @@ myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+autoclass_content = "class"
+autodoc_class_signature = "separated"
 
 html_theme = "furo"
 html_title = "noack"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_extra_path = [
     "scenario.schema.json",
     "campaign.schema.json",

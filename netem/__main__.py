@@ -5,13 +5,13 @@ In a run it joins like every other process. On its own it serves any UDP program
     python -m netem --listen 127.0.0.1:9000 --to 127.0.0.1:9001 loss 30% mansd 4
 """
 
-import argparse
 import sys
 from collections.abc import Sequence
 
 from netem.duplex import network_of
 from netem.relay import Relay
 from noack.errors import ExitStatus, NoackError
+from noack.io.command_line import Parser, failed
 from noack.io.node import Node
 from noack.io.process import add_options, join_run
 
@@ -23,19 +23,18 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         from netem.control import commands
 
         return commands.main(given)
-    joining = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
     add_options(joining)
-    options, more = joining.parse_known_args(given)
-    if not more:
-        return join_run("netem", _in_a_run, options)
-    from netem.cli.alone import alone
-
     try:
+        options, more = joining.parse_known_args(given)
+        if not more:
+            return join_run("netem", _in_a_run, options)
+        from netem.cli.alone import alone
+
         return alone(given)
     except NoackError as error:
-        for line in str(error).splitlines():
-            print(f"noack netem: {line}", file=sys.stderr)
-        return error.exit_status
+        as_json = "--json" in given
+        return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 
 
 def _in_a_run(node: Node) -> None:

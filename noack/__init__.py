@@ -1,1 +1,53 @@
-"""What every process agrees on: scenario, wire format, linear systems, records, clock."""
+"""What every process agrees on: scenario, wire format, linear systems, records, clock.
+
+To a program or a notebook, ``import noack`` is the laboratory, too: scenarios, runs, certificates
+(``docs/library.md``). Those names lead to :mod:`cosim.lab`, which stands above everything, and are
+looked up when they are first used: a process that imports a module from here loads nothing else.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cosim.lab import (
+        Certificates,
+        NoackError,
+        Run,
+        Scenario,
+        __version__,
+        certify,
+        from_system,
+        load,
+        open_run,
+        run,
+        simulate,
+        with_settings,
+    )
+else:
+
+    def __getattr__(name: str) -> object:
+        """Look up a name of the library (PEP 562)."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from cosim import lab
+
+        value = globals()[name] = getattr(lab, name)
+        return value
+
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})
+
+
+__all__ = [
+    "Certificates",
+    "NoackError",
+    "Run",
+    "Scenario",
+    "__version__",
+    "certify",
+    "from_system",
+    "load",
+    "open_run",
+    "run",
+    "simulate",
+    "with_settings",
+]

@@ -126,20 +126,21 @@ def _alternatives(kind: Any) -> list[Any]:
     return [kind]
 
 
-def _sections(kind: Any) -> list[type[BaseModel]]:
+def sections_of(kind: Any) -> list[type[BaseModel]]:
+    """Return the tables that a value of an annotation may be."""
     return [
         one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)
     ]
 
 
 def _section_of(kind: Any) -> type[BaseModel] | None:
-    sections = _sections(kind)
+    sections = sections_of(kind)
     return sections[0] if len(sections) == 1 else None
 
 
 def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
     """The tables that a value may be, by the key that all of them have a name of their own for."""
-    sections = _sections(kind)
+    sections = sections_of(kind)
     if len(sections) < 2:
         return {}, ""
     key = next(

@@ -67,6 +67,23 @@ class Scenario(Section):
     ports: Ports = Ports()
     realtime: Realtime = Realtime()
 
+    def __str__(self) -> str:
+        """What matters, in a few lines."""
+        n, m = self.model.dimensions
+        lines = {
+            "scenario": self.name + (f": {self.description}" if self.description else ""),
+            "mode": "model-based" if self.mode == "model" else "zero-order hold",
+            "plant": f"{self.plant.system.kind}, n = {n}, m = {m}, {self.plant.rate_hz:g} Hz",
+            "trigger": _said(self.trigger, "policy"),
+            "network": f"{_said(self.network.loss, 'model')}; M − 1 = {self.network.mansd}",
+            "horizon": f"{self.horizon_s:g} s",
+        }
+        return "\n".join(f"{name:<10} {text}" for name, text in lines.items())
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        """Show it so in IPython and notebooks."""
+        printer.text(str(self))
+
     @property
     def is_decaying(self) -> bool:
         """Whether the trigger is the paper's."""
@@ -443,6 +460,16 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     "controller": TypeAdapter(Controller),
 }
 """What can be changed during a run, part by part."""
+
+
+def _said(section: Section, kind: str) -> str:
+    """What a section is, and its values that are not the defaults."""
+    given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
+    values = (
+        f"{key} = {'…' if isinstance(value, dict | list) else value}"
+        for key, value in given.items()
+    )
+    return ", ".join((getattr(section, kind), *values))
 
 
 def _first(error: ValidationError) -> str:

@@ -42,7 +42,7 @@ def model_of(
     """
     states = state_names or _labels(system, "state_labels")
     inputs = input_names or _labels(system, "input_labels")
-    matrices = _matrices(system, gain)
+    matrices = matrices_of(system, gain)
     try:
         return Model(
             A=_rows(matrices["A"]),
@@ -67,12 +67,21 @@ def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
         CallerError: as in :func:`model_of`; or the file cannot be written.
     """
     try:
-        write_matrices(Path(path), _matrices(system, gain))
+        write_matrices(Path(path), matrices_of(system, gain))
     except (OSError, ValueError) as error:
         raise CallerError(f"{path}: cannot be written: {error}") from None
 
 
-def _matrices(system: Any, gain: Any) -> dict[str, Matrix]:
+def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
+    """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
+
+    Args:
+        system: as in :func:`model_of`.
+        gain: K of u = K x, (m, n).
+
+    Raises:
+        CallerError: as in :func:`model_of`.
+    """
     if isinstance(system, tuple):
         if len(system) not in (2, 4):
             raise CallerError(f"the system: a tuple of {len(system)}; give (A, B) or (A, B, C, D)")

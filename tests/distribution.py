@@ -37,6 +37,7 @@ APART = frozenset({
     "tests/integration/test_faults_paused.py",
     "tests/integration/test_simulation.py",
     "tests/integration/test_terminals.py",
+    "tests/test_examples.py",
 })  # fmt: skip
 """Files whose tests share no fixture that takes long."""
 

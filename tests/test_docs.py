@@ -33,6 +33,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
+    "docs/library.md", "docs/command-line.md",
 )  # fmt: skip
 
 
@@ -116,7 +117,8 @@ def test_every_command_works(command: str, run_folder: Path) -> None:
 
 def snippets() -> list[str]:
     """Programs; what begins with its own file's name is a file."""
-    found = [*blocks("docs/plants.md", "python"), *blocks("docs/record.md", "python")]
+    pages = ("docs/plants.md", "docs/record.md", "docs/library.md")
+    found = [code for page in pages for code in blocks(page, "python")]
     return [snippet for snippet in found if not snippet.startswith("#")]
 
 

@@ -19,7 +19,7 @@ from cosim.cli import app
 from netem.__main__ import main as netem_main
 
 ROOT = Path(__file__).parents[1]
-_MARK = re.compile(r"^<!-- made: ([a-z ]+) -->$", re.MULTILINE)
+_MARK = re.compile(r"^<!-- made: ([a-z_ ]+) -->$", re.MULTILINE)
 
 
 def commands() -> str:
@@ -41,7 +41,7 @@ def _command(name: str, command: Any, parent: Any) -> str:
         return "\n".join([*lines, "```text", _netem_help(), "```", ""])
     usage = " ".join(["noack", name, *command.collect_usage_pieces(context)])
     records = [parameter.get_help_record(context) for parameter in command.params]
-    rows = [(what, _plain(meaning)) for what, meaning in filter(None, records)]
+    rows = [(what, _meaning(meaning)) for what, meaning in filter(None, records)]
     lines += ["```text", usage.replace("{", "").replace("}", ""), "```", ""]
     if rows:
         lines += ["| | |", "|---|---|"]
@@ -55,6 +55,12 @@ def _command(name: str, command: Any, parent: Any) -> str:
 
 def _plain(markup: str | None) -> str:
     return Text.from_markup((markup or "").replace("\b", "")).plain.strip()
+
+
+def _meaning(record: str) -> str:
+    """Return an option's help, and what the help says in brackets after it: default, required."""
+    text, gap, more = record.rpartition("  [")
+    return f"{_plain(text)} ({more.removesuffix(']')})" if gap else _plain(record)
 
 
 def _cell(text: str) -> str:
@@ -96,10 +102,24 @@ def _shipped(folder: str) -> Iterator[str]:
         yield f"```toml\n{body}\n```\n"
 
 
+def example(name: str) -> str:
+    """Return a program in cells, of ``docs/examples``, as a page of prose and code."""
+    text = (ROOT / f"docs/examples/{name}.py").read_text(encoding="utf-8")
+    cells = (cell.partition("\n") for cell in f"\n{text}".split("\n# %%")[1:])
+    return "\n\n".join(
+        "\n".join(line.removeprefix("#").removeprefix(" ") for line in body.strip().splitlines())
+        if kind == " [markdown]"
+        else f"```python\n{body.strip()}\n```"
+        for kind, _, body in cells
+    )
+
+
 MADE: dict[str, Callable[[], str]] = {
     "commands": commands,
     "scenarios": lambda: shipped("scenarios"),
     "campaigns": lambda: shipped("campaigns"),
+    "example own_plant": lambda: example("own_plant"),
+    "example model_or_hold": lambda: example("model_or_hold"),
 }
 
 

@@ -122,7 +122,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         import distributed
     except ImportError:
         raise CallerError(
-            "--scheduler needs Dask, which is not installed: python -m pip install distributed"
+            "--scheduler needs Dask, which is not installed; pip install 'noack[cluster]'"
         ) from None
     _require_address(address)
     for name in list(logging.root.manager.loggerDict):

@@ -1,11 +1,9 @@
-"""The program ``noack``: how a command is declared, what all commands share, the entry point."""
+"""How a command of ``noack`` is declared, what all commands share, the entry point."""
 
-import io
 import math
 import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from functools import wraps
 from importlib.metadata import version
 from json import dumps
@@ -13,32 +11,85 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
+from cosim.cli import complete
+from cosim.cli.program import NAME, Program, be_patient
 from cosim.shipped import find_shipped
 from noack.errors import ExitStatus, NoackError
+from noack.io.command_line import failed
+
+_STORY = (
+    ("noack doctor", "what this machine grants to a run"),
+    ("noack run lane_following", "the loop live, as five processes, recorded"),
+    ("noack view", "the last run, drawn"),
+    ("noack simulate lane_following", "the same in virtual time, in a second"),
+    ("noack certify lane_following", "what is guaranteed, on which conditions"),
+    ("noack compare", "how far the last run is from the ideal loop"),
+    ("noack campaign mb_vs_zoh", "many runs over a grid of settings"),
+    ("noack netem --explain loss 5%", "the network emulator, for any UDP program"),
+)
+"""The commands in the order in which somebody meets them."""
+_MOST_COLUMNS = 78
+
+
+def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Commands and what they are for, as lines of rich's markup that no terminal need wrap."""
+    width = max(len(command) for command, _ in rows)
+    wide = width + max(len(what) for _, what in rows) + len("     ") > _MOST_COLUMNS
+    lines: list[str] = []
+    for command, what in rows:
+        gap = f"\n{'':6}" if wide else " " * (width - len(command) + 3)
+        lines.append(f"  [cyan]{escape(command)}[/]{gap if what else ''}{escape(what)}")
+    return lines
+
 
 app = typer.Typer(
+    name=NAME,
+    cls=Program,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    help="A laboratory for event-triggered control over lossy networks, without acknowledgements: "
-    "real processes, real UDP sockets, at most M − 1 packets lost in a row.",
-)
+    rich_markup_mode="rich",
+    # The first character has the lines left as they are; an empty one would end the paragraph.
+    help="\n".join([
+        "\b",
+        "A laboratory for event-triggered control over lossy networks, without acknowledgements: "
+        "real processes, real UDP sockets, at most M − 1 packets lost in a row.",
+        " ",
+        *_columns(_STORY),
+        " ",
+        "Each command has --help, which ends with examples. Scenarios are files (TOML), or names "
+        "of those that come with noack. `noack --install-completion` lets your shell complete "
+        "commands, names and keys.",
+    ]),
+)  # fmt: skip
 
 RUNS = "Runs"
 THEORY = "Theory"
 CAMPAIGNS = "Campaigns"
 PROCESSES = "One process each, for a person with five terminals"
-FILES = "Scenario files"
+FILES = "Scenario files, and this machine"
 
 ScenarioArgument = Annotated[
-    str, typer.Argument(help="Scenario file (TOML), or the name of a shipped scenario.")
+    str,
+    typer.Argument(
+        help="Scenario file (TOML), or the name of a shipped scenario.",
+        autocompletion=complete.scenarios,
+    ),
+]
+RunArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="A run directory; by default the last run.", autocompletion=complete.run_directories
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Replace a value of the scenario, e.g. trigger.beta=0.3."
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the scenario, e.g. trigger.beta=0.3.",
+        autocompletion=complete.settings,
     ),
 ]
 RunsOption = Annotated[Path, typer.Option("--runs", help="Where run directories are made.")]
@@ -53,11 +104,8 @@ ReportOption = Annotated[
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")
 ]
-SessionOption = Annotated[
-    str, typer.Option("--session", help="Name of the session that the processes meet in.")
-]
-
-DEFAULT_RUNS = Path("runs")
+SESSION = typer.Option("--session", help="Name of the session that the processes meet in.")
+SessionOption = Annotated[str, SESSION]
 
 
 def _version(asked: bool) -> None:
@@ -75,23 +123,37 @@ def options(
     """Take the options before the command."""
 
 
-def command(panel: str, **settings: Any) -> Callable[[Callable[..., int]], Callable[..., None]]:
-    """Register a command; its result is the exit status, and a mistake becomes one line."""
+def command(
+    panel: str, examples: Sequence[tuple[str, str]] = (), **settings: Any
+) -> Callable[[Callable[..., int]], Callable[..., None]]:
+    """Register a command; its result is the exit status, and a mistake becomes one line.
+
+    Args:
+        panel: of the help.
+        examples: commands, and what they are for; the command's own help ends with them.
+        settings: of :meth:`typer.Typer.command`.
+    """
 
     def register(function: Callable[..., int]) -> Callable[..., None]:
         @wraps(function)
         def reported(*arguments: Any, **options: Any) -> None:
+            as_json = bool(options.get("json"))
             try:
                 status = function(*arguments, **options)
                 if sys.stdout is not None:  # a shell's >&- gives a program none
                     sys.stdout.flush()
             except NoackError as error:
-                status = _failed(str(error), error.exit_status)
-            except OSError as error:  # standard output is a full disk or a closed pipe
-                status = _failed(f"cannot write: {error}", ExitStatus.FAILED)
+                status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
+            except OSError as error:  # standard output is a full disk
+                what = f"cannot write: {error}"
+                status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
-        registered: Callable[..., None] = app.command(rich_help_panel=panel, **settings)(reported)
+        # The first line is there to be left alone: a later one says how far all are indented.
+        epilog = "\n".join(["", "[bold]Examples[/]", *_columns(examples)]) if examples else None
+        registered: Callable[..., None] = app.command(
+            rich_help_panel=panel, epilog=epilog, **settings
+        )(reported)
         return registered
 
     return register
@@ -120,21 +182,11 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _failed(message: str, status: ExitStatus) -> ExitStatus:
-    if "--json" in sys.argv:
-        with suppress(OSError):  # it may be standard output that failed
-            print_json({"error": message, "exit": {"status": int(status), "reason": message}})
-    for line in message.splitlines():
-        print(f"noack: {line}", file=sys.stderr)
-    return status
-
-
 def main() -> None:
     """Entry point."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show ‖x‖ gets ?x?
-            stream.reconfigure(errors="replace")
+    if sys.argv[1:2] != ["netem"]:  # which ends when nobody reads any more
+        be_patient()
     try:
-        app()
+        app(prog_name=NAME)
     except KeyboardInterrupt:
         sys.exit(ExitStatus.INTERRUPTED)

@@ -6,17 +6,27 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.app import CAMPAIGNS, DEFAULT_RUNS, JsonOption, command, cores, print_json
+from cosim.cli import complete
+from cosim.cli.app import CAMPAIGNS, JsonOption, command, cores, print_json
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import CallerError, ExitStatus
 
 _PER_CORE = 4
 """More processes gain nothing, and cost memory."""
 
 
-@command(CAMPAIGNS)
+@command(CAMPAIGNS, [
+    ("noack campaign mb_vs_zoh", "what a model saves against a hold"),
+    ("noack campaign mansd_sweep --draws 200 --json", "fewer draws at each grid point"),
+    ("noack campaign mb_vs_zoh --scheduler tcp://127.0.0.1:8786", "on a Dask cluster"),
+])  # fmt: skip
 def campaign(
     file: Annotated[
-        str, typer.Argument(help="Campaign file (TOML), or the name of a shipped campaign.")
+        str,
+        typer.Argument(
+            help="Campaign file (TOML), or the name of a shipped campaign.",
+            autocompletion=complete.campaigns,
+        ),
     ],
     draws: Annotated[
         int | None, typer.Option(help="Runs at each grid point; the file's unless given.", min=1)

@@ -12,7 +12,6 @@ from rich.console import Console
 
 from cosim.cli.app import (
     CAMPAIGNS,
-    DEFAULT_RUNS,
     JsonOption,
     ScenarioArgument,
     SetOption,
@@ -20,12 +19,17 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import CallerError, ExitStatus, MachineError
 from noack.linear import Matrix
 from noack.scenario_file import dumps, load
 
 
-@command(CAMPAIGNS)
+@command(CAMPAIGNS, [
+    ("noack design lane_following --settling 14", "the fewest transmissions"),
+    ("noack design lane_following --settling 14 --bound error=3 --out mine.toml", ""),
+    ("noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json", ""),
+])  # fmt: skip
 def design(
     scenario: ScenarioArgument,
     settling: Annotated[float, typer.Option(metavar="SECONDS", help="Settle within this time.")],

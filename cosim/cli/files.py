@@ -1,5 +1,6 @@
 """Commands on scenario files."""
 
+from collections.abc import Iterator
 from typing import Annotated
 
 import typer
@@ -14,12 +15,17 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
+from noack.scenario import Scenario
 from noack.scenario_file import dumps as scenario_toml
 from noack.scenario_file import json_schema, load
 
 
-@command(FILES)
+@command(FILES, [
+    ("noack check lane_following", "all its keys, and what the paper assumes"),
+    ("noack check lane_following --set mode=zoh --json", ""),
+])  # fmt: skip
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
     """Check a scenario and print it resolved: defaults, named models and draws made explicit.
 
@@ -44,6 +50,8 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
     if (near := linearisation(resolved)) is not None:
         for what, value in said(near):
             console.print(f"{what}: {value}", highlight=False, markup=False)
+    for line in _in_force(resolved):
+        console.print(line, highlight=False, markup=False)
     if json:
         print_json(resolved.model_dump(mode="json"))
     else:
@@ -51,7 +59,27 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
     return ExitStatus.OK
 
 
-@command(FILES)
+def _in_force(resolved: Scenario) -> Iterator[str]:
+    """Say what holds of keys that have no value, and whose default depends on others."""
+    from cosim.launch import REJOIN_BY_HAND_S
+
+    watchdog, timeout_s = resolved.plant.watchdog, resolved.actuation_timeout_ns / NS_PER_S
+    if watchdog.timeout_s is None:
+        yield f"plant.watchdog: {watchdog.policy} when no actuation has come for {timeout_s:g} s"
+    if resolved.controller.safe_input is None:
+        yield "controller.safe_input: 0, while the controller knows no state"
+    if resolved.recovery.rejoin_within_s is None:
+        yield (
+            "recovery.rejoin_within_s: 0, who dies ends the run; "
+            f"{REJOIN_BY_HAND_S:g} for processes that people start"
+        )
+
+
+@command(FILES, [
+    ("noack schema > scenario.schema.json", "for an editor that completes keys"),
+    ("noack schema --campaign", ""),
+    ("noack schema --netem", ""),
+])  # fmt: skip
 def schema(
     netem: Annotated[
         bool, typer.Option("--netem", help="Of the emulator's links files instead.")

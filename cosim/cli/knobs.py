@@ -8,7 +8,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.cli.app import RUNS, JsonOption, command, print_json
+from cosim.cli import complete
+from cosim.cli.app import RUNS, SESSION, JsonOption, command, print_json
 from noack.errors import CallerError, ExitStatus
 from noack.knobs import SHORT, full_key, text_of
 from noack.scenario_file import value_of
@@ -16,6 +17,11 @@ from noack.scenario_file import value_of
 
 @command(
     RUNS,
+    [
+        ("noack set", "what can be changed, and what it is now"),
+        ("noack set loss.p 0.9", "nine in ten packets are lost from now on"),
+        ("noack set mansd 2 trigger.beta 0.3 --json", "two settings at once"),
+    ],
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value
 )
@@ -26,12 +32,16 @@ def set_(
             metavar="[KEY VALUE]...",
             help="What to change, as in the scenario or short, e.g. loss.p 0.9 mansd 2; "
             "nothing shows what can be changed.",
+            autocompletion=complete.knobs,
         ),
     ] = None,
-    session: Annotated[
-        str | None, typer.Option("--session", help="The run in this session.")
+    session: Annotated[str | None, SESSION] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            "--run", help="The run with this directory.", autocompletion=complete.run_directories
+        ),
     ] = None,
-    run: Annotated[Path | None, typer.Option("--run", help="The run with this directory.")] = None,
     json: JsonOption = False,
 ) -> int:
     """Change a run while it goes on: losses, M, the trigger, the set-point; the newest run's."""

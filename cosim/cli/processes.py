@@ -3,7 +3,6 @@
 import typer
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     PROCESSES,
     JsonOption,
     LiveOption,
@@ -16,11 +15,15 @@ from cosim.cli.app import (
     find_scenario,
 )
 from cosim.cli.runs import run_processes
+from cosim.run_dir import DEFAULT_RUNS
 from noack.scenario_file import load
 from noack.topology import RECORDER
 
 
-@command(PROCESSES)
+@command(PROCESSES, [
+    ("noack record lane_following", "then start the other four, in any order"),
+    ("noack record lane_following --session two --live", "beside another run"),
+])  # fmt: skip
 def record(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -35,7 +38,10 @@ def record(
     return run_processes(loaded, runs, (RECORDER,), session, live=live, report=report, json=json)
 
 
-@command(PROCESSES)
+@command(PROCESSES, [
+    ("noack plant", "joins what `noack record SCENARIO` has opened"),
+    ("noack plant --session two --json", "in another session; its report as JSON"),
+])  # fmt: skip
 def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the plant: owns the true state, sends measurements."""
     from plant_server.__main__ import main
@@ -43,7 +49,10 @@ def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
     return main(_process_arguments(session, json=json))
 
 
-@command(PROCESSES)
+@command(PROCESSES, [
+    ("noack sensor", "joins what `noack record SCENARIO` has opened"),
+    ("noack sensor --session two --json", "in another session; its report as JSON"),
+])  # fmt: skip
 def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
     from sensor_node.__main__ import main
@@ -51,7 +60,10 @@ def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
     return main(_process_arguments(session, json=json))
 
 
-@command(PROCESSES)
+@command(PROCESSES, [
+    ("noack controller", "joins what `noack record SCENARIO` has opened"),
+    ("noack controller --session two --json", "in another session; its report as JSON"),
+])  # fmt: skip
 def controller(session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the controller: runs x_c, sends u = K x_c."""
     from controller_node.__main__ import main

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from cosim.cli import complete
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     RUNS,
     JsonOption,
     LiveOption,
     ReportOption,
+    RunArgument,
     RunsOption,
     ScenarioArgument,
     SetOption,
@@ -22,7 +23,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
-from cosim.run_dir import RECORDING_FILE, latest_run
+from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, latest_run
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
 from noack.scenario_file import load
@@ -32,7 +33,11 @@ if TYPE_CHECKING:
     from cosim.launch import Ending
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack run lane_following", "the paper's example, 20 s"),
+    ("noack run unstable_pendulum --set horizon_s=5 --live", "shorter, and seen"),
+    ("noack run lane_following --set network.mansd=9 --json", "what became of it, as JSON"),
+])  # fmt: skip
 def run(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -46,7 +51,11 @@ def run(
     return run_processes(loaded, runs, ROLES, None, live=live, report=report, json=json)
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack demo", "20 s; tables at the end, all kept in runs/latest"),
+    ("noack demo --zoh --live", "a hold instead of a model, in the viewer"),
+    ("noack demo --set speed=4 --set horizon_s=8", "2 s of wall time"),
+])  # fmt: skip
 def demo(
     zoh: Annotated[bool, typer.Option("--zoh", help="Hold the last update; no model.")] = False,
     settings: SetOption = None,
@@ -68,7 +77,11 @@ class Trigger(StrEnum):
     CONTINUOUS = "continuous"
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack simulate lane_following", "the machines of a live run"),
+    ("noack simulate lane_following --trigger continuous", "the paper's loop"),
+    ("noack simulate reactor_petc --no-report --json", "for a program"),
+])  # fmt: skip
 def simulate(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -93,10 +106,17 @@ def simulate(
     return _conclude(ending, report=report, json=json)
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack view", "the last run, in a window where there is a display"),
+    ("noack view runs/latest --web", "in a browser on this machine"),
+])  # fmt: skip
 def view(
     recording: Annotated[
-        Path | None, typer.Argument(help="A run directory or .rrd file; by default the last run.")
+        Path | None,
+        typer.Argument(
+            help="A run directory or .rrd file; by default the last run.",
+            autocompletion=complete.run_directories,
+        ),
     ] = None,
     runs: RunsOption = DEFAULT_RUNS,
     web: Annotated[
@@ -116,11 +136,12 @@ def view(
     return ExitStatus.OK
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack summary", "of the last run"),
+    ("noack summary runs/latest --json", "all numbers"),
+])  # fmt: skip
 def summary(
-    run_dir: Annotated[
-        Path | None, typer.Argument(help="A run directory; by default the last run.")
-    ] = None,
+    run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
@@ -136,11 +157,12 @@ def summary(
     return ExitStatus.OK
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack replay", "the last run; exit status 1 if a bit differs"),
+    ("noack replay runs/latest --json", ""),
+])  # fmt: skip
 def replay(
-    run_dir: Annotated[
-        Path | None, typer.Argument(help="A run directory; by default the last run.")
-    ] = None,
+    run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
@@ -162,11 +184,12 @@ def replay(
     return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack compare", "sampling, delay and hold of the last run, in numbers"),
+    ("noack compare runs/latest --json", ""),
+])  # fmt: skip
 def compare(
-    run_dir: Annotated[
-        Path | None, typer.Argument(help="A run directory; by default the last run.")
-    ] = None,
+    run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
@@ -186,11 +209,12 @@ def compare(
     return ExitStatus.OK if fidelity.explained else ExitStatus.FAILED
 
 
-@command(RUNS)
+@command(RUNS, [
+    ("noack report", "of the last run; prints the page's path"),
+    ("noack report runs/latest --json", ""),
+])  # fmt: skip
 def report(
-    run_dir: Annotated[
-        Path | None, typer.Argument(help="A run directory; by default the last run.")
-    ] = None,
+    run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:

@@ -8,7 +8,6 @@ import typer
 from rich.console import Console
 
 from cosim.cli.app import (
-    DEFAULT_RUNS,
     THEORY,
     JsonOption,
     ScenarioArgument,
@@ -18,11 +17,16 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import ExitStatus
 from noack.scenario_file import load
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack certify lane_following", "its plant and its uncertainty box"),
+    ("noack certify lane_following --weight chosen", "in a norm that certifies more"),
+    ("noack certify lane_weighted --late 6 --json", "a schedule that may be 6 steps late"),
+])  # fmt: skip
 def certify(
     scenario: ScenarioArgument,
     settings: SetOption = None,
@@ -39,15 +43,12 @@ def certify(
     json: JsonOption = False,
 ) -> int:
     """Say what is guaranteed of a scenario, with which constants, under which conditions."""
-    from cosim.certify import print_study, study, with_weight
+    from cosim.certify import print_study, study_scenario
     from cosim.progress import work_bar
-    from noack.resolve import resolve
 
-    resolved = resolve(load(find_scenario(scenario), settings or ()))
-    allowed = resolved.certificate.late_periods if late is None else late
+    loaded = load(find_scenario(scenario), settings or ())
     with work_bar("choosing the weight") as progress:
-        weighted, chosen = with_weight(resolved, weight, progress)
-    found = study(weighted, allowed, chosen)
+        found = study_scenario(loaded, weight, late, progress)
     if json:
         print_json(found.to_json())
     else:
@@ -66,7 +67,11 @@ class AdversaryAim(StrEnum):
     ALL = "all"
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack adversary lane_following", "all objectives"),
+    ("noack adversary lane_following --objective error --json", "the controller's error"),
+    ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a quicker search"),
+])  # fmt: skip
 def adversary(
     scenario: ScenarioArgument,
     objective: Annotated[
@@ -116,7 +121,10 @@ def adversary(
     return ExitStatus.FAILED if refuted else ExitStatus.OK
 
 
-@command(THEORY)
+@command(THEORY, [
+    ("noack paper", "1,000 draws, some minutes; into runs/paper"),
+    ("noack paper --draws 50 --out paper --json", "a glance"),
+])  # fmt: skip
 def paper(
     draws: Annotated[int, typer.Option(help="Draws of plant, losses and initial state.")] = 1000,
     out: Annotated[

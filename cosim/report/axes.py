@@ -17,7 +17,7 @@ from matplotlib.ticker import LogFormatter
 
 from cosim import palette
 from cosim.report.decimate import Reals, decimate
-from cosim.report.style import printed
+from cosim.report.style import NotebookFigure, printed
 
 Curve = tuple[str, Reals, Reals]
 """Label, times in s (k,), values (k,)."""
@@ -71,7 +71,7 @@ def single(
     """
     width_in = WIDTH_IN - LEFT_IN - RIGHT_IN - (beside_in + 0.25 if beside_in else 0.0)
     above_in = head_in(labels, width_in)
-    figure = Figure(figsize=(WIDTH_IN, above_in + height_in + BELOW_IN))
+    figure = NotebookFigure(figsize=(WIDTH_IN, above_in + height_in + BELOW_IN))
     axes = [place(figure, LEFT_IN, above_in, width_in, height_in)]
     if beside_in:
         left_in = WIDTH_IN - RIGHT_IN - beside_in

@@ -39,7 +39,7 @@ from cosim.report.axes import (
     stems,
 )
 from cosim.report.decimate import Reals
-from cosim.report.style import PAPER, printed, styled
+from cosim.report.style import PAPER, NotebookFigure, printed, styled
 
 Flags = NDArray[np.bool_]
 
@@ -100,7 +100,7 @@ def paper_figure(
     tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
     above_in = tops_in[-1] + height_in + BELOW_IN + head
     below_in = above_in + interval_in + head
-    figure = Figure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
+    figure = NotebookFigure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
     for i in range(drawn):
         row, column = divmod(i, columns)
         left_in = LEFT_IN + column * (LEFT_IN + width_in)

@@ -1,6 +1,7 @@
 """The figures of one run, drawn from its record."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -9,9 +10,7 @@ from matplotlib.figure import Figure
 from cosim.crossing import crossing
 from cosim.estimation import true_states
 from cosim.join import Joined, join_all
-from cosim.record import (
-    RunRecord,
-)
+from cosim.record import RunRecord
 from cosim.report import figures
 from cosim.report.axes import Curve
 from cosim.report.decimate import Reals
@@ -42,25 +41,43 @@ class Picture(NamedTuple):
     """What it shows, for those who cannot see it."""
 
 
+BOUNDED = ("errors", "state-norm", "inter-event")
+"""The figures that show certified bounds."""
+
+
 def run_figures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
 ) -> Iterator[Picture]:
-    """Draw the figures of a run.
+    """Draw the figures of a run, as :func:`pictures` lists them."""
+    return (draw() for draw in pictures(record, envelopes, timed=timed).values())
+
+
+def pictures(
+    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
+) -> dict[str, Callable[[], Picture]]:
+    """List the figures of a run by name; each is drawn when it is called.
 
     Args:
         record: the run's record, of any length, none included.
         envelopes: certified bounds to be drawn beside what they bound.
         timed: whether the processes' lateness means anything; in virtual time it does not.
     """
-    with np.errstate(all="ignore"):  # a run that diverged has figures, too
-        joined = join_all(record)
-    yield _states(record, joined)
-    yield from _norms(record, joined, _bounding(envelopes, "e_c"), _bounding(envelopes, "x"))
-    yield _input(record)
-    yield _inter_event(record, _bounding(envelopes, "inter_event"))
-    if timed:
-        yield _lateness(record)
-        yield _latency(record)
+
+    @cache
+    def joined() -> Joined:
+        with np.errstate(all="ignore"):  # a run that diverged has figures, too
+            return join_all(record)
+
+    found = {
+        "states": lambda: _states(record, joined()),
+        "errors": lambda: _errors(record, joined(), _bounding(envelopes, "e_c")),
+        "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
+        "input": lambda: _input(record),
+        "inter-event": lambda: _inter_event(record, _bounding(envelopes, "inter_event")),
+    }
+    if record.kind == "live" if timed is None else timed:
+        found |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
+    return found
 
 
 def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Curve]:
@@ -117,13 +134,11 @@ def _known(scenario: Scenario) -> str:
     return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
 
 
-def _norms(
-    record: RunRecord, joined: Joined, e_c_bounds: list[Curve], x_bounds: list[Curve]
-) -> Iterator[Picture]:
+def _errors(record: RunRecord, joined: Joined, bounds: list[Curve]) -> Picture:
     t_s = _seconds(joined.t_ns)
-    yield Picture(
+    return Picture(
         "errors",
-        figures.error_figure(t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, e_c_bounds),
+        figures.error_figure(t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds),
         (
             "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; while none comes, "
             "the sensor transmits again and again. The controller's error is ‖e_c‖ = ‖x_c − x‖."
@@ -133,17 +148,20 @@ def _norms(
             "leaves it while packets are lost."
         )
         + ("" if record.scenario.knows_state else " Both are against x̂, what the sensor knows.")
-        + _dashed(e_c_bounds),
+        + _dashed(bounds),
         "Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
     )
+
+
+def _state_norm(record: RunRecord, bounds: list[Curve]) -> Picture:
     steps = record[PLANT_STEP]
     with np.errstate(all="ignore"):
         x_norm = np.linalg.norm(steps["x"], axis=1)
-    yield Picture(
+    return Picture(
         "state-norm",
-        figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, x_bounds),
-        "Norm of the plant's state." + _dashed(x_bounds),
+        figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, bounds),
+        "Norm of the plant's state." + _dashed(bounds),
         "Norm of the state over time on a logarithmic axis"
         + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
     )

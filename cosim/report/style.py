@@ -4,6 +4,7 @@ Nothing here touches pyplot or leaves a trace in matplotlib's global settings.
 """
 
 import functools
+import io
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -73,6 +74,16 @@ def settings() -> Iterator[None]:
         # A name may use signs that the font lacks; a box in their place is no reason to complain.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows, although pyplot has never heard of it."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with settings():
+            self.savefig(buffer, format="png")
+        return buffer.getvalue()
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:

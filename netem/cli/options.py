@@ -14,6 +14,7 @@ from noack.errors import CallerError
 from noack.impairment_files import read_files
 from noack.impairments import LinkSettings
 from noack.io.address import parse_address
+from noack.io.command_line import Parser
 from noack.io.process import add_options
 
 LINK_NAME = "relay"
@@ -79,9 +80,9 @@ class _Formatter(argparse.HelpFormatter):
         return "\n".join(lines)
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> Parser:
     """Return the parser of the command line."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="noack netem",
         usage="%(prog)s --listen HOST:PORT --to HOST:PORT\n"
         "                   [WORDS ...] [options]\n"

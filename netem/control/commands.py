@@ -13,7 +13,7 @@ from rich.console import Console
 
 from netem.control.client import Client
 from netem.control.history import History
-from netem.control.screen import Screen
+from netem.control.screen import JsonLines, Screen
 from netem.control.session import Session, find, running
 from netem.control.view import render
 from netem.engine.api import DIRECTIONS
@@ -22,6 +22,7 @@ from netem.words.parser import settings_of
 from noack.errors import CallerError, ExitStatus, NoackError, PeerError
 from noack.impairment_files import read_files
 from noack.impairments import LinkSettings
+from noack.io.command_line import Parser, failed
 from noack.io.signals import Signals
 
 _HELP = "name of the emulator, from its --control; may be left out if only one runs"
@@ -33,8 +34,8 @@ def main(arguments: Sequence[str]) -> ExitStatus:
     try:
         return COMMANDS[command](rest)
     except NoackError as error:
-        print(f"noack netem {command}: {error}", file=sys.stderr)
-        return error.exit_status
+        who, as_json = f"noack netem {command}", "--json" in rest
+        return failed(str(error), error.exit_status, who=who, as_json=as_json)
     except BrokenPipeError:  # who reads has seen enough
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())
@@ -42,9 +43,21 @@ def main(arguments: Sequence[str]) -> ExitStatus:
         return ExitStatus.OK
 
 
+def _parser(command: str, description: str, examples: Sequence[str], **more: Any) -> Parser:
+    return Parser(
+        prog=f"noack netem {command}",
+        description=description,
+        epilog="\n  ".join(["examples:", *examples]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        **more,
+    )
+
+
 def _show(arguments: Sequence[str]) -> ExitStatus:
-    parser = argparse.ArgumentParser(
-        prog="noack netem show", description="Show what has happened in a running emulator."
+    parser = _parser(
+        "show",
+        "Show what has happened in a running emulator.",
+        ("noack netem show", "noack netem show dns --json"),
     )
     parser.add_argument("name", nargs="?", help=_HELP)
     parser.add_argument("--json", action="store_true", help="print one JSON document")
@@ -63,11 +76,12 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
 
 
 def _set(arguments: Sequence[str]) -> ExitStatus:
-    parser = argparse.ArgumentParser(
-        prog="noack netem set",
+    parser = _parser(
+        "set",
+        "Change what a link of a running emulator does. As with `tc qdisc change`, the words\n"
+        "replace all that the direction did, its cap too.",
+        ("noack netem set loss 10% mansd 4", "noack netem set dns --direction both delay 20ms 5ms"),
         usage="%(prog)s [NAME] [--link LINK] [--direction forward|back|both] WORDS ...",
-        description="Change what a link of a running emulator does. As with `tc qdisc change`, the "
-        "words replace all that the direction did, its cap too.",
     )
     parser.add_argument("words", nargs="*", metavar="[NAME] WORDS", help="e.g. loss 5%% mansd 4")
     parser.add_argument("--link", help="may be left out if there is only one")
@@ -131,16 +145,19 @@ def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
 
 
 def _watch(arguments: Sequence[str]) -> ExitStatus:
-    parser = argparse.ArgumentParser(
-        prog="noack netem watch",
-        description="Watch a running emulator; where the output is no terminal, a line a second "
-        "for each direction of a link that has seen datagrams.",
+    parser = _parser(
+        "watch",
+        "Watch a running emulator; where the output is no terminal, a line a second for each\n"
+        "direction of a link that has seen datagrams.",
+        ("noack netem watch", "noack netem watch dns --json"),
     )
     parser.add_argument("name", nargs="?", help=_HELP)
-    session = find(parser.parse_args(arguments).name)
+    parser.add_argument("--json", action="store_true", help="print a JSON document a second")
+    options = parser.parse_args(arguments)
+    session = find(options.name)
     ended: PeerError | None = None
     with Signals().handled() as signals, Client(session) as client:
-        with Screen(_title(session)) as screen:
+        with JsonLines() if options.json else Screen(_title(session)) as screen:
             screen.show(client.ask("report"))
             try:
                 for statistics in client.follow(

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import os
 import select
 import sys
@@ -99,6 +100,24 @@ class Screen:
             self._console.print(render(self._history, self._title, self._console.width, None))
         for message in self._messages.lines:
             print(message, file=sys.stderr)
+
+
+class JsonLines:
+    """Stands in for a :class:`Screen` where a program reads: a line of JSON each time."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def show(self, statistics: Statistics) -> None:
+        """Write newer statistics."""
+        print(json.dumps(statistics), flush=True)
+
+    def look(self) -> bool:
+        """Nobody presses a key."""
+        return False
 
 
 class _Messages(io.TextIOBase):

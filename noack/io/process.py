@@ -8,6 +8,7 @@ import traceback
 from collections.abc import Callable, Sequence
 
 from noack.errors import ExitStatus, NoackError
+from noack.io.command_line import Parser, failed
 from noack.io.node import HORIZON, Node
 from noack.io.plane import Plane
 from noack.io.signals import Signals
@@ -20,11 +21,16 @@ TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 
 
 def run_process(
-    role: str, body: Callable[[Node], None], session: str = DEFAULT_SESSION
+    role: str,
+    body: Callable[[Node], None],
+    session: str = DEFAULT_SESSION,
+    *,
+    as_json: bool = False,
 ) -> ExitStatus:
     """Join a run as ``role``, do ``body``, and return the exit status.
 
-    A mistake or a peer's fault becomes one line on standard error, with no traceback.
+    A mistake or a peer's fault becomes one line on standard error, with no traceback; ``as_json``
+    also a document on standard output.
     """
     with Signals().handled() as signals:
         try:
@@ -38,8 +44,7 @@ def run_process(
                     plane.leave(node.ended)
         except NoackError as error:
             if signals.received is None:
-                print(f"noack {role}: {error}", file=sys.stderr)
-                return error.exit_status
+                return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
         except Exception:
             traceback.print_exc()
             print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
@@ -58,12 +63,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
     """Command line of one process that does nothing but join a run."""
-    parser = argparse.ArgumentParser(
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    parser = Parser(
         prog=f"noack {role}",
         description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
     )
     add_options(parser)
-    return join_run(role, body, parser.parse_args(arguments))
+    try:
+        options = parser.parse_args(given)
+    except NoackError as error:
+        return failed(str(error), error.exit_status, who=f"noack {role}", as_json="--json" in given)
+    return join_run(role, body, options)
 
 
 def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
@@ -74,7 +84,7 @@ def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespac
         if options.json:
             print(json.dumps(node.report, indent=2))
 
-    return run_process(role, body_and_report, options.session)
+    return run_process(role, body_and_report, options.session, as_json=options.json)
 
 
 def _admission(role: str, session: str, signals: Signals) -> Ticket:

@@ -1,9 +1,10 @@
 """What a section says of a file of matrices."""
 
 from collections.abc import Mapping
+from typing import Any
 
 
-def require_read(file: str | None, names: Mapping[str, str] | None) -> None:
+def require_read(file: str | None, names: Mapping[Any, str] | None) -> None:
     """Raise ValueError where a section still names a file, which whoever loads a scenario reads."""
     if file is not None:
         raise ValueError("file: it is read where a scenario file is loaded; give matrices here")

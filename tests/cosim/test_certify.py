@@ -118,7 +118,7 @@ def test_a_weight_is_chosen_that_contracts_and_keeps_the_volume() -> None:
 
 
 def test_no_weight_helps_a_hold() -> None:
-    with pytest.raises(CallerError, match=r"--weight chosen: α = 0\.25 /s is not below"):
+    with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
         with_weight(scenario("lane_following", 'mode="zoh"'), "chosen")
     with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
         with_weight(scenario("lane_following"), "best")

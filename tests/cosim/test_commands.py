@@ -34,3 +34,23 @@ def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
     assert result.exit_code == 2
     assert result.stderr.endswith("but Â + B̂K is not stable\n")
     assert result.stdout == ""
+
+
+def test_check_says_which_defaults_are_in_force(tmp_path: Path, content: dict[str, Any]) -> None:
+    path = tmp_path / "small.toml"
+
+    def said() -> str:
+        path.write_text(tomli_w.dumps(content))
+        done = CliRunner().invoke(app, ["check", str(path)])
+        assert done.exit_code == 0, done.stderr
+        return " ".join(done.stderr.split())
+
+    silent = said()
+    assert "plant.watchdog: hold when no actuation has come for 0.1 s" in silent
+    assert "controller.safe_input: 0, while" in silent
+    assert "recovery.rejoin_within_s: 0, who dies ends the run; 60 for processes" in silent
+    content["plant"]["watchdog"] = {"timeout_s": 0.2}
+    content["controller"] = {"safe_input": [0.1]}
+    content["recovery"] = {"rejoin_within_s": 5.0}
+    explicit = said()
+    assert not any(key in explicit for key in ("watchdog", "safe_input", "rejoin_within_s"))

@@ -150,7 +150,7 @@ def test_nobody_there_and_no_address_are_one_line(monkeypatch: pytest.MonkeyPatc
 def test_without_dask_the_way_to_get_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
-        pytest.raises(CallerError, match=r"python -m pip install distributed"),
+        pytest.raises(CallerError, match=r"pip install 'noack\[cluster\]'"),
         cluster("tcp://x:1"),
     ):
         pass

@@ -1,0 +1,105 @@
+"""The program as a whole: how mistakes end, what a reader who leaves means, what help hides."""
+
+import io
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+from rich.text import Text
+from typer.core import TyperGroup
+
+from noack.errors import ExitStatus, printable
+from noack.io.command_line import failed
+
+NAME = "noack"
+_COMPLETION = ("install_completion", "show_completion")
+
+
+class Program(TyperGroup):
+    """All commands; a mistake in how one is called is one line, with what would be right."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The options before the command; those of shell completion are not in the help."""
+        found: list[Any] = super().get_params(ctx)
+        for one in found:
+            one.hidden = one.hidden or one.name in _COMPLETION
+        return found
+
+    def main(
+        self,
+        args: Any = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run the program; the arguments are those of :class:`typer.core.TyperGroup`."""
+        words = list(sys.argv[1:] if args is None else args)
+        try:
+            status = super().main(
+                words, prog_name, complete_var, False, windows_expand_args, **extra
+            )
+        except typer.TyperException as error:
+            status = ExitStatus.CALLER
+            if said := self._line(error, words):
+                failed(said, status, who=NAME, as_json="--json" in words)
+        except OSError as error:  # help goes to a full disk
+            status = failed(
+                f"cannot write: {error}", ExitStatus.FAILED, who=NAME, as_json="--json" in words
+            )
+        if standalone_mode:
+            sys.exit(int(status or 0))
+        return status
+
+    def _line(self, error: typer.TyperException, words: Sequence[str]) -> str:
+        """What is wrong with a command line, in one line; empty if the help has been shown."""
+        message = printable(" ".join(error.format_message().split())).rstrip(".")
+        if not message:
+            return ""
+        message = message[0].lower() + message[1:].replace("Input should", "should")
+        name = next((word for word in words if word in self.commands), None)
+        where, command = (f"{name}: ", f"{NAME} {name}") if name else ("", NAME)
+        if near := getattr(error, "possibilities", None):
+            return f"{where}no such option: {error.option_name}; did you mean {near[0]}?"  # type: ignore[attr-defined]
+        if message.endswith("?"):
+            return f"{where}{message}"
+        if name and message.startswith("missing "):
+            return f"{where}{message}, e.g. `{examples_of(self.commands[name])[0]}`"
+        return f"{where}{message}; see `{command} --help`"
+
+
+def examples_of(command: Any) -> list[str]:
+    """The commands among the examples that a help page ends with."""
+    lines = Text.from_markup(command.epilog or "").plain.splitlines()
+    commands = (line.strip().partition("   ")[0] for line in lines)
+    return [line for line in commands if line.startswith(f"{NAME} ")]
+
+
+def be_patient() -> None:
+    """Let what is written to standard streams go nowhere once their readers have left.
+
+    So `noack run ... | head -1` runs to its end, and its exit status says what became of the run.
+    """
+    sys.stdout, sys.stderr = _patient(sys.stdout), _patient(sys.stderr)
+
+
+def _patient(stream: Any) -> Any:
+    if not isinstance(stream, io.TextIOWrapper):  # a shell's >&- gives a program none
+        return stream
+    return io.TextIOWrapper(
+        io.BufferedWriter(_Patient(stream.fileno(), "w", closefd=False)),
+        encoding=stream.encoding,
+        errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+
+
+class _Patient(io.FileIO):
+    def write(self, data: Any, /) -> int:
+        try:
+            return super().write(data)
+        except BrokenPipeError:
+            return memoryview(data).nbytes

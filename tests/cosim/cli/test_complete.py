@@ -1,0 +1,68 @@
+"""Completion, as a shell asks for it."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cosim.cli.complete import keys, run_directories
+from noack.scenario import Scenario
+
+ROOT = Path(__file__).parents[3]
+
+
+def completed(line: str, cwd: Path) -> list[str]:
+    """What bash is offered for the last word of a line."""
+    words = line.split(" ")
+    asked = {"_NOACK_COMPLETE": "complete_bash", "COMP_WORDS": line, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim.cli"], cwd=cwd, capture_output=True, text=True, check=True,
+        env=os.environ | asked | {"COMP_CWORD": str(len(words) - 1)},
+    )  # fmt: skip
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+@pytest.mark.parametrize(("line", "offered"), [
+    ("noack ca", ["campaign"]),
+    ("noack certify lane_f", ["lane_following"]),
+    ("noack doctor quad", ["quadrotor_hover"]),
+    ("noack campaign mb", ["mb_vs_zoh"]),
+    ("noack run lane_following --set trigger.be", ["trigger.beta="]),
+    ("noack run lane_following --set network.mansd", ["network.mansd="]),
+    ("noack view runs/l", ["runs/latest"]),
+    ("noack replay runs/2", ["runs/20260102-000000-b", "runs/20260101-000000-a"]),
+    ("noack set loss", ["loss", "loss.p"]),
+    ("noack simulate lane_following --tri", ["--trigger"]),
+    ("noack simulate lane_following --trigger c", ["continuous"]),
+])  # fmt: skip
+def test_words_are_completed(line: str, offered: list[str], tmp_path: Path) -> None:
+    for name in ("20260101-000000-a", "20260102-000000-b"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "scenario.toml").touch()
+    (tmp_path / "runs" / "campaigns").mkdir()
+    (tmp_path / "runs" / "latest").symlink_to("20260102-000000-b")
+    assert completed(line, tmp_path) == offered
+
+
+def test_the_script_of_a_shell_is_shown() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim.cli", "--show-completion", "bash"],
+        capture_output=True, text=True, check=True,
+        env=os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
+    )  # fmt: skip
+    assert "_NOACK_COMPLETE=complete_bash" in done.stdout
+
+
+def test_every_key_is_offered_once_with_those_of_tables_that_may_be_chosen() -> None:
+    found = keys(Scenario)
+    assert len(found) == len(set(found))
+    assert {"speed", "trigger.policy", "trigger.sigma", "network.loss.probability",
+            "plant.watchdog.policy", "seeds.loss"} <= set(found)  # fmt: skip
+
+
+def test_without_runs_nothing_is_offered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run_directories("") == []

@@ -1,0 +1,184 @@
+"""What the help promises: a story, examples that work, one word for one thing."""
+
+import json
+import re
+import shlex
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from cosim.cli import app
+from cosim.cli.program import examples_of
+from netem.cli import options as emulator
+from netem.control.commands import COMMANDS as ERRANDS
+from netem.words.parser import parse
+from noack.errors import NoackError
+
+PROGRAM: Any = get_command(app)
+COMMANDS: dict[str, Any] = dict(PROGRAM.commands)
+OURS = sorted(COMMANDS.keys() - {"netem"})
+"""netem's words are its own; its help is of argparse."""
+
+
+def help_of(*command: str) -> str:
+    done = CliRunner().invoke(app, [*command, "--help"], prog_name="noack")
+    assert done.exit_code == 0
+    return done.stdout
+
+
+def examples() -> list[tuple[str, str]]:
+    return [(name, line) for name in OURS for line in examples_of(COMMANDS[name])]
+
+
+def words_of(example: str) -> list[str]:
+    """An example's words after the program's name, without where a shell puts its output."""
+    return shlex.split(example.partition(">")[0])[1:]
+
+
+def test_the_help_begins_with_a_story() -> None:
+    text = help_of()
+    story, _, panels = text.partition("Options")
+    told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
+    assert told == [
+        "doctor", "run", "view", "simulate", "certify", "compare", "campaign", "netem",
+    ]  # fmt: skip
+    assert all(f" {name} " in panels for name in COMMANDS)
+    assert "completion" not in panels
+
+
+@pytest.mark.parametrize("command", ["", *OURS])
+def test_help_fits_a_terminal(command: str) -> None:
+    text = help_of(*filter(None, [command]))
+    assert max(map(len, text.splitlines())) <= 80
+    wrapped = [" ".join(line.split()) for line in text.splitlines()]
+    for example in examples_of(COMMANDS[command]) if command else []:
+        assert any(line.startswith(example) for line in wrapped), example
+
+
+@pytest.mark.parametrize("command", OURS)
+def test_every_help_page_ends_with_examples(command: str) -> None:
+    found = examples_of(COMMANDS[command])
+    assert len(found) >= 2
+    assert all(words_of(example)[0] == command for example in found)
+
+
+@pytest.mark.parametrize("command", ["", *ERRANDS])
+def test_the_emulators_help_ends_with_examples(command: str) -> None:
+    text = help_of("netem", *filter(None, [command]))
+    assert re.search(r"^examples:\n(  noack netem .*\n(    .*\n)*)+\Z", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("command", "example"), examples())
+def test_every_example_is_understood(
+    command: str, example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    PROGRAM.make_context("noack", words_of(example))
+    COMMANDS[command].make_context(command, words_of(example)[1:])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where there is a run, if one in virtual time."""
+    folder = tmp_path_factory.mktemp("examples")
+    words = ["simulate", "lane_following", "--set", "horizon_s=2", "--no-report"]
+    done = CliRunner().invoke(app, [*words, "--runs", str(folder / "runs")])
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+MORE = {
+    "check": (),
+    "schema": (),
+    "summary": (),
+    "replay": (),
+    "report": (),
+    "certify": (),
+    "simulate": ("--set", "horizon_s=1", "--no-report"),
+    "adversary": ("--nodes", "2000", "--beam", "8", "--set", "horizon_s=2"),
+    "doctor": ("--seconds", "0.1", "--set", "ports={}"),
+    "demo": ("--set", "horizon_s=0.5", "--set", "ports={}", "--no-report"),
+}
+"""Commands whose first and last examples are run (of the slow ones the first), made short."""
+
+
+def run_examples() -> list[str]:
+    found = []
+    for command in MORE:
+        first, *_, last = examples_of(COMMANDS[command])
+        found += [first] if command in ("certify", "demo", "report") else [first, last]
+    return found
+
+
+@pytest.mark.parametrize("example", run_examples())
+def test_examples_work(example: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    words = words_of(example)
+    done = CliRunner().invoke(app, [*words, *MORE[words[0]]])
+    allowed = {0, 1} if words[0] == "doctor" else {0}
+    assert done.exit_code in allowed, done.output
+    if "--json" in words or words[0] == "schema":
+        json.loads(done.stdout)
+
+
+def test_commands_without_a_short_example_are_the_long_and_the_live_ones() -> None:
+    assert set(OURS) - MORE.keys() == {
+        "campaign", "compare", "controller", "design", "paper", "plant", "record", "run", "sensor",
+        "set", "view",
+    }  # fmt: skip
+
+
+def test_the_emulators_examples_are_understood() -> None:
+    text = emulator.parser().format_help().replace(" \\\n", " ")
+    told = re.findall(r"^  noack netem (--.*)", text.partition("examples:")[2], re.MULTILINE)
+    assert len(told) >= 5
+    for example in told:
+        options = emulator.parsed(emulator.parser(), shlex.split(example))
+        parse(options.words or ())
+        if options.links is None:
+            emulator.specs_of(options)
+        else:
+            with pytest.raises(NoackError, match=r"links\.toml"):
+                emulator.specs_of(options)
+
+
+@pytest.mark.parametrize("command", OURS)
+def test_every_command_speaks_json(command: str) -> None:
+    assert "--json" in {name for one in COMMANDS[command].params for name in one.opts}
+
+
+OF_THEIR_OWN = {
+    "--draws": "at each grid point, in all, to choose by",
+    "--out": "a folder of results, or a scenario file",
+    "--runs": "where they are made, or the last one is looked for",
+}
+"""Options that mean what fits the command, and say so."""
+
+
+def test_options_of_the_same_name_mean_the_same_everywhere() -> None:
+    said: dict[str, set[tuple[str, str | None, str | None]]] = defaultdict(set)
+    for name in OURS:
+        for one in COMMANDS[name].params:
+            if one.param_type_name == "option":
+                said["/".join(one.opts)].add(("/".join(one.secondary_opts), one.metavar, one.help))
+    several = {name for name, variants in said.items() if len(variants) > 1}
+    assert several <= OF_THEIR_OWN.keys(), {name: said[name] for name in several}
+
+
+def test_options_that_mean_the_same_have_the_same_name() -> None:
+    by_words: dict[str, set[str]] = defaultdict(set)
+    for name in OURS:
+        for one in COMMANDS[name].params:
+            if one.help:
+                by_words[one.help].add(one.name)
+    assert not [names for names in by_words.values() if len(names) > 1]
+    arguments: dict[str, set[str | None]] = defaultdict(set)
+    for name in OURS:
+        for one in COMMANDS[name].params:
+            if one.param_type_name == "argument":
+                arguments[one.name].add(name)
+    assert arguments.keys() == {"scenario", "run_dir", "recording", "file", "settings"}

@@ -1,0 +1,79 @@
+"""A mistake in how a command is called is one line, with what would be right."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from cosim.cli import app
+
+MISTAKES = {
+    "certfy lane_following": "noack: no such command 'certfy'. Did you mean 'certify'?",
+    "--verson": "noack: no such option: --verson; did you mean --version?",
+    "--nothing-like-it": "noack: no such option: --nothing-like-it; see `noack --help`",
+    "certify": "noack: certify: missing argument 'scenario', e.g. `noack certify lane_following`",
+    "design lane_following": "noack: design: missing option '--settling', "
+    "e.g. `noack design lane_following --settling 14`",
+    "certify lane_following --wieght chosen": "noack: certify: no such option: --wieght; "
+    "did you mean --weight?",
+    "certify lane_following --late soon": "noack: certify: invalid value for '--late': should be "
+    "a valid integer, unable to parse string as an integer; see `noack certify --help`",
+    "certify lane_following --late 2000": "noack: certify: invalid value for '--late': should be "
+    "less than or equal to 1000; see `noack certify --help`",
+    "check lane_following too": "noack: check: got unexpected extra argument(s) (too); "
+    "see `noack check --help`",
+    "demo --set": "noack: demo: option '--set' requires an argument; see `noack demo --help`",
+    "netem --lisen :9000": "noack netem: unrecognized arguments: --lisen; see `noack netem --help`",
+    "netem --seed many --listen :9000 --to :9001": "noack netem: --seed: invalid int value: "
+    "'many'; see `noack netem --help`",
+    "netem --session": "noack netem: --session: expected one argument; see `noack netem --help`",
+    "netem show --name dns": "noack netem show: unrecognized arguments: --name; "
+    "see `noack netem show --help`",
+    "netem watch a b": "noack netem watch: unrecognized arguments: b; "
+    "see `noack netem watch --help`",
+}
+NOT_FOUND = {
+    "lane_folowing": "did you mean lane_following? There are cart_pole, ",
+    "nothing": "nor a shipped scenario; there are cart_pole, ",
+}
+
+
+def noack(line: str) -> Result:
+    return CliRunner().invoke(app, line.split(), prog_name="noack")
+
+
+@pytest.mark.parametrize(("line", "said"), MISTAKES.items())
+def test_a_mistake_is_one_line_with_a_remedy(line: str, said: str) -> None:
+    done = noack(line)
+    assert done.exit_code == 2
+    assert done.stderr == said + "\n"
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(("line", "said"), MISTAKES.items())
+def test_a_mistake_is_a_document_for_programs(line: str, said: str) -> None:
+    done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
+    document = json.loads(done.stdout)
+    who, _, message = said.partition(": ")
+    assert document["error"] == message
+    assert document["exit"] == {"status": 2, "reason": message}
+    assert done.stderr == f"{who}: {message}\n"
+
+
+@pytest.mark.parametrize(("name", "said"), NOT_FOUND.items())
+@pytest.mark.parametrize("command", ["check", "certify", "simulate", "run", "doctor"])
+def test_a_scenario_that_is_not_there_suggests_the_nearest(
+    command: str, name: str, said: str
+) -> None:
+    done = noack(f"{command} {name} --json")
+    assert done.exit_code == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert json.loads(done.stdout)["error"] in done.stderr
+
+
+def test_without_a_command_the_help_is_shown() -> None:
+    done = noack("")
+    assert done.exit_code == 2
+    assert "noack doctor" in done.stdout
+    assert done.stderr == ""

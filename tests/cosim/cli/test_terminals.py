@@ -1,0 +1,95 @@
+"""Pipes, terminals, and readers who leave."""
+
+import os
+import pty
+import re
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+NOACK = (sys.executable, "-m", "cosim.cli")
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 150.0
+SIMULATE = ("simulate", "double_integrator", "--set", "horizon_s=1", "--no-report")
+COMMANDS = (("--help",), ("certify", "--help"), ("check", "lane_following"), SIMULATE)
+COLOUR = re.compile(r"\x1b\[[0-9;]*\b(3[0-8]|4[0-8]|9[0-7]|10[0-7])[0-9;]*m")
+
+
+def environment(**more: str) -> dict[str, str]:
+    """The tests', without what speaks of terminals and colours."""
+    said = ("NO_COLOR", "FORCE_COLOR", "PY_COLORS", "TTY_COMPATIBLE", "TTY_INTERACTIVE",
+            "GITHUB_ACTIONS", "COLUMNS", "TERM", "COLORTERM")  # fmt: skip
+    kept = {name: value for name, value in os.environ.items() if name not in said}
+    return kept | {"TERM": "xterm-256color", "PYTHONPATH": str(ROOT)} | more
+
+
+def on_a_terminal(*arguments: str, cwd: Path, **more: str) -> str:
+    """What a command writes that has a terminal for both of its outputs."""
+    reading, writing = pty.openpty()
+    command = [*NOACK, *arguments]
+    with subprocess.Popen(
+        command, cwd=cwd, stdin=writing, stdout=writing, stderr=writing, env=environment(**more)
+    ) as process:
+        os.close(writing)
+        said = b""
+        with open(reading, "rb", buffering=0) as file, suppress(OSError):  # noqa: PTH123
+            while more_said := file.read(4096):
+                said += more_said
+        assert process.wait(PATIENCE_S) == 0, said.decode()
+    return said.decode()
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_pipes_get_text_and_nothing_else(command: tuple[str, ...], tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*NOACK, *command], cwd=tmp_path, env=environment(), capture_output=True, check=True
+    )
+    for said in (done.stdout.decode(), done.stderr.decode()):
+        assert all(one.isprintable() or one == "\n" for one in said)
+    assert b"simulated" not in done.stderr
+
+
+def test_a_terminal_gets_colours_unless_it_does_not_want_them(tmp_path: Path) -> None:
+    assert COLOUR.search(on_a_terminal("check", "lane_following", cwd=tmp_path))
+    assert COLOUR.search(on_a_terminal("--help", cwd=tmp_path))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_no_color_is_respected(command: tuple[str, ...], tmp_path: Path) -> None:
+    assert not COLOUR.search(on_a_terminal(*command, cwd=tmp_path, NO_COLOR="1"))
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_a_dumb_terminal_gets_no_control_characters(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
+    said = on_a_terminal(*command, cwd=tmp_path, TERM="dumb")
+    assert all(one.isprintable() or one in "\r\n" for one in said), said
+
+
+@pytest.mark.parametrize(
+    "command", [("--help",), ("certify", "unstable_pendulum"), ("schema",), SIMULATE], ids=" ".join
+)
+def test_a_reader_who_leaves_is_no_mistake(command: tuple[str, ...], tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [*NOACK, *command], cwd=tmp_path, env=environment(), stdout=writing,
+        stderr=subprocess.PIPE, check=False,
+    )  # fmt: skip
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_the_exit_status_is_the_commands_whoever_reads(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [*NOACK, "certify", "no_such_scenario", "--json"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment(), stdout=writing, stderr=writing, check=False
+    )
+    os.close(writing)
+    assert done.returncode == 2

@@ -1,0 +1,65 @@
+"""Certificates as a program has them."""
+
+import json
+
+import numpy as np
+import pytest
+
+import noack
+
+
+def test_a_system_is_certified_in_few_lines(scenario: noack.Scenario) -> None:
+    found = noack.certify(scenario)
+    for certificate in (found.paper, found.schedule):
+        assert certificate.void is None
+        assert certificate.constants is not None
+        assert certificate.constants.delta >= 1
+        assert certificate.constants.state >= 0.2
+        assert certificate.inter_event_s is not None
+    assert found.paper_box is None
+    assert found.schedule_box is None
+    assert found.limits.sampling_s > 0.002
+    assert found.theorem_2 is not None
+    assert found.weight is None
+    assert json.loads(json.dumps(found.to_json()))["scenario"] == "own_system"
+
+
+def test_a_run_keeps_within_its_certificate(scenario: noack.Scenario, simulated: noack.Run) -> None:
+    certificate = noack.certify(scenario).schedule
+    samples = simulated.samples()
+    t_s = samples["t_s"].to_numpy()
+    x_norm = np.hypot(samples["x_0"].to_numpy(), samples["x_1"].to_numpy())
+    assert (x_norm <= certificate.state(t_s)).all()
+    assert (samples["e_s_norm"].to_numpy() <= certificate.sensor_error(t_s)).all()
+
+
+def test_the_box_and_a_chosen_weight(scenario: noack.Scenario) -> None:
+    box = {"plant.uncertainty_A": [[0.0, 0.0], [0.3, 0.1]]}
+    found = noack.certify(noack.with_settings(scenario, box), weight="chosen", late=0)
+    assert found.weight is not None
+    assert found.weight.shape == (2, 2)
+    np.testing.assert_array_equal(np.array(found.scenario.trigger.weight), found.weight)
+    assert found.paper_box is not None
+    assert found.schedule_box is not None
+    assert found.paper_box.constants is not None
+    for shown in (repr(found), found._repr_html_()):
+        assert "schedule, box" in shown
+        assert f"{found.paper_box.constants.delta:.4g}" in shown
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"weight": "best"}, 'weight: given, identity or chosen, not "best"'),
+        ({"late": -1}, "late: -1 steps; give 0 to 1000"),
+    ],
+)
+def test_what_cannot_be_asked_is_one_line(options: dict[str, object], said: str) -> None:
+    with pytest.raises(noack.NoackError) as caught:
+        noack.certify("double_integrator", **options)  # type: ignore[arg-type]
+    assert str(caught.value) == said
+
+
+def test_what_has_no_certificate_is_one_line() -> None:
+    with pytest.raises(noack.NoackError, match="linear plants"):
+        noack.certify("cart_pole")

@@ -1,0 +1,84 @@
+"""What ``import noack`` is: documented, typed, and light until it is used."""
+
+import inspect
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import noack
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs/library.md").read_text()
+HEAVY = ("cosim", "matplotlib", "numba", "numpy", "pyarrow", "pydantic", "rerun", "scipy", "zenoh")
+
+
+def loaded_by(program: str) -> set[str]:
+    code = f"{program}\nimport json, sys\nprint(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
+
+
+def documented(heading: str) -> set[str]:
+    """Names at the left of the table under a heading."""
+    text = PAGE.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    return {re.match(r"[\w.]+", name)[0] for row in rows for name in re.findall("`(.+?)`", row)}  # type: ignore[index]
+
+
+def members(kind: type) -> set[str]:
+    own = {name for name in vars(kind) if not name.startswith("_")}
+    return own | {name for name in kind.__annotations__ if not name.startswith("_")}
+
+
+def test_the_names_are_those_of_the_page() -> None:
+    assert {name.removeprefix("noack.") for name in documented("Names")} == set(noack.__all__)
+
+
+def test_a_runs_and_certificates_members_are_those_of_the_page() -> None:
+    assert documented("Runs") == members(noack.Run)
+    assert documented("Certificates") == members(noack.Certificates)
+
+
+@pytest.mark.parametrize("name", sorted(set(noack.__all__) - {"__version__"}))
+def test_every_name_is_explained(name: str) -> None:
+    found = getattr(noack, name)
+    text = inspect.getdoc(found)
+    assert text
+    if inspect.isfunction(found):
+        assert {"Args:", "Raises:"} <= set(text.split())
+        for parameter in inspect.signature(found).parameters:
+            assert f"    {parameter}: " in text, parameter
+    if found in (noack.Run, noack.Certificates):
+        for member in vars(found).values():
+            target = member.fget if isinstance(member, property) else member
+            if inspect.isfunction(target) and not target.__name__.startswith("_"):
+                assert inspect.getdoc(target)
+                assert inspect.signature(target).return_annotation is not inspect.Signature.empty
+
+
+def test_importing_it_loads_nothing_heavy() -> None:
+    assert not loaded_by("import noack; dir(noack)") & set(HEAVY)
+
+
+def test_loading_a_scenario_needs_no_viewer_plane_or_plots() -> None:
+    loaded = loaded_by("import noack; noack.load('lane_following')")
+    assert not loaded & {"matplotlib", "numba", "rerun", "zenoh"}
+
+
+def test_a_process_of_a_run_loads_no_library() -> None:
+    assert "cosim" not in loaded_by("import controller_node.__main__, plant_server.__main__")
+
+
+def test_what_it_has_not_is_said() -> None:
+    with pytest.raises(AttributeError, match="module 'noack' has no attribute 'simulates'"):
+        noack.simulates  # type: ignore[attr-defined]  # noqa: B018
+    assert set(noack.__all__) <= set(dir(noack))
+
+
+def test_users_type_checkers_are_told() -> None:
+    assert (ROOT / "noack/py.typed").is_file()
+    assert (ROOT / "cosim/py.typed").is_file()

@@ -1,0 +1,134 @@
+"""Runs that a program makes, opens, and looks at."""
+
+import gc
+import json
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import noack
+
+
+def test_a_run_says_what_became_of_it(simulated: noack.Run) -> None:
+    assert simulated.ok
+    assert simulated.reason == "horizon"
+    assert simulated.summary == json.loads((simulated.directory / "summary.json").read_text())
+    assert simulated.claims == simulated.summary["claims"] != []
+    assert simulated.scenario.plant.draw == "given"
+    for shown in (repr(simulated), simulated._repr_html_()):
+        assert "own_system" in shown
+        assert str(simulated.summary["events"]) in shown
+    assert len(repr(simulated).splitlines()) < 10
+
+
+def test_its_machines_repeat_it(simulated: noack.Run) -> None:
+    assert simulated.replay().bit_exact
+    assert simulated.compare().explained
+
+
+def test_a_temporary_run_is_there_as_long_as_its_object() -> None:
+    run = noack.simulate("double_integrator")
+    folder = run.directory
+    assert folder.is_dir()
+    assert not (folder / "recording.rrd").exists()
+    del run
+    gc.collect()
+    assert not folder.parent.exists()
+
+
+def test_a_run_directory_is_like_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scenario: noack.Scenario
+) -> None:
+    run = noack.simulate(scenario, runs=tmp_path / "runs")
+    assert (run.directory / "recording.rrd").is_file()
+    monkeypatch.chdir(tmp_path)
+    again = noack.open_run()
+    assert again.directory.samefile(run.directory)
+    assert again.summary == run.summary
+    assert again.report() == again.directory / "report.html"
+
+
+def test_a_live_run_is_a_run(scenario: noack.Scenario) -> None:
+    run = noack.run(noack.with_settings(scenario, {"horizon_s": 0.5}))
+    assert run.ok
+    assert run.summary["kind"] == "live"
+    assert isinstance(run.plot("latency"), Figure)
+    assert run.table("plant_step").num_rows == 250 + 1
+
+
+def test_a_live_run_that_is_interrupted_is_returned() -> None:
+    program = (
+        "import noack\n"
+        "scenario = noack.load('double_integrator', {'horizon_s': 10.0})\n"
+        "run = noack.run(scenario, progress=True)\n"
+        "print(run.ok, run.reason, run.table('plant_step').num_rows > 100)"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert any("/10 s" in line for line in process.stderr)
+        process.send_signal(signal.SIGINT)
+        stdout, _ = process.communicate(timeout=100)
+    assert stdout.split("\n")[0] == "False stopped by SIGINT True"
+    assert process.returncode == 0
+
+
+def test_a_live_run_is_the_main_threads(scenario: noack.Scenario) -> None:
+    caught: list[noack.NoackError] = []
+
+    def start() -> None:
+        with pytest.raises(noack.NoackError, match="main thread") as error:
+            noack.run(scenario)
+        caught.append(error.value)
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert caught
+
+
+def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(noack.NoackError, match="not a run directory"):
+        noack.open_run(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["states", "errors", "state-norm", "input", "inter-event"])
+def test_a_figure_is_shown_by_a_notebook(simulated: noack.Run, name: str) -> None:
+    figure = simulated.plot(name)
+    assert isinstance(figure, Figure)
+    assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+
+
+def test_certified_bounds_are_drawn_with_what_they_bound(simulated: noack.Run) -> None:
+    (axes,) = simulated.plot("errors").axes
+    assert any(line.get_linestyle() != "-" for line in axes.lines)
+    legend = axes.get_legend()
+    assert legend is not None
+    assert any("certified for" in text.get_text() for text in legend.get_texts())
+
+
+def test_a_figure_or_table_that_there_is_not_is_one_line(simulated: noack.Run) -> None:
+    with pytest.raises(noack.NoackError, match=r'"lateness": no such figure .* it has states, '):
+        simulated.plot("lateness")
+    with pytest.raises(noack.NoackError, match='"plant": the record has no such table; it has'):
+        simulated.table("plant")
+
+
+def test_a_diverging_run_is_a_run() -> None:
+    run = noack.simulate(
+        noack.from_system(
+            ([[100.0]], [[1.0]]), [[-150.0]], [1.0],
+            plant=([[300.0]], [[1.0]]), settings={"horizon_s": 5.0},
+        )
+    )  # fmt: skip
+    assert not run.ok
+    assert "diverged" in run.reason
+    assert not np.isfinite(run.table("plant_step")["x_0"].to_numpy()).all()
+    assert isinstance(run.plot(), Figure)

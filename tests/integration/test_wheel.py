@@ -1,0 +1,162 @@
+"""What is built and installed works where there is no repository."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.integration.conftest import EPHEMERAL, PATIENCE_S
+
+ROOT = Path(__file__).parents[2]
+OF_THE_NETWORK = ("Failed to fetch", "error sending request", "dns error", "Could not connect",
+                  "not found in the package registry", "cannot be found in the cache",
+                  "Network connectivity is disabled")  # fmt: skip
+ENVIRONMENT = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+}
+
+
+def uv(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    program = shutil.which("uv", path=str(Path(sys.executable).parent)) or shutil.which("uv")
+    if program is None:
+        pytest.skip("uv is not installed")
+    return subprocess.run(
+        [program, *map(str, arguments)], env=ENVIRONMENT, capture_output=True, text=True,
+        check=False, timeout=250,
+    )  # fmt: skip
+
+
+def built(*arguments: str | Path) -> Path:
+    """Build with what is installed here: nothing is fetched."""
+    out = Path(arguments[-1])
+    done = uv("build", "--no-build-isolation", "--python", sys.executable, *arguments)
+    assert done.returncode == 0, done.stderr
+    (wheel,) = out.glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sdist, and the wheel that was built from it."""
+    out = tmp_path_factory.mktemp("dist")
+    built(ROOT, "--out-dir", out)
+    return out
+
+
+@dataclass(frozen=True)
+class Installed:
+    """An environment with noack in it, and a folder to work in."""
+
+    program: Path
+    folder: Path
+
+    def __call__(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [self.program, *arguments], cwd=self.folder, env=ENVIRONMENT, capture_output=True,
+            text=True, check=False, timeout=PATIENCE_S,
+        )  # fmt: skip
+
+    def json(self, *arguments: str) -> dict[str, Any]:
+        done = self(*arguments, "--json")
+        assert done.returncode == 0, done.stderr
+        said: dict[str, Any] = json.loads(done.stdout)
+        return said
+
+
+@pytest.fixture(scope="module")
+def noack(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    (wheel,) = dist.glob("*.whl")
+    place = tmp_path_factory.mktemp("clean")
+    python = place / "env" / "bin" / "python"
+    made = uv("venv", "--python", sys.executable, place / "env")
+    assert made.returncode == 0, made.stderr
+    lock = ROOT / "requirements.lock"
+    done = uv("pip", "install", "--python", python, "--constraint", lock, wheel)
+    if done.returncode != 0 and any(said in done.stderr for said in OF_THE_NETWORK):
+        pytest.skip(f"no package index can be reached: {' '.join(done.stderr.split())[:200]}")
+    assert done.returncode == 0, done.stderr
+    (place / "work").mkdir()
+    return Installed(place / "env" / "bin" / "noack", place / "work")
+
+
+def test_the_sdist_makes_the_same_wheel_as_the_repository(dist: Path, tmp_path: Path) -> None:
+    (from_sdist,) = dist.glob("*.whl")
+    from_tree = built("--wheel", ROOT, "--out-dir", tmp_path)
+
+    def content(wheel: Path) -> dict[str, int]:
+        with zipfile.ZipFile(wheel) as file:
+            return {entry.filename: entry.CRC for entry in file.infolist()}
+
+    assert content(from_sdist) == content(from_tree)
+
+
+def test_the_wheel_has_what_noack_reads_and_nothing_else(dist: Path) -> None:
+    (wheel,) = dist.glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        names = set(file.namelist())
+    for folder in ("scenarios", "campaigns"):
+        here = {f"cosim/{folder}/{path.name}" for path in (ROOT / folder).glob("*.toml")}
+        assert here <= names
+    packages = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim")
+    for package in packages:
+        files = {
+            str(path.relative_to(ROOT))
+            for path in (ROOT / package).rglob("*")
+            if path.is_file() and path.suffix not in (".pyc", ".nbi", ".nbc")
+        }
+        assert files <= names
+    (about,) = {name.partition("/")[0] for name in names} - set(packages)
+    assert about.endswith(".dist-info")
+    assert not [name for name in names if "__pycache__" in name]
+
+
+def test_the_sdist_has_the_documentation_and_the_tests(dist: Path) -> None:
+    (sdist,) = dist.glob("*.tar.gz")
+    with tarfile.open(sdist) as file:
+        names = {name.partition("/")[2] for name in file.getnames()}
+    assert {"README.md", "CHANGELOG.md", "LICENSE", "Makefile", "docs/scenarios.md",
+            "requirements.lock", "tests/integration/test_wheel.py"} <= names  # fmt: skip
+    assert not [name for name in names if name.startswith((".venv", "runs", ".ci"))]
+
+
+def test_what_is_installed_runs_without_the_repository(noack: Installed) -> None:
+    assert noack("--version").stdout.startswith("noack ")
+    assert noack.json("check", "lane_following")["name"] == "lane_following"
+    short = ("--set", "horizon_s=0.5", "--no-report")
+    assert noack.json("simulate", "unstable_pendulum", *short)["exit"]["status"] == 0
+    run = noack.json("demo", *EPHEMERAL, *short)
+    assert run["exit"]["status"] == 0
+    assert run["replay"]["bit_exact"]
+    assert noack.json("report")["report"].endswith("report.html")
+    assert noack("netem", "--explain", "loss", "5%").returncode == 0
+
+
+def test_the_doctor_says_what_is_missing(noack: Installed) -> None:
+    done = noack("doctor", *EPHEMERAL, "--seconds", "0.1", "--json")
+    said = json.loads(done.stdout)
+    assert said["measured"]["extras"] == {"fmi": False, "vehicle": False, "cluster": False}
+    remedies = {one["remedy"] for one in said["findings"]}
+    assert {"`pip install 'noack[fmi]'`", "`pip install 'noack[vehicle]'`"} <= remedies
+
+
+@pytest.mark.parametrize(("command", "extra"), [
+    (("check", "lane_vehicle"), "vehicle"),
+    (("campaign", "mb_vs_zoh", "--scheduler", "tcp://127.0.0.1:9"), "cluster"),
+])  # fmt: skip
+def test_what_an_extra_brings_names_it_where_it_is_missing(
+    noack: Installed, command: tuple[str, ...], extra: str
+) -> None:
+    done = noack(*command)
+    assert done.returncode == 2
+    assert f"pip install 'noack[{extra}]'" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
