@@ -14,30 +14,20 @@ author = "the noack authors"
 version = release = version_of("noack")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "reference_pages"]
-exclude_patterns = ["examples/*.py"]
 
 # Sections are linked to by the names that GitHub gives them, so that links work there as well.
 myst_heading_anchors = 4
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
-autoclass_content = "class"
-autodoc_class_signature = "separated"
 
 html_theme = "furo"
 html_title = "noack"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_extra_path = [
-    "scenario.schema.json",
-    "campaign.schema.json",
-    "netem.schema.json",
-]
 html_copy_source = False
 html_show_sourcelink = False
 html_show_copyright = False
-html_theme_options = {"footer_icons": []}
-pygments_style = "friendly"
 # Words of shell sessions and of files are no smart punctuation.
 smartquotes = False
 
