@@ -133,7 +133,7 @@ schema: setup ## Write the JSON Schemas of scenario, campaign and links files to
 	$(BIN)/noack schema --netem > docs/netem.schema.json
 
 docs: setup-dev ## Build the documentation site into site/; a warning is an error
-	$(BIN)/sphinx-build -b html -W --keep-going --jobs auto --quiet docs site
+	$(BIN)/sphinx-build -b html -E -W --keep-going --jobs auto --quiet docs site
 	@echo site/index.html
 
 docs-serve: docs ## Build it, and serve it on http://127.0.0.1:8000
