@@ -2,14 +2,12 @@
 
 import json
 import os
-import pty
 import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +17,8 @@ _PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 _ROUNDING_S = 0.05
 """A progress line shows tenths of a second."""
 
+PLAIN_TERMINAL = {"FORCE_COLOR": "1", "TERM": "dumb"}
+"""Has a pipe taken for a terminal that cannot redraw a line; into others goes no progress."""
 FREE_PORTS = tuple(
     argument
     for role in ("plant", "sensor", "netem", "controller")
@@ -53,31 +53,22 @@ class NoackRun(NamedTuple):
 def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
     """Run a program to its end, noting when each line of its standard error came.
 
-    That is a terminal which cannot redraw a line: noack shows its progress on terminals only.
-
     Raises:
         MeasurementError: it failed.
     """
     with tempfile.TemporaryFile("w+") as stdout:
-        reading, writing = pty.openpty()
         begun_s = time.monotonic()
         with subprocess.Popen(
-            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=writing,
-            env=os.environ | {"TERM": "dumb"},
+            command, cwd=cwd, stdin=subprocess.DEVNULL, stdout=stdout, stderr=subprocess.PIPE,
+            text=True, env=os.environ | PLAIN_TERMINAL,
         ) as process:  # fmt: skip
-            os.close(writing)
-            lines = list(_lines(reading))
+            assert process.stderr is not None
+            lines = [Line(time.monotonic(), text.rstrip()) for text in process.stderr]
         stdout.seek(0)
         if process.returncode != 0:
             said = lines[-1].text if lines else "nothing"
             raise MeasurementError(f"{command[0]} ended with {process.returncode}, said {said!r}")
         return Finished(begun_s, lines, stdout.read())
-
-
-def _lines(terminal: int) -> Iterator[Line]:
-    with os.fdopen(terminal, encoding="utf-8", errors="replace") as said, suppress(OSError):
-        for text in said:  # and an error, when the last who could write has gone
-            yield Line(time.monotonic(), text.rstrip())
 
 
 def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:

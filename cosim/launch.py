@@ -348,7 +348,10 @@ def longest_s(run_s: float) -> float:
 def _overdue(coordinator: Coordinator) -> str:
     if coordinator.epoch_ns is None:
         return f"{', '.join(coordinator.missing())} did not come to the start"
-    return "the run did not end at its horizon"
+    here = [role for role in ROLES if not coordinator.finished(role)]
+    # The recorder stays until the last of the others has left.
+    held = [role for role in here if role != RECORDER] or here
+    return f"the run did not end at its horizon: no end came from {', '.join(held)}"
 
 
 def _end(child: subprocess.Popen[str]) -> None:

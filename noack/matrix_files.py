@@ -93,10 +93,11 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
         found[key] = _matrix(file, name, arrays[name])
     if GAIN in names and names[GAIN] not in arrays:
         file.wrong(_missing(names[GAIN], arrays))
-    for name in (names[GAIN],) if GAIN in names else _GAINS:
-        if name in arrays:
-            found[GAIN] = _matrix(file, name, arrays[name])
-            break
+    gains = [name for name in (_GAINS if GAIN not in names else (names[GAIN],)) if name in arrays]
+    if len(gains) > 1:
+        file.wrong(f'has {" and ".join(gains)}; say which by names = {{ gain = "…" }}')
+    for name in gains:
+        found[GAIN] = _matrix(file, name, arrays[name])
     C, D, dt = (arrays.get(key) for key in ("C", "D", "dt"))
     if (why := unfit(C, D, dt, len(found["A"]))) is not None:
         file.wrong(why)
@@ -198,4 +199,5 @@ def _matrix(file: NamedFile, name: str, value: Any) -> Matrix:
 
 def _missing(name: str, arrays: Mapping[str, Any]) -> str:
     listed = ", ".join(list(arrays)[:10]) or "none"
-    return f"has no matrix {name} of at most {MAX_DIMENSION} x {MAX_DIMENSION}; it has {listed}"
+    most = f"{MAX_DIMENSION} x {MAX_DIMENSION}"
+    return f"has no matrix {name} of numbers, at most {most}; it has {listed}"

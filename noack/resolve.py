@@ -185,7 +185,11 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
         except ValueError:  # scipy's word for an exponential of infinite entries
             finite = False
     if not finite:
-        raise CallerError(f"{key}: these matrices take one step to infinity; check their size")
+        sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
+        raise CallerError(
+            f"{key}: these matrices take one step to infinity, with entries of {sizes}; "
+            "check their units"
+        )
 
 
 def _explicit_model(model: Model) -> Model:

@@ -92,8 +92,8 @@ def _patient(stream: Any) -> Any:
         io.BufferedWriter(_Patient(stream.fileno(), "w", closefd=False)),
         encoding=stream.encoding,
         errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
+        # PYTHONUNBUFFERED asks for more; a line is what somebody waits for.
+        line_buffering=stream.line_buffering or stream.write_through,
     )
 
 

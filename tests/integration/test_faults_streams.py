@@ -31,6 +31,8 @@ from tests.integration.conftest import (
 HORIZON_S = 8.0
 SHORT = [*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S)]
 F_SETPIPE_SZ = 1031
+AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
+"""That cannot redraw a line: progress comes in lines, through a pipe, too."""
 EVENTS, VOID = " s  events ", "claims that this touches are void from "
 
 
@@ -58,7 +60,9 @@ def test_a_full_pipe_holds_up_the_launcher_and_not_the_loop(tmp_path: Path) -> N
     reading, writing = os.pipe()
     room = fcntl.fcntl(writing, F_SETPIPE_SZ, 4096)
     os.write(writing, b"x" * (room - 10))
-    process = subprocess.Popen(run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing)
+    process = subprocess.Popen(
+        run(tmp_path), stdout=subprocess.DEVNULL, stderr=writing, env=AS_A_TERMINAL
+    )
     os.close(writing)
     try:
         latest = tmp_path / "latest"
@@ -85,7 +89,7 @@ def unheard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run; who read its progress left at the first line."""
     runs = tmp_path_factory.mktemp("runs")
     with subprocess.Popen(
-        run(runs), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+        run(runs), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=AS_A_TERMINAL
     ) as process:
         assert process.stderr is not None
         assert process.stderr.readline()

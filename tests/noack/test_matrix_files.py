@@ -93,8 +93,8 @@ def test_a_sparse_matrix_and_whole_numbers_are_matrices(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arrays", "expected"),
     [
-        ({"A": A}, "has no matrix B of at most 64 x 64; it has A"),
-        ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of at most 64 x 64"),
+        ({"A": A}, "has no matrix B of numbers, at most 64 x 64; it has A"),
+        ({"A": np.zeros((65, 65)), "B": B}, "has no matrix A of numbers, at most 64 x 64"),
         ({"A": A, "B": B, "K": K, "dt": 0.01}, "dt is 0.01, so it is a system in discrete time"),
         ({"A": A, "B": B, "K": K, "C": np.eye(2)[:1]}, "C is not the identity"),
         ({"A": A, "B": B, "K": K, "C": 2 * np.eye(2)}, "C is not the identity"),
@@ -102,6 +102,7 @@ def test_a_sparse_matrix_and_whole_numbers_are_matrices(tmp_path: Path) -> None:
         ({"A": A * 1j, "B": B}, "A is not of real numbers"),
         ({"A": A, "B": B + np.inf}, "B has entries that are not finite"),
         ({"A": A, "B": B}, "gain: give a model by name"),
+        ({"A": A, "B": B, "gain": K, "K": 2 * K}, "has gain and K; say which by names = { gain"),
         ({"A": A, "B": B, "K": K.T}, "gain = [[-8.0], [-4.0]]: expected 1 x 2"),
         ({"A": A, "B": np.zeros((3, 1)), "K": K}, "B = [[0.0], [0.0], [0.0]]: expected 2 x 1"),
     ],
@@ -125,7 +126,7 @@ def test_a_file_that_is_no_such_system_is_refused_in_one_line(
         ('file = "bad.npz"', "is no .npz file, or a damaged one"),
         ('file = "bad.mat"', "is no .mat file, or a damaged one"),
         ('file = "hdf.mat"', "is of MATLAB's v7.3, which is HDF5; save it as v7"),
-        ('file = "pickled.npz"', "has no matrix A of at most 64 x 64; it has B"),
+        ('file = "pickled.npz"', "has no matrix A of numbers, at most 64 x 64; it has B"),
         ('file = "flat.npz"', "B has 2 entries; a matrix is needed, with rows and columns"),
         ('file = "m.npz"\nA = [[1.0]]', "the file has A, and so has the scenario"),
         ('file = "m.npz"\nnames = { gain = "G" }', "has no matrix G"),

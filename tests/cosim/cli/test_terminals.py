@@ -93,3 +93,14 @@ def test_the_exit_status_is_the_commands_whoever_reads(tmp_path: Path) -> None:
     )
     os.close(writing)
     assert done.returncode == 2
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_what_is_said_is_heard_at_once(unbuffered: str, tmp_path: Path) -> None:
+    command = [*NOACK, "plant", "--session", "nobodys"]
+    more = environment(PYTHONUNBUFFERED=unbuffered, XDG_RUNTIME_DIR=str(tmp_path))
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=more) as process:
+        assert process.stderr is not None
+        assert "waiting for" in process.stderr.readline()
+        process.terminate()
+        assert process.wait(PATIENCE_S) == 143

@@ -1,6 +1,8 @@
 """From numbers to verdicts, without a machine."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -102,6 +104,15 @@ def test_wake_ups_that_nobody_could_watch_are_not_called_good() -> None:
     assert about("wake-ups with what was granted", realtime="it timed out").verdict is (
         Verdict.LIMITED
     )
+
+
+def test_every_finding_is_documented() -> None:
+    text = (Path(__file__).parents[3] / "docs/command-line.md").read_text()
+    rows = re.findall(r"^\| `([^`]+)` \|", text.partition("| finding |")[2], re.MULTILINE)
+    named = [row.removesuffix(" ...").removesuffix(" of").removesuffix(":") for row in rows]
+    found = {one.what for one in judge(IDEAL, WANTED)}
+    assert all(any(what.startswith(name) for name in named) for what in found)
+    assert all(any(what.startswith(name) for what in found) for name in named)
 
 
 def test_quantiles_of_lateness_are_of_the_sample() -> None:

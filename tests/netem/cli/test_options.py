@@ -1,5 +1,6 @@
 """From a command line to links, and what is told of mistakes."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -170,7 +171,7 @@ def test_a_mistake_ends_the_program(
 ) -> None:
     assert main(arguments) == 2
     out, err = capsys.readouterr()
-    assert out == ""
+    assert ("error" in json.loads(out)) if "--json" in arguments else out == ""
     assert err.startswith(says)
     assert err.count("\n") == 1
 
