@@ -33,7 +33,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
-    "docs/library.md", "docs/command-line.md", "docs/howto.md",
+    "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
+    "docs/benchmarks.md",
 )  # fmt: skip
 
 
