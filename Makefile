@@ -91,7 +91,7 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
-.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema lock dist clean
+.PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
 setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
@@ -132,11 +132,18 @@ schema: setup ## Write the JSON Schemas of scenario, campaign and links files to
 	$(BIN)/noack schema --campaign > docs/campaign.schema.json
 	$(BIN)/noack schema --netem > docs/netem.schema.json
 
+docs: setup-dev ## Build the documentation site into site/; a warning is an error
+	$(BIN)/sphinx-build -b html -E -W --keep-going --jobs auto --quiet docs site
+	@echo site/index.html
+
+docs-serve: docs ## Build it, and serve it on http://127.0.0.1:8000
+	$(BIN)/python -m http.server --bind 127.0.0.1 --directory site 8000
+
 lock: setup-dev ## Pin the dependencies anew
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra vehicle --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
-		--no-header pyproject.toml --group build --group dev -c requirements.lock -o requirements-dev.lock
+		--no-header pyproject.toml --group build --group dev --group docs -c requirements.lock -o requirements-dev.lock
 
 dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	@rm -rf dist
@@ -144,7 +151,7 @@ dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	@ls dist/*
 
 clean: ## Remove the environment and caches; keep runs/
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 
 $(VENV)/bin/python:
 	@test -n "$(PYTHON)" || { echo "noack needs Python >= 3.11; none found (set PYTHON=...)" >&2; exit 2; }

@@ -33,7 +33,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = (
     "README.md", "docs/record.md", "docs/scenarios.md", "docs/paper.md", "docs/netem.md",
     "docs/netem-programs.md", "docs/campaigns.md", "docs/design.md", "docs/plants.md",
-    "docs/library.md", "docs/command-line.md",
+    "docs/library.md", "docs/command-line.md", "docs/howto.md", "docs/guarantees.md",
+    "docs/benchmarks.md",
 )  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def commands() -> Iterator[str]:
     for page in PAGES:
         for block in blocks(page, "sh"):
             lines = (line.partition("#")[0].strip() for line in block.splitlines())
-            yield from filter(None, lines)
+            yield from (line.removeprefix(".venv/bin/") for line in filter(None, lines))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def test_every_command_works(command: str, run_folder: Path) -> None:
 
 def snippets() -> list[str]:
     """Programs; what begins with its own file's name is a file."""
-    pages = ("docs/plants.md", "docs/record.md", "docs/library.md")
+    pages = ("docs/plants.md", "docs/record.md", "docs/library.md", "docs/howto.md")
     found = [code for page in pages for code in blocks(page, "python")]
     return [snippet for snippet in found if not snippet.startswith("#")]
 
@@ -261,12 +262,21 @@ def test_the_exported_schema_is_the_codes() -> None:
     assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema()
 
 
+def test_the_network_of_the_how_to_page_is_one(tmp_path: Path) -> None:
+    (network,) = blocks("docs/howto.md", "toml")
+    text = (ROOT / "scenarios/unstable_pendulum.toml").read_text()
+    path = tmp_path / "pendulum.toml"
+    path.write_text(re.sub(r"^\[network\]\n.*?\n\n", network + "\n", text, flags=re.DOTALL | re.M))
+    assert [one.kind for one in load(path).network.impairments] == ["delay", "rate"]
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "scenarios").glob("*.toml")), ids=lambda p: p.stem)
 def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> None:
     assert load(path).name == path.stem
 
 
 def test_links_lead_somewhere() -> None:
-    for page in (*PAGES, "ARCHITECTURE.md", "docs/theory.md", "docs/wire.md", "docs/mansd.md"):
-        for target in re.findall(r"\]\(([^)#:]+)\)", (ROOT / page).read_text()):
-            assert (ROOT / page).parent.joinpath(target).exists(), f"{page}: {target}"
+    pages = [*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")]
+    for page in set(pages):
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert page.parent.joinpath(target).exists(), f"{page.name}: {target}"

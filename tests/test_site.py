@@ -1,0 +1,52 @@
+"""The documentation site is built as `make docs` builds it: a warning is an error."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from cosim.cli import app
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet",
+         "-d", folder / "trees", ROOT / "docs", folder / "html"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder / "html"
+
+
+def test_every_page_is_there(site: Path) -> None:
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    assert pages <= {path.stem for path in site.glob("*.html")}
+
+
+def test_every_command_is_on_its_page(site: Path) -> None:
+    text = (site / "commands.html").read_text()
+    for name in get_command(app).commands:  # type: ignore[attr-defined]
+        assert f'id="noack-{name}"' in text
+
+
+def test_every_public_name_of_the_library_is_on_its_page(site: Path) -> None:
+    import noack
+
+    text = (site / "api.html").read_text()
+    for name in set(noack.__all__) - {"__version__"}:
+        assert f'id="noack.{name}"' in text
+
+
+def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
+    for page in site.glob("*.html"):
+        loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", page.read_text())
+        assert not [tag for tag in loaded if re.search(r'(?:src|href)="(?:https?:)?//', tag)]
+    for style in site.rglob("*.css"):
+        assert not re.search(r"(?:@import|url\()\s*['\"]?(?:https?:)?//", style.read_text())

@@ -1,0 +1,128 @@
+"""The tutorial is gone through: its files written, its commands run, what it shows compared."""
+
+import json
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+NUMBER = re.compile(r"-?\d[\d,.]*(?:e[-+]?\d+)?")
+
+
+class Step(NamedTuple):
+    """A command of the tutorial, and lines that it shows of the output."""
+
+    command: str
+    shown: list[str]
+
+
+def fences() -> list[tuple[str, str]]:
+    return FENCE.findall((ROOT / "docs/tutorial.md").read_text())
+
+
+def steps() -> Iterator[Step]:
+    step = None
+    for language, text in fences():
+        if language == "sh":
+            (command,) = text.splitlines()
+            step = Step(command, [])
+            yield step
+        elif language == "text" and step is not None:
+            step.shown.extend(text.splitlines())
+
+
+def steps_of(program: str, *commands: str) -> list[Step]:
+    words = [(step, shlex.split(step.command)) for step in list(steps())]
+    return [step for step, (first, second, *_) in words if first == program and second in commands]
+
+
+def noack(step: Step) -> list[str]:
+    return [sys.executable, "-m", "cosim.cli", *shlex.split(step.command)[1:]]
+
+
+def shape(line: str) -> str:
+    """The line without its numbers, and without spaces: how wide a column is depends on them."""
+    return "".join(NUMBER.sub("0", line).split())
+
+
+def numbers(line: str) -> list[float]:
+    return [float(found[0].strip(".").replace(",", "")) for found in NUMBER.finditer(line)]
+
+
+def alike(line: str, other: str) -> bool:
+    """Whether a page may show one for the other: to 2 %, or both are rounding."""
+    return shape(line) == shape(other) and numbers(line) == pytest.approx(
+        numbers(other), rel=0.02, abs=1e-12
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for language, text in fences():
+        if language == "toml" and (named := re.match(r"# (\w+\.toml)\n", text)):
+            (tmp_path / named[1]).write_text(text)
+    return tmp_path
+
+
+STILL = steps_of("noack", "check", "simulate", "certify")
+MAKE = [step for step in steps() if step.command.startswith("make ")]
+LIVE = steps_of("noack", "run", "set")
+
+
+def test_every_step_is_gone_through() -> None:
+    assert [step.command for step in steps()] == [step.command for step in [*MAKE, *STILL, *LIVE]]
+
+
+@pytest.mark.parametrize("step", MAKE, ids=lambda step: step.command)
+def test_its_targets_exist(step: Step) -> None:
+    done = subprocess.run(
+        ["make", "--dry-run", *step.command.split()[1:]], cwd=ROOT, capture_output=True, check=False
+    )
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("step", STILL, ids=lambda step: step.command)
+def test_its_commands_show_what_it_shows(step: Step, folder: Path) -> None:
+    done = subprocess.run(noack(step), cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    output = (done.stdout + done.stderr).splitlines()
+    for line in filter("...".__ne__, step.shown):
+        assert any(alike(line, said) for said in output), line
+
+
+def test_its_knob_can_be_turned(folder: Path) -> None:
+    """The run of one terminal is changed from another, and ended as by Ctrl-C."""
+    run, turn = LIVE
+    with subprocess.Popen(
+        noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            while process.poll() is None:
+                if not (folder / "runs/latest/spool").exists():
+                    time.sleep(0.1)
+                    continue
+                done = subprocess.run(
+                    [*noack(turn), "--run", "runs/latest"],
+                    cwd=folder, capture_output=True, text=True, check=False,
+                )  # fmt: skip
+                if done.returncode == 0:
+                    break
+        finally:
+            process.send_signal(signal.SIGINT)
+            _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    assert [shape(line) for line in turn.shown] == [
+        shape(line) for line in done.stdout.splitlines()
+    ]
+    summary = json.loads((folder / "runs/latest/summary.json").read_text())
+    (change,) = summary["changes"]
+    assert change["settings"] == {"network.loss.probability": 0.9}

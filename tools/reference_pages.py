@@ -1,0 +1,138 @@
+"""Pages of the documentation that are made of the program itself, so that they cannot be stale.
+
+A Sphinx extension: where a page says ``<!-- made: NAME -->`` stands what is made of that name.
+"""
+
+import contextlib
+import io
+import os
+import re
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from rich.text import Text
+from typer.main import get_command
+
+from cosim.cli import app
+from netem.__main__ import main as netem_main
+
+ROOT = Path(__file__).parents[1]
+_MARK = re.compile(r"^<!-- made: ([a-z_ ]+) -->$", re.MULTILINE)
+
+
+def commands() -> str:
+    """Return every command with its options and examples, under the panels of its help."""
+    program: Any = get_command(app)
+    context = program.context_class(program, info_name="noack")
+    pages: dict[str, list[str]] = {}
+    for name in program.list_commands(context):
+        command = program.get_command(context, name)
+        if not command.hidden:
+            pages.setdefault(command.rich_help_panel, []).append(_command(name, command, context))
+    return "\n".join("\n".join([f"## {panel}\n", *made]) for panel, made in pages.items())
+
+
+def _command(name: str, command: Any, parent: Any) -> str:
+    context = command.context_class(command, info_name=name, parent=parent)
+    lines = [f"### noack {name}", "", _plain(command.help), ""]
+    if name == "netem":
+        return "\n".join([*lines, "```text", _netem_help(), "```", ""])
+    usage = " ".join(["noack", name, *command.collect_usage_pieces(context)])
+    records = [parameter.get_help_record(context) for parameter in command.params]
+    rows = [(what, _meaning(meaning)) for what, meaning in filter(None, records)]
+    lines += ["```text", usage.replace("{", "").replace("}", ""), "```", ""]
+    if rows:
+        lines += ["| | |", "|---|---|"]
+        lines += [
+            f"| `{_cell(what)}` | {_cell(meaning).replace('<', '&lt;')} |" for what, meaning in rows
+        ]
+    if command.epilog:
+        lines += ["", "```text", _examples(command.epilog), "```"]
+    return "\n".join([*lines, ""])
+
+
+def _plain(markup: str | None) -> str:
+    return Text.from_markup((markup or "").replace("\b", "")).plain.strip()
+
+
+def _meaning(record: str) -> str:
+    """Return an option's help, and what the help says in brackets after it: default, required."""
+    text, gap, more = record.rpartition("  [")
+    return f"{_plain(text)} ({more.removesuffix(']')})" if gap else _plain(record)
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _examples(epilog: str) -> str:
+    lines = _plain(epilog).splitlines()
+    if lines and lines[0].strip() == "Examples":
+        del lines[0]
+    return "\n".join(line.removeprefix("  ") for line in lines)
+
+
+def _netem_help() -> str:
+    said = io.StringIO()
+    columns = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "100"
+    try:
+        with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+            netem_main(["--help"])
+    finally:
+        os.environ.pop("COLUMNS")
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
+    return said.getvalue().strip()
+
+
+def shipped(folder: str) -> str:
+    """Return every file of ``scenarios`` or ``campaigns``: what it says of itself, and its text."""
+    return "\n".join(_shipped(folder))
+
+
+def _shipped(folder: str) -> Iterator[str]:
+    for path in sorted((ROOT / folder).glob("*.toml")):
+        text = path.read_text(encoding="utf-8")
+        lines = text.splitlines()
+        body = "\n".join(line for line in lines if not line.startswith("#:schema"))
+        yield f"## {path.stem}\n\n{tomllib.loads(text).get('description', '')}\n"
+        yield f"```toml\n{body}\n```\n"
+
+
+def example(name: str) -> str:
+    """Return a program in cells, of ``docs/examples``, as a page of prose and code."""
+    text = (ROOT / f"docs/examples/{name}.py").read_text(encoding="utf-8")
+    cells = (cell.partition("\n") for cell in f"\n{text}".split("\n# %%")[1:])
+    return "\n\n".join(
+        "\n".join(line.removeprefix("#").removeprefix(" ") for line in body.strip().splitlines())
+        if kind == " [markdown]"
+        else f"```python\n{body.strip()}\n```"
+        for kind, _, body in cells
+    )
+
+
+MADE: dict[str, Callable[[], str]] = {
+    "commands": commands,
+    "scenarios": lambda: shipped("scenarios"),
+    "campaigns": lambda: shipped("campaigns"),
+    "example own_plant": lambda: example("own_plant"),
+    "example model_or_hold": lambda: example("model_or_hold"),
+}
+
+
+def fill_in(page: str) -> str:
+    """Return a page with what is made in the place of its marks."""
+    return _MARK.sub(lambda mark: MADE[mark[1]](), page)
+
+
+def setup(sphinx: Any) -> dict[str, bool]:
+    """Have Sphinx fill in every page that it reads."""
+
+    def on_read(_sphinx: Any, _name: str, source: list[str]) -> None:
+        source[0] = fill_in(source[0])
+
+    sphinx.connect("source-read", on_read)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
