@@ -66,7 +66,7 @@ def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
 def said(found: Linearisation) -> tuple[tuple[str, str], ...]:
     """A linearisation as a person reads it: quantities and their values."""
     if found["A"] is None:
-        return (("the plant, linearised", "its x does not tell what follows"),)
+        return (("the plant, linearised", "none: x does not tell what follows, or not smoothly"),)
     slowest = max(real for real, _ in found["eigenvalues"])
     worst, where = max(_entries("A", found["off_A"]) + _entries("B", found["off_B"]))
     box = {True: ", inside the box", False: ", outside the box", None: ""}[found["in_box"]]

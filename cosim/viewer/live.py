@@ -19,6 +19,7 @@ from types import FrameType
 from cosim.viewer.server import RecordingServer, end_process
 from noack.errors import CallerError, ExitStatus, MachineError
 
+_MAGIC = b"RRF"
 _PATIENCE_S = 5.0
 _WINDOW = "window"
 
@@ -119,12 +120,15 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
             (None); where no window can be opened after all, a browser is served.
 
     Raises:
-        CallerError: there is no such file.
+        CallerError: there is no such file, or it is no recording.
         MachineError: the viewer cannot be started.
         SystemExit: by SIGTERM or SIGHUP.
     """
     if not path.is_file():
         raise CallerError(f"{path}: no such recording")
+    with path.open("rb") as file:
+        if not file.read(len(_MAGIC)).startswith(_MAGIC):
+            raise CallerError(f"{path}: is no rerun recording, or holds nothing")
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _exit)
     with contextlib.suppress(KeyboardInterrupt), RecordingServer(path, follow=False) as server:

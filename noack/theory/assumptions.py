@@ -68,7 +68,7 @@ def _not_linear(loop: Loop, resolved: Scenario) -> list[Assumption]:
     return [
         Assumption(
             "the plant is ẋ = Ax + Bu", "eq:plant", Verdict.VIOLATED,
-            f'it is a "{resolved.plant.system.kind}": the theorems and the certificates say '
+            f'it is of kind "{resolved.plant.system.kind}": the theorems and the certificates say '
             "nothing of it",
         ),
         Assumption(

@@ -10,6 +10,7 @@ import difflib
 import io
 import os
 import weakref
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -240,6 +241,9 @@ class _Variables:
     def real(self, key: str, names: Sequence[str]) -> list[Any]:
         """Real scalars."""
         found = [self._named(key, name) for name in names]
+        twice = next((name for name, count in Counter(names).items() if count > 1), None)
+        if twice is not None:
+            raise CallerError(f'plant.system.{key}: "{twice}" stands there twice')
         for one in found:
             if one.type not in _REAL:
                 _refuse(key, one, f"is of type {one.type}; real numbers are needed")
@@ -261,6 +265,8 @@ class _Variables:
             kinds, needed = (int,), "a whole number"
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             _refuse("parameters", one, f"is of type {one.type}; give {needed}, not {value!r}")
+        if one.causality == "input":
+            _refuse("parameters", one, "is an input; its value at rest is operating_input")
         if not _settable(one):
             _refuse("parameters", one, "cannot be set at the start")
         return one, value

@@ -161,6 +161,8 @@ def test_a_warning_is_no_failure_and_noise_is_not_heard(
         ({"parameters": {"fail_status": 1.5}}, "give a whole number, not 1.5"),
         ({"parameters": {"name": 1}}, "give a text, not 1"),
         ({"parameters": {"energy": 1.0}}, '"energy" cannot be set at the start'),
+        ({"parameters": {"u": 1.0}}, '"u" is an input; its value at rest is operating_input'),
+        ({"state_variables": ("x0", "x0")}, 'state_variables: "x0" stands there twice'),
         ({"on_record": ("heat",)}, 'plant.system.on_record: the FMU has no variable "heat"'),
         ({"initial_variables": ()}, "but the FMU begins at [0.0, 0.0]"),
     ],

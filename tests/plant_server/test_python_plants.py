@@ -270,3 +270,16 @@ def test_what_is_no_derivative_is_refused(returned: str, expected: str, tmp_path
     with pytest.raises(SystemFailedError) as failed:
         follow(system, 20)
     assert expected in str(failed.value)
+
+
+def test_a_derivative_cannot_write_into_what_it_is_given(tmp_path: Path) -> None:
+    code = """
+        class P:
+            def derivative(self, t_s, z, u):
+                if t_s > 0.0201:
+                    z[0] = 7.0
+                return 0 * z
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError, match="read-only"):
+        follow(system, 20)

@@ -618,6 +618,14 @@ def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> N
         view_recording(tmp_path / "run" / "recording.rrd")
 
 
+@pytest.mark.parametrize("content", [b"", b"<html>"])
+def test_what_is_no_recording_is_not_served(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(content)
+    with pytest.raises(CallerError, match=r"recording\.rrd: is no rerun recording"):
+        view_recording(path)
+
+
 @pytest.mark.parametrize(
     ("sent", "status"),
     [
