@@ -197,12 +197,34 @@ def print_study(console: Console, found: Study) -> None:
     _print_assumptions(console, [a._asdict() for a in certificate.assumptions])
     console.print("assumptions of the paper's theorems:")
     _print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
+    for sentence in in_words(found):
+        console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
         rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
         console.print(
             f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
+
+
+def in_words(found: Study) -> Iterator[str]:
+    """What is certified under the scenario's own schedule, in sentences."""
+    for under, certificate in found.certificates:
+        constants, dropouts = certificate.constants, certificate.conditions.dropouts
+        if under != SCHEDULE or constants is None:
+            continue
+        plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
+        decay = f" e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
+        late = ""
+        if (floor := certificate.floor_constants) is not None:
+            late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
+        apart = ""
+        if (spacing_s := certificate.inter_event_s) is not None:
+            apart = f" No two transmissions are closer than {_limit(spacing_s)}."
+        yield (
+            f"In words: of {plants}, whichever updates are lost, at most {dropouts} in a "
+            f"row: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+        )
 
 
 def _print_constants(console: Console, found: Study) -> None:

@@ -133,6 +133,7 @@ class _Shown(_Part):
     deliveries: Number
     drops: Number
     drops_by_cause: Counts | None = None
+    loss_expected: float | None = None
     forced_deliveries: Number
     longest_drop_run: Number
     assumption_violations: list[_Violation]

@@ -14,6 +14,7 @@ from cosim.crossing import Crossing, crossing
 from cosim.estimation import disturbance_summary, estimation_summary, true_states
 from cosim.join import Joined, identity_residual, join_all
 from cosim.record import Life, Rows, RunRecord
+from netem.predict import predicted_loss
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
 from noack.io.node import HORIZON
@@ -83,6 +84,7 @@ def _summarise(
         "events": len(events),
         "deliveries": len(record[CONTROLLER_DELIVERY]),
         "drops": int(crossed.lost.sum()),
+        "loss_expected": None if scenario.changes else predicted_loss(scenario.network.link),
         "drops_by_cause": _causes(crossed),
         "forced_deliveries": int((crossed.rows["fate"] == Fate.FORCED).sum()),
         "longest_drop_run": max(

@@ -83,6 +83,7 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
         ("deliveries", str(deliveries)),
         ("  of these forced (t_0 or cap)", str(summary["forced_deliveries"])),
         ("lost in the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
+        *_expected(summary.get("loss_expected"), summary["mansd"]),
         *_causes(summary),
         *_acknowledgements(summary.get("acknowledgements")),
         ("longest drop run", f"{summary['longest_drop_run']} (at most {summary['mansd']})"),
@@ -169,6 +170,11 @@ def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
         )
 
 
+def _expected(rate: float | None, mansd: int) -> Iterator[tuple[str, str]]:
+    if rate is not None:
+        yield f"  in the long run, at most {mansd} in a row", f"{100 * rate:.3g} %"
+
+
 def _disturbances(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
     for one in found or ():
         what = f"disturbance at the {one['at']}, RMS, largest"
@@ -201,6 +207,8 @@ def print_claims(console: Console, summary: Summary) -> None:
             f"[{colour}]{claim['verdict']}{since}[/]",
         )
     console.print(table)
+    if any(claim["ratio"] is not None for claim in claims):
+        console.print("[dim]used: how near the run came to the bound, at its nearest[/]")
     for verdict, why in dict.fromkeys((c["verdict"], c["why"]) for c in claims):
         if verdict != "held" and why:
             console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",

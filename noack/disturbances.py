@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Discriminator, Field, FiniteFloat, model_validator
 
 from noack.linear import Vector
-from noack.matrices import Row, require_length, require_non_negative
+from noack.matrices import Row, require_length, require_squares
 from noack.section import NonNegative, Positive, Section
 
 Place = Literal["input", "state"]
@@ -41,7 +41,7 @@ class Uniform(_Disturbance):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_non_negative(self.bound, "bound", "bounds")
+        require_squares(self.bound, "bound", "bounds")
         return self
 
     @property
@@ -67,7 +67,7 @@ class Gaussian(_Disturbance):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_non_negative(self.std, "std", "standard deviations")
+        require_squares(self.std, "std", "standard deviations")
         return self
 
     @property

@@ -57,9 +57,18 @@ def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-wid
     """Check half-widths, or what else.
 
     Raises:
-        ValueError: one is negative, or so large that its square is beyond floating point.
+        ValueError: one is negative.
     """
     if any(entry < 0 for entry in row):
         raise ValueError(f"{key}: {what} cannot be negative")
+
+
+def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
+    """Check what is squared: standard deviations, or bounds of noise.
+
+    Raises:
+        ValueError: one is negative, or its square is beyond floating point.
+    """
+    require_non_negative(row, key, what)
     if any(entry > _LARGEST for entry in row):
         raise ValueError(f"{key}: {what} can be {_LARGEST:g} at most")

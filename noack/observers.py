@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Discriminator, FiniteFloat, model_validator
 
 from noack.linear import Vector
-from noack.matrices import Row, Rows, require_length, require_non_negative, require_shape
+from noack.matrices import Row, Rows, require_length, require_shape, require_squares
 from noack.section import Section
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
@@ -24,8 +24,8 @@ class Measurement(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        require_non_negative(self.noise_std or (), "noise_std", "standard deviations")
-        require_non_negative(self.noise_bound or (), "noise_bound", "bounds")
+        require_squares(self.noise_std or (), "noise_std", "standard deviations")
+        require_squares(self.noise_bound or (), "noise_bound", "bounds")
         return self
 
     def outputs(self, n: int) -> int:
@@ -141,7 +141,7 @@ class Kalman(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         for key in ("process_std", "input_std", "noise_std", "initial_std"):
-            require_non_negative(getattr(self, key) or (), key, "standard deviations")
+            require_squares(getattr(self, key) or (), key, "standard deviations")
         for key, others in (("Q", ("process_std", "input_std")), ("R", ("noise_std",))):
             for other in others:
                 if getattr(self, key) is not None and getattr(self, other) is not None:

@@ -1,5 +1,6 @@
 """Scenario files: TOML in, frozen scenario out, and one clear line for every mistake."""
 
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -14,6 +15,10 @@ from noack.matrix_files import with_matrices
 from noack.scenario import Scenario
 from noack.sections.network import Acknowledgements, Network
 from noack.system_files import read_system
+
+_ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
+_ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
+"""Numbers or names in a row, which the TOML writer puts on a line each."""
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -83,7 +88,8 @@ def _read(section: Network | Acknowledgements, folder: Path, place: str) -> dict
 
 def dumps(scenario: Scenario) -> str:
     """Return the scenario as TOML that :func:`load` reads back to an equal scenario."""
-    return tomli_w.dumps(scenario.model_dump(mode="json", exclude_none=True), indent=2)
+    text = tomli_w.dumps(scenario.model_dump(mode="json", exclude_none=True), indent=2)
+    return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
 
 
 def json_schema() -> dict[str, Any]:

@@ -79,6 +79,8 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "found 1"),
         ({"noise_bound": [0.1, -0.1]}, None,
          "plant.measurement.noise_bound = [0.1, -0.1]: bounds cannot be negative"),
+        ({"noise_std": [0.1, 1e200]}, None,
+         "plant.measurement.noise_std = [0.1, 1e+200]: standard deviations can be 1e+100 at most"),
         (POSITION, {"kind": "luenberger"},
          "observer.gain: give either gain or poles_per_s"),
         (POSITION, {"kind": "luenberger", "gain": [[1.0, 0.0]]},
