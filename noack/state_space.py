@@ -127,7 +127,9 @@ def _matrix(name: str, value: Any) -> Matrix:
     except (TypeError, ValueError):
         raise CallerError(f"{name}: is not a matrix of real numbers") from None
     if found.ndim != 2 or not found.size or not np.isfinite(found).all():
-        raise CallerError(f"{name}: a matrix of finite numbers is needed, with rows and columns")
+        raise CallerError(
+            f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]"
+        )
     return found
 
 

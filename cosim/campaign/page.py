@@ -67,7 +67,8 @@ def verdict(summary: Summary) -> str:
     if summary.breaches:
         return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
     if not certified:
-        return f"{runs:,} runs; no bound is certified at any grid point."
+        why = "none is with a hold, a floor or another policy"
+        return f"{runs:,} runs; no bound is certified at any grid point ({why})."
     where = "all" if certified == len(summary.found) else f"{certified} of {len(summary.found)}"
     return f"{runs:,} runs; none exceeds the bound that is certified at {where} grid points."
 

@@ -354,19 +354,23 @@ class Claims:
                 left = (0.0, outside)
             constants, t_s, source = certificate.constants, self._t_s, certificate.source
             rate = f"e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
-            suffix = "" if certificate.floor_constants is None else ", and the floor's share"
+            late, then = certificate.floor_constants, f", from {certificate.floor_from_s:.4g} s on "
+            of_s, of_c, of_x = ("", "", "") if late is None else (
+                f"{then}{late.overshoot:.4g} ε", f"{then}{late.delta:.4g} ε",
+                f"{then}{late.state:.4g}",
+            )  # fmt: skip
             yield self._upper(
                 "the sensor's error follows its threshold", source,
-                f"‖e_s‖ ≤ {{:.4g}} {certificate.level}{suffix}", constants.overshoot,
+                f"‖e_s‖ ≤ {{:.4g}} {certificate.level}{of_s}", constants.overshoot,
                 t_s, self.joined.e_s_norm / certificate.sensor_error(t_s), left, "",
             )  # fmt: skip
             yield self._controller_error(
                 "the controller's error is bounded", source,
-                f"‖e_c‖ ≤ {{:.4g}} {certificate.level}{suffix}", constants.delta,
+                f"‖e_c‖ ≤ {{:.4g}} {certificate.level}{of_c}", constants.delta,
                 certificate.controller_error(t_s), left, "",
             )  # fmt: skip
             yield self._state(
-                source, f"‖x‖ ≤ {{:.4g}} {rate}{suffix}", constants.state,
+                source, f"‖x‖ ≤ {{:.4g}} {rate}".rstrip() + of_x, constants.state,
                 certificate.state(t_s), left, "",
             )  # fmt: skip
             if certificate.inter_event_s is not None:

@@ -73,7 +73,7 @@ def _not_linear(loop: Loop, resolved: Scenario) -> list[Assumption]:
         ),
         Assumption(
             "the gain stabilises the model", "Theorem 2", _verdict(nominal < 0),
-            f"largest real part {nominal:.3g} /s with Â + B̂K",
+            f"largest real part {nominal:.3g} /s with Â + B̂K{_other_sign(loop)}",
         ),
     ]  # fmt: skip
 
@@ -199,8 +199,17 @@ def _closed_loop(loop: Loop) -> Assumption:
         "the gain stabilises the plant and the model",
         "Theorem 2",
         _verdict(true < 0 and nominal < 0),
-        f"largest real part {true:.3g} /s with A + BK, {nominal:.3g} /s with Â + B̂K",
+        f"largest real part {true:.3g} /s with A + BK, {nominal:.3g} /s with Â + B̂K"
+        f"{_other_sign(loop)}",
     )
+
+
+def _other_sign(loop: Loop) -> str:
+    """A hint where K is the gain of u = −Kx, as most programs give it."""
+    given, other = (
+        spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0)
+    )
+    return "; the loop's u is +Kx, and −K would stabilise it" if other < 0 <= given else ""
 
 
 def _decay_rate(loop: Loop, alpha_per_s: float) -> Assumption:
