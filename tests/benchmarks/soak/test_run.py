@@ -45,7 +45,7 @@ def test_every_process_is_watched(result: Result) -> None:
 
 def test_a_real_run_breaks_nothing(result: Result) -> None:
     assert result.account["broken"] == 0, result.account["first_broken"]
-    assert result.account["rows"]["plant_step"] == 96 * 40 + 1
+    assert result.account["rows"]["plant_step"] == 96 * 20 + 1
     assert result.account["events"] > 100
     overtaken = result.account["overtaken"]
     assert ended_badly(result.summary, 0, result.account["rows"], overtaken) == []

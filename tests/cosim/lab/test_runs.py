@@ -2,6 +2,7 @@
 
 import gc
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -70,8 +71,9 @@ def test_a_live_run_that_is_interrupted_is_returned() -> None:
         "print(run.ok, run.reason, run.table('plant_step').num_rows > 100)"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"},  # a pipe is told no progress
+    ) as process:  # fmt: skip
         assert process.stderr is not None
         assert any("/10 s" in line for line in process.stderr)
         process.send_signal(signal.SIGINT)
