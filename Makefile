@@ -99,7 +99,7 @@ setup-dev: $(VENV)/.installed-dev
 test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest's, e.g. ARGS="-k mansd")
 
 pytest: setup-dev
-	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=4 --dist=loadfile)
+	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile)
 
 fuzz: setup-dev ## Fuzz every parser, MINUTES=10 in all; exit status 1 if something is found
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)

@@ -256,4 +256,6 @@ def test_of_a_plant_whose_x_is_no_state_the_summary_says_so() -> None:
     found = linearisation(shipped("lane_vehicle", "plant.system.model=kinematic"))
     assert found is not None
     assert set(found.values()) == {None}
-    assert said(found) == (("the plant, linearised", "its x does not tell what follows"),)
+    assert said(found) == (
+        ("the plant, linearised", "none: x does not tell what follows, or not smoothly"),
+    )
