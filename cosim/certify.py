@@ -222,8 +222,8 @@ def in_words(found: Study) -> Iterator[str]:
         if (spacing_s := certificate.inter_event_s) is not None:
             apart = f" No two transmissions are closer than {_limit(spacing_s)}."
         yield (
-            f"In words: of {plants}, whichever updates are lost, at most {dropouts} in a "
-            f"row: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+            f"In words: of {plants}, where what is presupposed above holds, whichever updates are "
+            f"lost, at most {dropouts} in a row: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
         )
 
 

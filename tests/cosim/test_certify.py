@@ -152,6 +152,30 @@ def test_nothing_certified_is_a_failure_that_says_why() -> None:
     assert "grows at" in result.stdout
 
 
+def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum"])
+    said = " ".join(result.stdout.split())
+    sentences = said.split("In words: ")[1:]
+    assert [one.partition(",")[0] for one in sentences] == [
+        "of the scenario's plant", "of every plant of the box"
+    ]  # fmt: skip
+    document = json.loads(
+        CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json"]).stdout
+    )
+    scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
+    for sentence, one in zip(sentences, scheduled, strict=True):
+        assert "where what is presupposed above holds" in sentence
+        assert "at most 3 in a row" in sentence
+        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
+        assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
+
+
+def test_a_gain_of_the_other_sign_is_recognised() -> None:
+    arguments = ["certify", "unstable_pendulum", "--set", "model.gain=[[15.0, 5.0]]"]
+    said = " ".join(CliRunner().invoke(app, arguments).stdout.split())
+    assert "the loop's u is +Kx, and −K would stabilise it" in said
+
+
 @pytest.mark.parametrize(
     "settings",
     [
