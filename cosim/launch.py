@@ -180,8 +180,7 @@ class _Run:
                 point_to_latest(self._run_dir)
                 self._tell(self._watcher.started, self._run_dir)
                 patience_s = now_s + longest_s(scenario.horizon_s / scenario.speed)
-            if (account := coordinator.progress()) is not None:
-                self._tell(self._watcher.progress, account)
+            self._give_account(coordinator)
             if verdict is None:
                 verdict = self._stopped(signals) or self._trouble(coordinator)
                 if verdict is None and now_s > patience_s:
@@ -192,6 +191,7 @@ class _Run:
             elif now_s > patience_s:
                 break
             time.sleep(_POLL_S)
+        self._give_account(coordinator)  # the last one may have come with the end
         return (
             verdict
             or self._stopped(signals)
@@ -199,6 +199,10 @@ class _Run:
             or self._never_back()
             or (ExitStatus.OK, HORIZON)
         )
+
+    def _give_account(self, coordinator: Coordinator) -> None:
+        if (account := coordinator.progress()) is not None:
+            self._tell(self._watcher.progress, account)
 
     def _tell(self, callback: Callable[..., None], *arguments: object) -> None:
         try:

@@ -139,12 +139,15 @@ class Recorder:
     def show(self) -> None:
         """Bring the view and the coordinator up to date."""
         self._judge(self._guard.advance)
-        self._plane.session.put(self._plane.key("progress"), json.dumps(self._account))
+        self._give_account()
         if self._feed is not None:
             try:
                 self._feed.advance()
             except ViewError as error:
                 self._give_up_view(error)
+
+    def _give_account(self) -> None:
+        self._plane.session.put(self._plane.key("progress"), json.dumps(self._account))
 
     def note(self, notice: Notice) -> None:
         """Take a line of its own for the run's log."""
@@ -182,6 +185,7 @@ class Recorder:
             MachineError: the record cannot be written; what was spooled is kept.
         """
         self._judge(self._guard.end)
+        self._give_account()
         self._spool.close()
         write_reports(self._run_dir, self._reports.values())
         record = finish_record(self._run_dir)

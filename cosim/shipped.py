@@ -2,8 +2,24 @@
 
 import difflib
 from pathlib import Path
+from typing import NamedTuple
 
+from noack import toml_file
 from noack.errors import CallerError
+
+KINDS = ("scenarios", "campaigns")
+"""And the folders in which they lie."""
+
+_SCHEMA = "#:schema"
+"""The line that tells an editor where the schema lies, which is not beside a copy."""
+
+
+class Shipped(NamedTuple):
+    """A file that comes with noack."""
+
+    name: str
+    description: str
+    path: Path
 
 
 def find_shipped(name: str, folder: str) -> Path:
@@ -34,6 +50,28 @@ def find_shipped(name: str, folder: str) -> Path:
 def shipped_names(folder: str) -> list[str]:
     """Return the names of the scenarios or campaigns that come with noack."""
     return sorted(file.stem for file in _place(folder).glob("*.toml"))
+
+
+def all_shipped(folder: str) -> list[Shipped]:
+    """Return the scenarios or campaigns that come with noack, by name."""
+    paths = (find_shipped(name, folder) for name in shipped_names(folder))
+    return [Shipped(path.stem, toml_file.read(path)["description"], path) for path in paths]
+
+
+def text_of(name: str) -> str:
+    """Return what a shipped scenario or campaign says, to be copied.
+
+    Raises:
+        CallerError: there is none of this name.
+    """
+    for folder in KINDS:
+        if name in shipped_names(folder):
+            lines = (_place(folder) / f"{name}.toml").read_text(encoding="utf-8").splitlines(True)
+            return "".join(line for line in lines if not line.startswith(_SCHEMA))
+    names = [known for folder in KINDS for known in shipped_names(folder)]
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]}? There" if close else "there"
+    raise CallerError(f"{name}: nothing of that name is shipped; {hint} are {', '.join(names)}")
 
 
 def _place(folder: str) -> Path:

@@ -29,12 +29,14 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
         overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
 
     Raises:
-        CallerError: one line per mistake, each with file, key, value and remedy.
+        CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
     content = toml_file.read(path)
-    for override in overrides:
-        _apply(content, override)
-    return completed(content, path)
+    keys = [_apply(content, override) for override in overrides]
+    try:
+        return completed(content, path)
+    except CallerError as error:
+        raise CallerError(_attributed(str(error), path, keys)) from None
 
 
 def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
@@ -97,12 +99,21 @@ def json_schema() -> dict[str, Any]:
     return toml_file.json_schema(Scenario)
 
 
-def _apply(content: dict[str, Any], override: str) -> None:
+def _attributed(lines: str, path: Path, keys: Iterable[str]) -> str:
+    """Name ``--set`` instead of the file where one of these keys, or a part of it, is wrong."""
+    set_here = "|".join(map(re.escape, keys)) or "(?!)"
+    mistake = re.compile(rf"^{re.escape(printable(str(path)))}: (?=(?:{set_here})[.:=\s])", re.M)
+    return mistake.sub("--set ", lines)
+
+
+def _apply(content: dict[str, Any], override: str) -> str:
+    """Put ``key=value`` into the content; return the key."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         shown = printable(override)
         raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
     put(content, key.strip(), value_of(text, f"--set {key}"), f"--set {override}")
+    return key.strip()
 
 
 def value_of(text: str, source: str) -> Any:

@@ -21,6 +21,11 @@ def campaigns(incomplete: str) -> list[str]:
     return _beginning(incomplete, shipped_names("campaigns"))
 
 
+def shipped(incomplete: str) -> list[str]:
+    """Names of both."""
+    return scenarios(incomplete) + campaigns(incomplete)
+
+
 def run_directories(incomplete: str) -> list[str]:
     """Run directories below ``runs``, the newest first."""
     found = [path.parent for path in DEFAULT_RUNS.glob(f"*/{SCENARIO_FILE}")]

@@ -5,7 +5,9 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
+from cosim.cli import complete
 from cosim.cli.app import (
     FILES,
     JsonOption,
@@ -15,11 +17,50 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
+from cosim.shipped import KINDS, all_shipped, text_of
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
 from noack.scenario_file import dumps as scenario_toml
 from noack.scenario_file import json_schema, load
+
+
+@command(FILES, [
+    ("noack scenarios", "all of them, a line each"),
+    ("noack scenarios unstable_pendulum > mine.toml", "a file to change into your own"),
+    ("noack scenarios --json", ""),
+])  # fmt: skip
+def scenarios(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="Print this one, scenario or campaign, instead.", autocompletion=complete.shipped
+        ),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """List the scenarios and campaigns that come with noack; or print one, to start from."""
+    if name is not None:
+        text = text_of(name)
+        print_json({"name": name, "toml": text}) if json else print(text, end="")
+        return ExitStatus.OK
+    shipped = {kind: all_shipped(kind) for kind in KINDS}
+    if json:
+        print_json({
+            kind: [one._asdict() | {"path": str(one.path)} for one in some]
+            for kind, some in shipped.items()
+        })  # fmt: skip
+        return ExitStatus.OK
+    console = Console()
+    for kind, some in shipped.items():
+        table = Table.grid(padding=(0, 2), expand=False)
+        table.add_column(no_wrap=True, style="cyan")
+        table.add_column()
+        for one in some:
+            table.add_row(one.name, one.description)
+        console.print(kind, style="bold", highlight=False)
+        console.print(table)
+    return ExitStatus.OK
 
 
 @command(FILES, [

@@ -48,6 +48,8 @@ T = TypeVar("T")
 _JOIN_TIMEOUT_S = 24 * 3600.0
 """A person may take long to start the other processes; who does not want to wait, interrupts."""
 _ADMISSION_TIMEOUT_S = 10.0
+_COORDINATOR_AWAY_S = 8.0
+"""Four leases of the connection, which comes back by itself if a busy machine was its end."""
 _GOODBYE_TIMEOUT_S = 5.0
 _CHANGES_AT_ONCE = 2
 """In the loop, every 50 ms: a machine takes some tenths of a millisecond for each."""
@@ -280,7 +282,7 @@ class Node:
                 self._ended = reason
             elif self.ticket.launched and _lifeline_cut():
                 self._ended = LAUNCHER_GONE
-            elif self._joining and self.plane.coordinator_gone():
+            elif self._joining and self.plane.coordinator_gone(for_s=_COORDINATOR_AWAY_S):
                 # Once the loop runs, it goes on without the control plane.
                 self._ended = "the run's coordinator is gone"
         return self._ended

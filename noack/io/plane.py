@@ -59,7 +59,7 @@ class Plane:
         self._coordinator = self.session.liveliness().declare_subscriber(
             self.key("alive", COORDINATOR, "*"), RingChannel(8), history=True
         )
-        self._coordinator_gone = False
+        self._coordinator_gone_s: float | None = None
         # As many as there can be: none is ever pushed out.
         self._changes = self.session.declare_subscriber(
             self.key("change"), RingChannel(MOST_CHANGES)
@@ -90,11 +90,18 @@ class Plane:
                 self._stop_reason = reason or "stopped"
         return self._stop_reason
 
-    def coordinator_gone(self) -> bool:
-        """Whether the coordinator was there and has disappeared."""
+    def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
+        """Whether the coordinator was there and has disappeared.
+
+        Args:
+            for_s: for how long it must have been away. On a busy machine a connection may end
+                because one of its ends was not run; it comes back by itself.
+        """
         while (life := self._coordinator.try_recv()) is not None:
-            self._coordinator_gone = life.kind == zenoh.SampleKind.DELETE
-        return self._coordinator_gone
+            gone = life.kind == zenoh.SampleKind.DELETE
+            self._coordinator_gone_s = time.monotonic() if gone else None
+        since_s = self._coordinator_gone_s
+        return since_s is not None and time.monotonic() - since_s >= for_s
 
     def request_stop(self, reason: str) -> None:
         """Ask every process of the run to end."""

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from noack.errors import CallerError
 from noack.resolve import resolve
 from noack.scenario import Scenario
-from noack.scenario_file import dumps, load, validate
+from noack.scenario_file import dumps, load, put, validate, value_of
 
 SHIPPED = sorted((Path(__file__).parents[2] / "scenarios").glob("*.toml"))
 Content = dict[str, Any]
@@ -49,8 +49,17 @@ network = { mansd = 2, loss = { model = "worst_case" } }
 """
 
 
-def mistakes(text: str, folder: Path, settings: Sequence[str] = ()) -> list[str]:
-    """What a person is told about a scenario, with the file's name shortened to FILE."""
+def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
+    """What a person is told about a scenario whose file says these ``key=value`` too."""
+    content = tomllib.loads(text)
+    for line in lines:
+        key, _, value = line.partition("=")
+        put(content, key, value_of(value, key), key)
+    return mistakes_with(tomli_w.dumps(content), folder, ())
+
+
+def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]:
+    """What a person is told who gives settings, with the file's name shortened to FILE."""
     path = folder / "some.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(CallerError) as caught:
@@ -424,6 +433,28 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (["trigger.beta=-1"], ["--set trigger.beta = -1: should be greater than 0"]),
+        (["network.loss={model='bernoulli'}"], ["--set network.loss.probability: missing "]),
+        (["trigger.bet=1"], ["--set trigger.bet = 1: unknown key; did you mean beta?"]),
+        (["plant.initial_state=[1,2]"], ["--set plant.initial_state = [1, 2]: "]),
+        (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
+        (["trigger.beta=1"], ["FILE: name = 1: "]),  # nothing is wrong with what was set
+    ],
+)
+def test_what_is_wrong_with_a_setting_is_not_said_of_the_file(
+    settings: list[str], told: list[str], tmp_path: Path
+) -> None:
+    name = "1" if told[0].startswith("FILE") else '"lane"'
+    text = LANE.replace('name = "lane"', f"name = {name}", 1)
+    lines = mistakes_with(text, tmp_path, settings)
+    assert len(lines) == len(told)
+    for line, begins in zip(lines, told, strict=True):
+        assert line.startswith(begins), line
+
+
 def test_an_empty_file_lacks_everything_that_is_required(tmp_path: Path) -> None:
     lines = mistakes("", tmp_path)
     assert [line.split(": ")[1] for line in lines] == [
@@ -453,7 +484,7 @@ def test_a_long_value_is_cut_short(tmp_path: Path) -> None:
     ],
 )
 def test_text_that_is_not_toml_is_told_by_line(text: str, says: str, tmp_path: Path) -> None:
-    (line,) = mistakes(text, tmp_path)
+    (line,) = mistakes_with(text, tmp_path, ())
     assert line.startswith("FILE: not valid TOML: ")
     assert says in line
 
@@ -523,7 +554,7 @@ def test_the_last_setting_of_a_key_counts(tmp_path: Path) -> None:
     ],
 )
 def test_a_setting_that_cannot_be_applied_is_told(setting: str, says: str, tmp_path: Path) -> None:
-    assert mistakes(LANE, tmp_path, [setting]) == [says]
+    assert mistakes_with(LANE, tmp_path, [setting]) == [says]
 
 
 def test_only_the_sources_name_goes_into_the_message(content: Content) -> None:

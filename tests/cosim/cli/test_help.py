@@ -97,6 +97,7 @@ MORE = {
     "summary": (),
     "replay": (),
     "report": (),
+    "scenarios": (),
     "certify": (),
     "simulate": ("--set", "horizon_s=1", "--no-report"),
     "adversary": ("--nodes", "2000", "--beam", "8", "--set", "horizon_s=2"),
@@ -181,4 +182,4 @@ def test_options_that_mean_the_same_have_the_same_name() -> None:
         for one in COMMANDS[name].params:
             if one.param_type_name == "argument":
                 arguments[one.name].add(name)
-    assert arguments.keys() == {"scenario", "run_dir", "recording", "file", "settings"}
+    assert arguments.keys() == {"scenario", "run_dir", "recording", "file", "name", "settings"}

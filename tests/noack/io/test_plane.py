@@ -4,6 +4,7 @@ import hashlib
 import re
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,15 @@ import noack
 from cosim.coordinator import Coordinator
 from noack.errors import PeerError
 from noack.io.messages import Admission, Begin, Missing, heard
+from noack.io.node import Node
 from noack.io.plane import Plane, secret_of
+from noack.io.signals import Signals
 from noack.io.star import Secret, open_star, star_config
 from noack.io.ticket import Ticket, new_ticket
 from noack.io.udp import free_tcp_port
 from noack.resolve import resolve
 from noack.scenario_file import validate
-from noack.topology import LOOP_ROLES
+from noack.topology import COORDINATOR, LOOP_ROLES
 from tests.integration.conftest import wait_for
 
 HELLO = '{"pid": 1, "instance": "evil", "address": ["127.0.0.1", 9]}'
@@ -237,3 +240,41 @@ def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticke
         told = heard(Begin, plant.request("ask", {}, timeout_s=30))
     assert told["epoch_ns"] == 7
     assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+
+
+def meet(plane: Plane) -> None:
+    """Wait until a process knows that there is a coordinator."""
+    everyone = plane.key("alive", COORDINATOR, "*")
+    wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
+
+
+def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> None:
+    """As when the machine did not run one end of a connection for a lease."""
+    first = Coordinator(ticket)
+    with Plane(ticket, "plant") as plant:
+        meet(plant)
+        assert not plant.coordinator_gone()
+        first.close()
+        wait_for(plant.coordinator_gone)
+        assert not plant.coordinator_gone(for_s=3600)
+        second = Coordinator(ticket)
+        wait_for(lambda: not plant.coordinator_gone())
+        second.close()
+        wait_for(lambda: plant.coordinator_gone(for_s=0.2))
+        assert not plant.coordinator_gone(for_s=3600)
+
+
+def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> None:
+    ticket = ticket._replace(launched=False)
+    first = Coordinator(ticket)
+    with Plane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
+        node = Node("plant", ticket, plane, Signals())
+        meet(plane)
+        first.close()
+        wait_for(plane.coordinator_gone)
+        knocking = pool.submit(node.knock)
+        second = Coordinator(ticket)
+        while not knocking.done():
+            second.poll()
+        second.close()
+        knocking.result()

@@ -1,0 +1,59 @@
+"""``noack scenarios``: what comes with noack, and a file to start one's own from."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from cosim.cli import app
+from noack.scenario_file import load
+
+ROOT = Path(__file__).parents[3]
+SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))
+CAMPAIGNS = sorted(file.stem for file in (ROOT / "campaigns").glob("*.toml"))
+
+
+def scenarios(*words: str) -> Result:
+    return CliRunner().invoke(app, ["scenarios", *words], prog_name="noack")
+
+
+def test_all_are_listed_with_what_they_say_of_themselves() -> None:
+    done = scenarios()
+    assert done.exit_code == 0
+    listed = " ".join(done.stdout.split())
+    for folder, names in (("scenarios", SCENARIOS), ("campaigns", CAMPAIGNS)):
+        for name in names:
+            content = tomllib.loads((ROOT / folder / f"{name}.toml").read_text("utf-8"))
+            assert f"{name} {content['description']}" in listed
+
+
+def test_the_list_as_a_document_names_files_that_can_be_read() -> None:
+    document = json.loads(scenarios("--json").stdout)
+    assert [one["name"] for one in document["scenarios"]] == SCENARIOS
+    assert [one["name"] for one in document["campaigns"]] == CAMPAIGNS
+    for one in document["scenarios"]:
+        assert load(Path(one["path"])).name == one["name"]
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_printed_scenario_is_the_shipped_one_wherever_it_is_put(
+    name: str, tmp_path: Path
+) -> None:
+    done = scenarios(name)
+    assert done.exit_code == 0
+    copy = tmp_path / "mine.toml"
+    copy.write_text(done.stdout, encoding="utf-8")
+    assert load(copy) == load(ROOT / "scenarios" / f"{name}.toml")
+    assert "schema" not in done.stdout  # which lies elsewhere
+
+
+@pytest.mark.parametrize("words", [["lane_folowing"], ["lane_folowing", "--json"]])
+def test_a_name_that_is_not_shipped_is_one_line(words: list[str]) -> None:
+    done = scenarios(*words)
+    assert done.exit_code == 2
+    assert "lane_folowing: nothing of that name is shipped; did you mean lane_following?" in (
+        done.stderr
+    )
+    assert done.stderr.count("\n") == 1
