@@ -7,6 +7,7 @@ import pytest
 
 from cosim.launch import Watcher, _Run, longest_s
 from noack.errors import ExitStatus, MachineError
+from noack.io.signals import Signals
 from noack.io.ticket import new_ticket
 from noack.resolve import resolve
 from noack.scenario_file import validate
@@ -121,3 +122,26 @@ def test_a_recorder_that_is_busy_with_a_long_record_s_end_is_not_given_up(
     run._children["recorder"] = cast(Any, Child(-9))
     reason = "recorder died: killed by SIGKILL"
     assert run._trouble(cast(Any, Silent(1.0))) == (ExitStatus.FAILED, reason)
+
+
+def test_an_account_that_comes_with_the_end_is_told(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    class Ending(Barrier):
+        """All end after the first look, and the recorder's last account arrives after it."""
+
+        looks = 0
+
+        def poll(self) -> None:
+            for child in run._children.values():
+                cast(Any, child).code = 0
+
+        def progress(self) -> dict[str, Any] | None:
+            self.looks += 1
+            return {"void": ["late"]} if self.looks == 2 else None
+
+    told: list[Any] = []
+    run = Run(content, tmp_path, 0)
+    run._watcher = Watcher(progress=told.append)
+    assert run.watch(cast(Any, Ending(1.0)), Signals())[0] is ExitStatus.OK
+    assert told == [{"void": ["late"]}]

@@ -73,6 +73,15 @@ def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_pa
     assert load_record(tmp_path).notices == notices
 
 
+def test_what_is_found_out_at_the_end_is_said_too(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    (notice,) = recorder.finish().notices
+    assert [account["void"] for account in plane.accounts] == [[notice["text"]]]
+
+
 def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
     run: RunRecord, tmp_path: Path
 ) -> None:
