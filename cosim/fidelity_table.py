@@ -40,7 +40,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
     console.print(
         "Each effect is added to those above it. Δt: largest time difference of an event to the "
         "line above; parted: first event more than ten measurements apart, from which on the same "
-        "packet fates meet other events.",
+        "packet fates meet other events. A negative share takes away from what the others make.",
         highlight=False,
     )
     colour = "green" if fidelity.explained else "bold red"
@@ -59,7 +59,8 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
         if name != "unexplained":
-            yield f"  share of {name.replace('_', ' ')}", percent(share)
+            against = ", against the others" if share < -0.0005 else ""
+            yield f"  share of {name.replace('_', ' ')}", percent(share) + against
     yield "  unexplained, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from cosim.report.findings import FIDELITY, REPLAY, findings
 from cosim.tables import away, changes_in, interval_of, key_numbers, warnings_of
 from noack.scenario import Scenario
 from noack.trigger.text import trigger_text
@@ -21,7 +22,6 @@ _TONES = {
     "void": "doubt",
 }  # fmt: skip
 _QUANTILES = {"p50": "median", "p99": "99 %", "p999": "99.9 %", "max": "largest"}
-_FINDINGS = {"fidelity": "Fidelity", "replay": "Replay"}
 
 
 class Embedded(NamedTuple):
@@ -62,19 +62,17 @@ def page(
         ending=_ending(summary),
         verdict_tone="bad" if status else "doubt" if remarks else "good",
         remarks=remarks,
-        key_numbers=key_numbers({**summary, **dict.fromkeys(_FINDINGS)}),  # they have sections
+        # These have sections of their own.
+        key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
         figures=figures,
         claims=[_claim(claim) for claim in claims],
         assumptions=_objects(summary.get("assumptions")),
         timing=list(_timing(summary)),
         timing_headings=[*_QUANTILES.values(), "count", "late"],
-        findings=[
-            (heading, summary[key]) for key, heading in _FINDINGS.items() if summary.get(key)
-        ],
+        findings=list(findings(summary)),
         scenario_toml=scenario_toml,
         environment=[(_words(key), _line(value)) for key, value in environment.items()],
-        most=_MOST_ROWS,
     )  # fmt: skip
 
 
@@ -87,8 +85,7 @@ def _templates() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters |= {"shown": _shown, "words": _words, "tone": lambda w: _TONES.get(w, "")}
-    templates.tests["records"] = _are_records
+    templates.filters["tone"] = lambda word: _TONES.get(word, "")
     return templates
 
 
@@ -118,9 +115,9 @@ def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) ->
         if count:
             yield f"{count} of {len(claims)} claims {verdict}: see Claims"
     if (summary.get("replay") or {}).get("bit_exact") is False:
-        yield "The replay of the run differs from its record: see Replay"
+        yield f"The replay of the run differs from its record: see {REPLAY}"
     if (summary.get("fidelity") or {}).get("explained") is False:
-        yield "The run's difference to the ideal loop is not explained: see Fidelity"
+        yield f"The run's difference to the ideal loop is not explained: see {FIDELITY}"
     if summary["missing_samples"]:
         where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
         yield f"{summary['missing_samples']} samples are missing in the record: {where}"
@@ -199,10 +196,6 @@ def _started(environment: Mapping[str, Any]) -> str:
 
 def _objects(value: Any) -> list[dict[str, Any]]:
     return [entry for entry in value if isinstance(entry, dict)] if isinstance(value, list) else []
-
-
-def _are_records(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(e, dict) for e in value)
 
 
 def _words(key: str) -> str:

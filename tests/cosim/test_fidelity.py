@@ -112,6 +112,15 @@ def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
     assert told == f"not compared: {summary['reason']}"
 
 
+def test_a_share_that_counts_against_the_others_is_called_so() -> None:
+    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "unexplained": 0.0}
+    numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
+    told = dict(summary_rows(numbers | {"reason": None}))
+    assert told["  share of sampling"] == "142.0 %"
+    assert told["  share of delay"] == "-42.0 %, against the others"
+    assert told["  share of held actuation"] == "0.0 %"
+
+
 def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> None:
     """This rule does not stand the losses; a deviation grows freely between the same events."""
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import asdict
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from cosim import conclude as concluding
 from cosim.cli import app
 from cosim.launch import Ending
 from cosim.record import RunRecord
+from cosim.replay.result import difference
 from cosim.report import write
 from cosim.report.save import inline
 from cosim.report.write import write_report
@@ -161,7 +163,8 @@ def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -
         claims=[dict.fromkeys(("what", "source", "bound", "verdict", "why"), HOSTILE)],
         assumptions=[dict.fromkeys(("what", "source", "verdict", "why"), HOSTILE)],
         assumption_violations=[{"t_s": 1.0, "process": HOSTILE, "what": HOSTILE}],
-        fidelity={HOSTILE: [HOSTILE, {HOSTILE: HOSTILE}]},
+        fidelity=dict.fromkeys(fidelity()) | {"reason": HOSTILE},
+        replay={"bit_exact": None, "error": HOSTILE},
         rejected_datagrams={HOSTILE: {HOSTILE: 3}},
         missing_samples=1,
         missing_by_table={HOSTILE: 1},
@@ -172,32 +175,75 @@ def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -
     assert page.attributes("title") == [{}]
 
 
-def test_findings_are_shown_whatever_they_hold(record: RunRecord, tmp_path: Path) -> None:
-    page, html, _ = written(
-        record,
-        tmp_path,
-        replay={"bit_exact": True, "machines": {"plant": {"inputs": 10001, "first": None}}},
-        fidelity={
-            "rms_x": 1.23456e-4,
-            "parts": [{"of": "sampling", "share": 0.5}, {"of": "delay", "share": 0.25}],
-            "many": list(range(100)),
-            "none": [],
-            "nothing": {},
-        },
-    )
+def fidelity(**changed: Any) -> dict[str, Any]:
+    """A run's difference to the ideal loop, as its summary has it."""
+    shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "unexplained": 0.0}
+    return {
+        "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
+        "rms_x_live": 2.0, "shares": shares, "events_ideal": 31, "events_live": 30,
+        "max_event_difference_s": 0.0125, "parted_event": None, "reason": None,
+    } | changed  # fmt: skip
+
+
+def replayed(**changed: Any) -> dict[str, Any]:
+    found = {"bit_exact": True, "complete": True, "inputs": 10001, "first_difference": None}
+    return found | changed
+
+
+def test_the_difference_to_the_ideal_loop_is_told_in_words(
+    record: RunRecord, tmp_path: Path
+) -> None:
+    page, html, _ = written(record, tmp_path, fidelity=fidelity())
     check(page, html)
-    for text in ("Replay", "bit exact", "yes", "10001", "Fidelity", "rms x", "0.0001235", "0.25"):
+    for text in (
+        "by 0.25 (RMS), 12 % of x itself, and by 0.5 at most",
+        "The effects below explain it: 1e-07 % of the difference is left.",
+        "30 events, against 31 of the ideal loop; each at most 12.5 ms from the ideal one",
+        "one with a negative share takes away",
+        "held actuation", "-42.0 %",
+    ):  # fmt: skip
         assert text in page.text
-    assert "and 60 more" in page.text
-    failed, _, _ = written(
-        record, tmp_path, replay={"bit_exact": False}, fidelity={"explained": False}
-    )
-    assert "differs from its record: see Replay" in failed.text
-    assert "is not explained: see Fidelity" in failed.text
-    without, _, _ = written(record, tmp_path)
-    assert "Fidelity" not in without.text
-    assert "Replay" not in without.text
-    assert "Claims" not in without.text
+    assert "held_actuation" not in page.text
+    assert "Replay" not in page.text
+    shares = {"sampling": 1.0, "delay": 0.0, "held_actuation": 0.0, "unexplained": 0.0}
+    page, _, _ = written(
+        record, tmp_path, fidelity=fidelity(explained=False, explained_relative=0.4,
+                                            shares=shares, parted_event=7)
+    )  # fmt: skip
+    assert "is not explained: see Fidelity" in page.text
+    assert "40 % of the difference is left, which is too much" in page.text
+    assert "With event 7 they part" in page.text
+    assert "negative share" not in page.text
+    nothing = dict.fromkeys(fidelity()) | {"reason": "the run diverged"}
+    page, html, _ = written(record, tmp_path, fidelity=nothing)
+    check(page, html)
+    assert "Not compared with the ideal loop: the run diverged." in page.text
+
+
+def test_the_replay_is_told_in_words(record: RunRecord, tmp_path: Path) -> None:
+    page, html, _ = written(record, tmp_path, replay=replayed())
+    check(page, html)
+    assert "its 10,001 recorded inputs again" in page.text
+    assert "bit for bit" in page.text
+    assert "gaps" not in page.text
+    assert "Fidelity" not in page.text
+    other = asdict(difference("plant_step", 7, 5, "another x", "x_1", 1.0, 2.0))
+    page, html, _ = written(
+        record, tmp_path,
+        replay=replayed(bit_exact=False, complete=False, first_difference=other),
+    )  # fmt: skip
+    check(page, html)
+    assert "differs from its record: see Replay" in page.text
+    assert "plant_step row 7, x_1: another x: recorded 1.0" in page.text
+    assert "The record has gaps" in page.text
+    page, _, _ = written(record, tmp_path, replay={"bit_exact": None, "error": "KeyError('x')"})
+    assert "Nothing could be replayed: KeyError('x')." in page.text
+
+
+def test_what_was_not_found_out_has_no_section(record: RunRecord, tmp_path: Path) -> None:
+    page, _, _ = written(record, tmp_path)
+    for heading in ("Fidelity", "Replay", "Claims"):
+        assert heading not in page.text
 
 
 def empty(content: dict[str, Any]) -> RunRecord:
