@@ -87,7 +87,7 @@ def _replay(found: Mapping[str, Any]) -> Iterator[str]:
         )
     else:
         yield (
-            "Fed its recorded inputs again, a machine did something else than is on record; first, "
+            "Fed its recorded inputs again, a machine did something else than is on record: "
             f"{Difference(**found['first_difference'])}."
         )
     if not found.get("complete", True):
