@@ -82,8 +82,8 @@ def _replay(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"Nothing could be replayed: {found.get('error', 'the record is empty')}."
     elif found["bit_exact"]:
         yield (
-            f"Every machine was fed its {found['inputs']:,} recorded inputs again: all that it then "
-            "did is what is on record, bit for bit."
+            f"Every machine was fed its {found['inputs']:,} recorded inputs again: all that it "
+            "then did is what is on record, bit for bit."
         )
     else:
         yield (
