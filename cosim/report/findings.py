@@ -82,7 +82,7 @@ def _replay(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"Nothing could be replayed: {found.get('error', 'the record is empty')}."
     elif found["bit_exact"]:
         yield (
-            f"Every machine was fed its {found['inputs']:,} recorded inputs again: all that it "
+            f"The machines were fed their {found['inputs']:,} recorded inputs again: all that they "
             "then did is what is on record, bit for bit."
         )
     else:

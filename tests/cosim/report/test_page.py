@@ -223,7 +223,7 @@ def test_the_difference_to_the_ideal_loop_is_told_in_words(
 def test_the_replay_is_told_in_words(record: RunRecord, tmp_path: Path) -> None:
     page, html, _ = written(record, tmp_path, replay=replayed())
     check(page, html)
-    assert "its 10,001 recorded inputs again" in page.text
+    assert "their 10,001 recorded inputs again" in page.text
     assert "bit for bit" in page.text
     assert "gaps" not in page.text
     assert "Fidelity" not in page.text
