@@ -38,7 +38,7 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
     with concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
             record = finish_record(run_dir)
-            from cosim.recorder import write_view  # imports rerun, which a good run needs not here
+            from cosim.viewer.opened import write_view
 
             write_view(record, run_dir, ending.run_id)
         else:

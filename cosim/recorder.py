@@ -15,13 +15,11 @@ from zenoh.handlers import FifoChannel, RingChannel
 
 from cosim.claims.guard import Guard
 from cosim.claims.observed import Departure
-from cosim.environment import Kind
 from cosim.record import RunRecord, finish_record, report_of, updates_in, write_reports
-from cosim.run_dir import RECORDING_FILE, SPOOL, under_way
+from cosim.run_dir import SPOOL, under_way
 from cosim.viewer.feed import ViewFeed
 from cosim.viewer.live import LiveView
-from cosim.viewer.pictures.choose import picture_of
-from cosim.viewer.pictures.network import LEG_S, Diagram
+from cosim.viewer.opened import open_view, write_view
 from cosim.viewer.recording import RunView, ViewError
 from noack.changes import Change, said_of
 from noack.clock import NS_PER_S
@@ -44,7 +42,6 @@ from noack.records import (
 from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES, RECORDER
-from noack.trigger.text import trigger_text
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
@@ -54,8 +51,6 @@ _CONFIRM_S = 1.0
 _BATCHES_IN_WAITING = 4096
 """A minute of them; each place of the ring takes 256 bytes once it has been used."""
 _STOP_PATIENCE_S = 8.0
-_INDEXED_S = 120.0
-"""Wall time of a run whose view has an index; that of a longer one would take too much memory."""
 
 
 class Recorder:
@@ -345,66 +340,6 @@ class Recorder:
         self._out_of_order = True
 
 
-def open_view(
-    scenario: Scenario,
-    run_dir: Path,
-    run_id: int,
-    live: LiveView | None,
-    kind: Kind = "live",
-    *,
-    at_once: bool = False,
-) -> RunView:
-    """Create the recording of a run, to be written at once or while the run goes on."""
-    loop = loop_of(scenario)
-    return RunView(
-        run_dir / RECORDING_FILE,
-        run_id=f"{run_id:016x}",
-        title=f"{scenario.name} ({scenario.mode})",
-        about=about(scenario, kind),
-        state_names=loop.state_names,
-        input_names=loop.input_names,
-        processes=LOOP_ROLES if kind == "live" else (),
-        picture=picture_of(scenario),
-        diagram=Diagram(acknowledged=scenario.is_acknowledged),
-        live=live,
-        indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
-    )
-
-
-def about(scenario: Scenario, kind: Kind = "live") -> str:
-    """Markdown that says what the view shows."""
-    network = scenario.network
-    late = {
-        "live": "* **Lateness**: wall time by which each process acted after its input was due.",
-        "simulated": "* The run was **simulated**, in virtual time: nothing was ever late.",
-    }[kind]
-    protocol, x_s_is_reset = "Nothing is acknowledged.", "at every event"
-    if scenario.is_acknowledged:
-        protocol, x_s_is_reset = "**Updates are acknowledged.**", "when an update is acknowledged"
-    hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
-    return f"""# {scenario.name}
-
-{scenario.description}
-
-Sensor and controller run **{hold}** between updates. The sensor transmits when
-{trigger_text(scenario.trigger)}.
-The network ({network.loss.model.replace("_", "-")} loss) drops at most
-M − 1 = {network.mansd} packets in a row. {protocol}
-
-* **The picture**: the plant, solid, and in outline where the sensor's model (whole line) and the
-  controller's (dashes) believe it is. Play the run to see it move.
-* **Packets**: each update on its way; what is lost falls, what was forced through is a diamond.
-  A flight takes microseconds; it is drawn as {LEG_S:g} s a leg: x_c jumps before the dot arrives.
-* **States**: the plant's x, the sensor's model x_s (reset {x_s_is_reset}), the controller's model
-  x_c (reset only by what survives). Where x_c leaves the other two, packets were lost.
-* **Intervals**: time since the last broadcast, and since the last reception.
-* **Errors**: e_s = x_s − x against its threshold, and e_c = x_c − x, which nobody in the loop can
-  measure, below what is known of it: the bound from identity (I1), and the certified one, which
-  holds as long as nothing is later than the certificate allows (the summary's claims say so).
-{late}
-"""
-
-
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the recorder; ``--live`` also opens a viewer."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -477,17 +412,6 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
         print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
     if recorder.view_is_incomplete:
         write_view(record, run_dir, node.ticket.run_id)
-
-
-def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
-    """Write a run's recording from its finished record."""
-    with open_view(record.scenario, run_dir, run_id, None, record.kind, at_once=True) as view:
-        feed = ViewFeed(record.scenario, view)
-        for table in record.tables:
-            feed.add(table, record[table])
-        for notice in record.notices:
-            feed.log(notice)
-        feed.advance(final=True)
 
 
 if __name__ == "__main__":

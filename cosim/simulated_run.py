@@ -60,7 +60,7 @@ def simulate_run(
             (run_dir / REPORTS_FILE).write_text(reports, encoding="utf-8")
             write_record(record, run_dir)
             if view:
-                from cosim.recorder import write_view  # imports rerun
+                from cosim.viewer.opened import write_view  # imports rerun
 
                 write_view(record, run_dir, run_id)
     except BaseException as error:
