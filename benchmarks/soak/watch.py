@@ -1,6 +1,7 @@
 """Watches the processes of a run from outside."""
 
 import contextlib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -88,9 +89,10 @@ def _sample(process: psutil.Process) -> Sample:
 
 
 def size_bytes(folder: Path) -> int:
-    """What a folder takes on the disk; files may vanish meanwhile."""
+    """What a folder takes on the disk; files and folders may vanish meanwhile."""
     total = 0
-    for path in folder.rglob("*"):
-        with contextlib.suppress(OSError):
-            total += path.stat().st_blocks * 512
+    for inner, _, names in os.walk(folder):  # which passes over what it cannot read
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += (Path(inner) / name).stat().st_blocks * 512
     return total
