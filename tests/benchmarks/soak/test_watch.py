@@ -18,7 +18,7 @@ def test_a_folder_may_vanish_while_it_is_measured(
     look = Path.stat
 
     def look_once_more(path: Path) -> object:
-        if path.name == "log":
+        if path.name == "rows":
             shutil.rmtree(tmp_path / "spool", ignore_errors=True)
         return look(path)
 
