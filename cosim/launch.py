@@ -29,6 +29,7 @@ from noack.io.udp import LOOPBACK, free_tcp_port, require_free_tcp_port
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.topology import PLANT, RECORDER, ROLES
+from plant_server.systems.choose import prepare
 
 _MODULES = {
     "recorder": "cosim.recorder",
@@ -96,6 +97,8 @@ def launch(
     control = resolved.ports.control
     if control:
         require_free_tcp_port(control, "ports.control")
+    if PLANT in spawn:
+        prepare(resolved.plant.system)  # nobody waits long for a process at the start
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
     resolved = write_scenario(resolved, run_dir)

@@ -146,6 +146,13 @@ class Vehicle(System):
         return 8 * self.steering_s
 
     @property
+    def library_model(self) -> str:
+        """The library's name of the model."""
+        kinematic = "kst" if self.parameters == "truck" else "ks"
+        names = {"kinematic": kinematic, "single_track": "st", "drift": "std", "multi_body": "mb"}
+        return names[self.model]
+
+    @property
     def internal_names(self) -> tuple[str, ...]:
         """The states of the library's model, SI units."""
         kinematic = (*_CORE, "hitch_angle") if self.parameters == "truck" else _CORE

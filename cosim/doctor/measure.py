@@ -25,9 +25,9 @@ from cosim.doctor.facts import Buffer, Disk, Lateness, Machine, RoundTrips, Want
 from cosim.environment import environment
 from cosim.room import needed_bytes
 from cosim.viewer.live import has_display
-from netem.code_cache import cache_folder
 from noack.clock import NS_PER_S
 from noack.errors import CallerError, MachineError, NoackError, one_line, why
+from noack.io.code_cache import cache_folder
 from noack.io.private import make_private, private_folder
 from noack.io.star import Secret, answer_to, cause_of, open_star
 from noack.io.udp import LOOPBACK, bind, free_tcp_port, require_free_tcp_port

@@ -33,8 +33,9 @@ from netem.capture.packets import (
     blocks_bytes,
     put_blocks,
 )
-from netem.code_cache import is_kept, say_compiling
 from netem.events import EVENT
+from netem.say import say
+from noack.io.code_cache import is_kept, while_compiling
 
 SNAP_BYTES = 262_144
 """Payload bytes captured of a datagram unless told otherwise: all."""
@@ -76,7 +77,7 @@ class Section:
         self._end_ns = 0
         self._out = np.empty(0, np.uint8)
         if not is_kept(FOLDER, put_blocks):
-            say_compiling("the capture", kept=FOLDER is not None)
+            say(while_compiling("the capture", kept=FOLDER is not None))
         self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
 
     def header(self) -> bytes:

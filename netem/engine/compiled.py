@@ -1,6 +1,6 @@
 """Compiles the rules of a link with numba: the very functions that :mod:`netem.link` runs.
 
-What is compiled is kept in the user's cache; see :mod:`netem.code_cache`.
+What is compiled is kept in the user's cache; see :mod:`noack.io.code_cache`.
 """
 
 import importlib
@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 import netem.engine.pump
 import netem.rules
-from netem import code_cache, events, records
-from netem.code_cache import cache_folder, compiler
+from netem import events, records
 from netem.engine import histogram
 from netem.program import new_flow
 from netem.records import array_of, dtype_of
 from netem.rules.link import Program, State
 from netem.rules.mansd import NEVER_NS
+from noack.io import code_cache
+from noack.io.code_cache import cache_folder, compiler
 
 _PROGRAM = {
     "stages": records.Stage,

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from netem.code_cache import say_compiling
 from netem.engine.compiled import compile_rule, is_kept, keeps
 from netem.engine.pump.clients import insert, remove
 from netem.engine.pump.pump import run_pump
 from netem.rules.change import carry
+from netem.say import say
+from noack.io.code_cache import while_compiling
 
 
 class Functions(NamedTuple):
@@ -25,5 +26,5 @@ def functions() -> Functions:
     """Return them; say so if they have to be compiled, which takes a while."""
     sources: Any = (run_pump, insert, remove, carry)
     if not all(map(is_kept, sources)):
-        say_compiling("the relay", keeps())
+        say(while_compiling("the relay", keeps()))
     return Functions(*map(compile_rule, sources))

@@ -10,6 +10,20 @@ from plant_server.system import System
 from plant_server.systems.linear import LinearSystem
 
 
+def prepare(settings: object) -> None:
+    """Do what a plant's system takes long for once on a machine: a vehicle's are compiled.
+
+    Raises:
+        CallerError: what it is made of is not there.
+    """
+    if isinstance(settings, Vehicle):
+        settings.require_installed()
+        from plant_server.systems import equations
+
+        if not equations.kept(settings.library_model):
+            equations.prepare(settings.library_model)
+
+
 def system_of(resolved: Scenario) -> System:
     """Return the system of a resolved scenario's plant, at x(0).
 

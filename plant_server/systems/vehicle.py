@@ -6,9 +6,8 @@ sign of its lateral velocity and y; yaw, yaw rate and steering angle have the sa
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,18 +16,14 @@ from noack.errors import CallerError
 from noack.linear import Vector
 from noack.systems import Vehicle
 from plant_server.ode import OdeSystem
+from plant_server.systems.equations import equations, library
 
 _PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}
-
-Dynamics = Callable[[list[float], list[float], Any], Sequence[float]]
-"""The library's: ż of its state, of steering rate and acceleration, and of its parameters."""
 
 
 class _Model(NamedTuple):
     """One of the library's models, and what it is to the loop."""
 
-    name: str
-    """As the library calls it."""
     start: Callable[[Vector, float, Any], list[float]]
     """z(0) from x(0), the speed and the parameters."""
     output: Callable[[Any], Callable[[Vector], Vector]]
@@ -51,7 +46,7 @@ def vehicle(settings: Vehicle, x0: Vector) -> OdeSystem:
         CallerError: the library is not installed, or the vehicle is not so fast.
     """
     settings.require_installed()
-    model = _model_of(settings)
+    model = _MODELS[settings.library_model]
     parameters = _parameters_of(settings)
     speed, servo_s, hold = settings.speed_m_per_s, settings.steering_s, settings.speed_gain_per_s
     if speed > (fastest := parameters.longitudinal.v_max):
@@ -59,43 +54,30 @@ def vehicle(settings: Vehicle, x0: Vector) -> OdeSystem:
             f"plant.system.speed_m_per_s: a {settings.parameters} goes {fastest:g} m/s at most; "
             f"it cannot keep {speed:g}"
         )
-    dynamics: Dynamics = _library(f"vehicle_dynamics_{model.name}")
+    z0 = np.array(model.start(x0, speed, parameters), dtype=np.float64)
+    rates = equations(settings.library_model, parameters)
     leftmost, rightmost = parameters.steering.min, parameters.steering.max
 
-    def derivative(t_s: float, z: Vector, v: Vector) -> Sequence[float]:
-        state = z.tolist()
+    def derivative(t_s: float, z: Vector, v: Vector) -> Vector:
         asked = min(max(float(v[0]), leftmost), rightmost)
-        return dynamics(
-            state, [(asked - state[2]) / servo_s, hold * (speed - state[3])], parameters
-        )
+        return rates(z, (asked - float(z[2])) / servo_s, hold * (speed - float(z[3])))
 
     return OdeSystem(
         derivative,
-        np.array(model.start(x0, speed, parameters), dtype=np.float64),
+        z0,
         output=model.output(parameters),
         relative=model.relative,
         absolute=1e-3 * model.relative,
     )
 
 
-def _library(name: str) -> Any:
-    """A function of the library, each of which has a module of its name."""
-    return getattr(import_module(f"vehiclemodels.{name}"), name)
-
-
 @cache
 def _parameters_of(settings: Vehicle) -> Any:
     number = _PARAMETERS[settings.parameters]
-    parameters = _library(f"parameters_vehicle{number}")()
+    parameters = library(f"parameters_vehicle{number}")()
     parameters.tire.p_dx1 *= settings.friction
     parameters.tire.p_dy1 *= settings.friction
     return parameters
-
-
-def _model_of(settings: Vehicle) -> _Model:
-    if settings.model == "kinematic" and settings.parameters == "truck":
-        return _Model("kst", lambda *given: [*_start_kinematic(*given), 0.0], _see_kinematic)
-    return _MODELS[settings.model]
 
 
 def _start(x0: Vector, speed: float, parameters: Any) -> list[float]:
@@ -129,12 +111,12 @@ def _see_kinematic(parameters: Any) -> Callable[[Vector], Vector]:
 
 
 def _start_drift(x0: Vector, speed: float, parameters: Any) -> list[float]:
-    started: list[float] = _library("init_std")(_start(x0, speed, parameters), parameters)
+    started: list[float] = library("init_std")(_start(x0, speed, parameters), parameters)
     return started
 
 
 def _start_multi_body(x0: Vector, speed: float, parameters: Any) -> list[float]:
-    started: list[float] = _library("init_mb")(_start(x0, speed, parameters), parameters)
+    started: list[float] = library("init_mb")(_start(x0, speed, parameters), parameters)
     return started
 
 
@@ -146,8 +128,9 @@ def _see_multi_body(parameters: Any) -> Callable[[Vector], Vector]:
 
 
 _MODELS = {
-    "kinematic": _Model("ks", _start_kinematic, _see_kinematic),
-    "single_track": _Model("st", _start, _see),
-    "drift": _Model("std", _start_drift, _see, relative=1e-7),
-    "multi_body": _Model("mb", _start_multi_body, _see_multi_body, relative=1e-6),
+    "ks": _Model(_start_kinematic, _see_kinematic),
+    "kst": _Model(lambda *given: [*_start_kinematic(*given), 0.0], _see_kinematic),
+    "st": _Model(_start, _see),
+    "std": _Model(_start_drift, _see, relative=1e-7),
+    "mb": _Model(_start_multi_body, _see_multi_body, relative=1e-6),
 }

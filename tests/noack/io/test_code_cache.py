@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numba
 import pytest
 
-from netem.code_cache import cache_folder, compiler
+from noack.io.code_cache import cache_folder, compiler
 
 SOURCES = [Path(__file__)]
 
@@ -51,8 +51,8 @@ def test_what_is_compiled_is_kept_there(home: Path) -> None:
 COMPILED_LATER = """
 import sys
 from pathlib import Path
-from netem.code_cache import compiler
-from tests.netem.test_code_cache import doubled
+from noack.io.code_cache import compiler
+from tests.noack.io.test_code_cache import doubled
 function = compiler(Path(sys.argv[1]))(doubled)
 print("began", flush=True)
 assert function(21) == 42
@@ -67,7 +67,7 @@ def test_who_comes_while_another_compiles_waits_and_takes_what_is_kept(home: Pat
         fcntl.flock(lock, fcntl.LOCK_EX)
         later = subprocess.Popen(
             [sys.executable, "-c", COMPILED_LATER, str(folder)],
-            cwd=Path(__file__).parents[2], stdout=subprocess.PIPE, text=True,
+            cwd=Path(__file__).parents[3], stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert later.stdout is not None
         assert later.stdout.readline() == "began\n"

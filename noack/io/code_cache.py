@@ -9,10 +9,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-from netem.say import say
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
@@ -24,7 +23,7 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
     The folder's name depends on what all the sources say: numba itself looks at the file of the
     outermost function only.
     """
-    digest = hashlib.blake2b(_numba().__version__.encode(), digest_size=8)
+    digest = hashlib.blake2b(version("numba").encode(), digest_size=8)
     for source in sources:
         digest.update(source.read_bytes())
     try:
@@ -48,10 +47,10 @@ def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
 
-def say_compiling(what: str, kept: bool) -> None:
-    """Tell a waiting person what takes so long."""
+def while_compiling(what: str, kept: bool) -> str:
+    """What a waiting person should know about what takes so long."""
     once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) takes nothing"
-    say(f"compiling {what} for this machine, {once} ...")
+    return f"compiling {what} for this machine, {once} ..."
 
 
 def _forget_old(folder: Path, name: str) -> None:
