@@ -11,7 +11,7 @@ from plant_server.systems.linear import LinearSystem
 
 
 def prepare(settings: object) -> None:
-    """Do what a plant's system takes long for once on a machine: a vehicle's are compiled.
+    """Do what a system takes long for once on a machine: a vehicle's equations are compiled.
 
     Raises:
         CallerError: what it is made of is not there.

@@ -1,6 +1,8 @@
-"""The equations of CommonRoad's vehicle models, compiled: the library's own functions.
+"""The equations of CommonRoad's vehicle models; those with tyres are compiled, as they stand.
 
-Run by Python, those of a car with wheels and springs take a third of a period of 2 ms and more.
+Run by Python, a step of the multi-body model takes a third of a period of 2 ms and more. Of the
+small models a call of compiled code costs more than it saves: it wants more of the processor's
+caches, which have other contents at each step.
 """
 
 import inspect
@@ -21,6 +23,7 @@ from noack.io.code_cache import cache_folder, compiler, is_kept, while_compiling
 from noack.linear import Vector
 
 _LIBRARY = "vehiclemodels"
+_COMPILED = ("std", "mb")
 
 Rates = Callable[[Vector, float, float], Vector]
 """ż of the library's state (N,), of steering rate (rad/s) and acceleration (m/s²)."""
@@ -32,16 +35,16 @@ def library(module: str, name: str | None = None) -> Any:
 
 
 def equations(model: str, parameters: Any) -> Rates:
-    """Return the equations of a model, compiled if they can be.
+    """Return the equations of a model.
 
     Args:
         model: as the library calls it, e.g. ``st``.
         parameters: the library's, of a vehicle.
     """
-    values = _record(parameters)
     if (compiled := prepare(model)) is None:
         dynamics = _dynamics(model)
         return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
+    values = _record(parameters)
 
     def rates(z: Vector, steering: float, acceleration: float) -> Vector:
         found = np.empty_like(z)
@@ -53,7 +56,9 @@ def equations(model: str, parameters: Any) -> Rates:
 
 @cache
 def prepare(model: str) -> Any:
-    """Compile the equations of a model, which takes long the first time; None if they cannot be."""
+    """Compile the equations of a model, which takes long the first time; None if they are not."""
+    if model not in _COMPILED:
+        return None
     import numba
     from numba.core.errors import NumbaError
 
@@ -73,8 +78,8 @@ def prepare(model: str) -> Any:
 
 
 def kept(model: str) -> bool:
-    """Whether the equations of a model have been compiled before, for this machine."""
-    return is_kept(_folder(model), _of(_dynamics(model)))
+    """Whether the equations of a model need not be compiled on this machine any more."""
+    return model not in _COMPILED or is_kept(_folder(model), _of(_dynamics(model)))
 
 
 def _dynamics(model: str) -> Any:

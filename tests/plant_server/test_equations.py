@@ -1,4 +1,4 @@
-"""The library's equations, compiled, are the library's equations."""
+"""The library's equations, compiled or not, are the library's equations."""
 
 from typing import Any
 
@@ -52,6 +52,12 @@ def test_they_say_what_the_library_says(model: str, car: int) -> None:
     assert said > 80
 
 
+@pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
+def test_those_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
+    assert (compiled.prepare(model) is not None) == is_compiled
+    assert compiled.kept(model)
+
+
 def test_they_take_the_parameters_that_they_are_given() -> None:
     slippery, grippy = parameters(2), parameters(2)
     slippery.tire.p_dy1 *= 0.1
@@ -71,6 +77,7 @@ def test_what_cannot_be_compiled_is_run_as_it_is(
         return [eval("2 * value") for value in z]
 
     monkeypatch.setattr(compiled, "_dynamics", lambda model: dynamics)
+    monkeypatch.setattr(compiled, "_COMPILED", ("other",))
     prepare_anew = compiled.prepare.__wrapped__
     monkeypatch.setattr(compiled, "prepare", prepare_anew)
     rates = equations("other", parameters(2))
