@@ -44,6 +44,9 @@ def find_shipped(name: str, folder: str) -> Path:
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]}? There" if close else "there"
     kind = folder.removesuffix("s")
+    for other in KINDS:
+        if name in shipped_names(other):
+            raise CallerError(f"{name}: that is a shipped {other.removesuffix('s')}, no {kind}")
     raise CallerError(f"{name}: no such file, nor a shipped {kind}; {hint} are {', '.join(names)}")
 
 

@@ -208,7 +208,10 @@ def print_claims(console: Console, summary: Summary) -> None:
         )
     console.print(table)
     if any(claim["ratio"] is not None for claim in claims):
-        console.print("[dim]used: how near the run came to the bound, at its nearest[/]")
+        console.print(
+            "[dim]used: how near the run came to the bound, at its nearest; "
+            "those on ‖e_c‖ that are made of the run itself are tight[/]"
+        )
     for verdict, why in dict.fromkeys((c["verdict"], c["why"]) for c in claims):
         if verdict != "held" and why:
             console.print(f"{verdict}: {_sources(claims, verdict, why)}: {why}",

@@ -194,7 +194,9 @@ def _purpose(section: type[BaseModel] | None, key: str) -> str:
     inner = _section_of(field.annotation) if field is not None else None
     text = (inner.__doc__ if inner is not None else field.description if field else None) or ""
     purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
-    return f" ({purpose[0].lower()}{purpose[1:]})" if purpose else ""
+    if purpose[1:2].islower() or purpose.startswith("A "):  # a word, not M or UDP
+        purpose = purpose[0].lower() + purpose[1:]
+    return f" ({purpose})" if purpose else ""
 
 
 def _nearest(key: str, section: type[BaseModel] | None) -> str:

@@ -2,7 +2,8 @@
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     try:
         return completed(content, path)
     except CallerError as error:
-        raise CallerError(_attributed(str(error), path, keys)) from None
+        raise CallerError(_attributed(str(error), path, keys) if keys else str(error)) from None
 
 
 def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
@@ -99,11 +100,39 @@ def json_schema() -> dict[str, Any]:
     return toml_file.json_schema(Scenario)
 
 
-def _attributed(lines: str, path: Path, keys: Iterable[str]) -> str:
-    """Name ``--set`` instead of the file where one of these keys, or a part of it, is wrong."""
-    set_here = "|".join(map(re.escape, keys)) or "(?!)"
-    mistake = re.compile(rf"^{re.escape(printable(str(path)))}: (?=(?:{set_here})[.:=\s])", re.M)
-    return mistake.sub("--set ", lines)
+def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
+    """Name ``--set`` where a key that was set is wrong, or the file would be right without it.
+
+    Args:
+        lines: mistakes of a file with settings.
+        path: of the file.
+        keys: that were set.
+    """
+    try:
+        completed(toml_file.read(path), path)
+        alone = True
+    except CallerError:
+        alone = False
+
+    def said_of(line: re.Match[str]) -> str:
+        if any(re.match(rf"{re.escape(key)}[.:=\s]", line["rest"]) for key in keys):
+            return f"--set {line['rest']}"
+        if not alone:
+            return line[0]
+        place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
+        shared = [_shared(place, key.split(".")) for key in keys]
+        nearest = [key for key, parts in zip(keys, shared, strict=True) if parts == max(shared)]
+        return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
+
+    file = re.escape(printable(str(path)))
+    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", said_of, lines, flags=re.MULTILINE)
+
+
+def _shared(one: Sequence[str], other: Sequence[str]) -> int:
+    """How many parts two keys begin with alike."""
+    return sum(
+        1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
+    )
 
 
 def _apply(content: dict[str, Any], override: str) -> str:

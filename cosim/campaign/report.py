@@ -65,6 +65,13 @@ def print_summary(console: Console, summary: Summary) -> None:
             console.print(table)
         if len(rows) > _MOST_ROWS:
             console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
+    if campaign.time == "continuous":
+        console.print(
+            "continuous time: the trigger watches always, and the network takes none; with "
+            'time = "sampled" it is as in a live run, sampling and delays included',
+            style="dim",
+            highlight=False,
+        )
     remarks = list(unfinished(summary))
     for remark in remarks[:_MOST_REMARKS]:
         console.print(remark, style="yellow", markup=False, highlight=False)

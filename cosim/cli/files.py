@@ -1,6 +1,6 @@
 """Commands on scenario files."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated
 
 import typer
@@ -17,7 +17,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
-from cosim.shipped import KINDS, all_shipped, text_of
+from cosim.shipped import KINDS, Shipped, all_shipped, text_of
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
@@ -53,14 +53,24 @@ def scenarios(
         return ExitStatus.OK
     console = Console()
     for kind, some in shipped.items():
-        table = Table.grid(padding=(0, 2), expand=False)
-        table.add_column(no_wrap=True, style="cyan")
-        table.add_column()
-        for one in some:
-            table.add_row(one.name, one.description)
         console.print(kind, style="bold", highlight=False)
-        console.print(table)
+        _print_shipped(console, some)
     return ExitStatus.OK
+
+
+def _print_shipped(console: Console, some: Sequence[Shipped]) -> None:
+    """A line each where a program reads, wrapped beside their names where a person does."""
+    width = max(len(one.name) for one in some)
+    if not console.is_terminal:
+        for one in some:
+            print(f"{one.name:{width}}  {one.description}")
+        return
+    table = Table.grid(padding=(0, 2))
+    table.add_column(min_width=width, no_wrap=True, style="cyan")
+    table.add_column()
+    for one in some:
+        table.add_row(one.name, one.description)
+    console.print(table)
 
 
 @command(FILES, [

@@ -98,8 +98,15 @@ def _patient(stream: Any) -> Any:
 
 
 class _Patient(io.FileIO):
+    """Says once that it is full; what is left is tried again at the end, and nobody listens."""
+
+    _full = False
+
     def write(self, data: Any, /) -> int:
         try:
             return super().write(data)
-        except BrokenPipeError:
+        except OSError as error:
+            if not self._full and not isinstance(error, BrokenPipeError):
+                self._full = True
+                raise
             return memoryview(data).nbytes

@@ -232,7 +232,7 @@ def _cache(machine: Machine) -> Finding:
     what = "compiled code"
     if machine.cache:
         return Finding(what, Verdict.GOOD, "is kept in your cache", "")
-    means = "campaigns, and netem on its own, compile anew each time"
+    means = "campaigns, netem on its own, and vehicles with tyres compile anew each time"
     remedy = "set XDG_CACHE_HOME to a folder that can be written"
     return Finding(what, Verdict.LIMITED, "cannot be kept", means, remedy)
 

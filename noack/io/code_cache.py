@@ -5,10 +5,12 @@ import hashlib
 import importlib
 import os
 import shutil
+import signal
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -87,9 +89,27 @@ def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any
             with suppress(OSError):  # where files cannot be locked all of them compile
                 file = stack.enter_context(lock.open("w"))
                 fcntl.flock(file, fcntl.LOCK_EX)
-            return compiling(signature)
+            with _to_the_end():
+                return compiling(signature)
 
     return compile_alone
+
+
+@contextmanager
+def _to_the_end() -> Iterator[None]:
+    """Let Ctrl-C wait: LLVM calls Python back, and does not survive an exception there."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    came: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _numba() -> Any:

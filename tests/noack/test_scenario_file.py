@@ -442,12 +442,19 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
         (["plant.initial_state=[1,2]"], ["--set plant.initial_state = [1, 2]: "]),
         (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
         (["trigger.beta=1"], ["FILE: name = 1: "]),  # nothing is wrong with what was set
+        # The file alone is right, but not with what was set.
+        (["model.A=[[1]]"], ['FILE with --set model.A: model.name = "lane_following": ']),
+        (
+            ["horizon_s=3", 'network.loss.model="gilbert_elliott"', "network.mansd=9"],
+            ["FILE with --set network.loss.model: network.loss.probability = 0.8: unknown key; "],
+        ),
+        (["mode=zoh", "observer.kind=kalman"], ["FILE with --set observer.kind: observer."]),
     ],
 )
 def test_what_is_wrong_with_a_setting_is_not_said_of_the_file(
     settings: list[str], told: list[str], tmp_path: Path
 ) -> None:
-    name = "1" if told[0].startswith("FILE") else '"lane"'
+    name = "1" if told[0].startswith("FILE: ") else '"lane"'
     text = LANE.replace('name = "lane"', f"name = {name}", 1)
     lines = mistakes_with(text, tmp_path, settings)
     assert len(lines) == len(told)

@@ -22,7 +22,7 @@ def scenarios(*words: str) -> Result:
 def test_all_are_listed_with_what_they_say_of_themselves() -> None:
     done = scenarios()
     assert done.exit_code == 0
-    listed = " ".join(done.stdout.split())
+    listed = [" ".join(line.split()) for line in done.stdout.splitlines()]  # a line each
     for folder, names in (("scenarios", SCENARIOS), ("campaigns", CAMPAIGNS)):
         for name in names:
             content = tomllib.loads((ROOT / folder / f"{name}.toml").read_text("utf-8"))

@@ -104,3 +104,24 @@ def test_what_is_said_is_heard_at_once(unbuffered: str, tmp_path: Path) -> None:
         assert "waiting for" in process.stderr.readline()
         process.terminate()
         assert process.wait(PATIENCE_S) == 143
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+@pytest.mark.parametrize(
+    "words", [("scenarios",), ("scenarios", "--json"), ("scenarios", "lane_weighted")]
+)
+def test_a_full_disk_is_one_line(words: tuple[str, ...], tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*NOACK, *words], cwd=tmp_path, env=environment(),
+            stdout=full, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("noack: cannot write: ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_terminal_gets_the_list_wrapped_and_a_pipe_a_line_each(tmp_path: Path) -> None:
+    wrapped = on_a_terminal("scenarios", cwd=tmp_path, COLUMNS="60", NO_COLOR="1")
+    assert max(map(len, wrapped.splitlines())) <= 60
+    assert "unstable_pendulum" in wrapped

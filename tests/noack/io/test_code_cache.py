@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -12,7 +13,7 @@ from typing import Any, NoReturn
 import numba
 import pytest
 
-from noack.io.code_cache import cache_folder, compiler
+from noack.io.code_cache import _one_at_a_time, cache_folder, compiler
 
 SOURCES = [Path(__file__)]
 
@@ -123,3 +124,25 @@ def test_nor_on_a_full_disk_unless_it_is_there_already(
     assert compiler(folder)(doubled)(21) == 42
     monkeypatch.setattr(os, "posix_fallocate", refuse)
     assert cache_folder("netem", SOURCES) == folder
+
+
+def test_ctrl_c_waits_for_the_compiler(home: Path) -> None:
+    """LLVM calls Python back, and does not survive an exception there."""
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    function = compiler(folder)(doubled)
+    going_on: list[str] = []
+    compile_once = function.compile.__closure__[0].cell_contents  # what the lock surrounds
+
+    def interrupted(signature: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        going_on.append("compiled all the same")
+        return compile_once(signature)
+
+    function.compile = _one_at_a_time(interrupted, folder / ".lock")
+    with pytest.raises(KeyboardInterrupt):
+        function(21)
+    assert going_on
+    assert function(21) == 42  # without compiling anew
+    assert len(going_on) == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
