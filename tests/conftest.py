@@ -14,6 +14,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import pytest
 from hypothesis import HealthCheck, settings
+from hypothesis.internal.conjecture import providers
 
 from tests.distribution import LongestFirst, in_order
 
@@ -36,6 +37,10 @@ settings.load_profile("noack")
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = in_order(items)
+    if settings().derandomize:
+        # Hypothesis would try numbers of the modules that are loaded, and these depend on which
+        # tests this worker has run before.
+        providers._get_local_constants = providers.Constants
 
 
 @pytest.hookimpl(optionalhook=True)  # there may be no xdist, or not be asked for
