@@ -153,9 +153,9 @@ def value_of(text: str, source: str) -> Any:
     """
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
     except (ValueError, RecursionError) as error:
+        if isinstance(error, tomllib.TOMLDecodeError) and text.lstrip()[:1] not in tuple("{[\"'"):
+            return text
         raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
 
 

@@ -554,6 +554,11 @@ def test_the_last_setting_of_a_key_counts(tmp_path: Path) -> None:
         (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
         ("trigger.beta.x=1", "--set trigger.beta.x=1: beta is not a table"),
         (
+            "plant.initial_state=[1,2",
+            "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)",
+        ),
+        ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
+        (
             "plant.initial_state.0=1",
             "--set plant.initial_state.0=1: initial_state is not a table "
             "(a list is set as a whole)",
