@@ -246,6 +246,11 @@ def percent(share: float) -> str:
     return f"{round(100 * share, 1) + 0.0:.1f} %"
 
 
+def is_against(share: float) -> bool:
+    """Whether a share, as people see it, takes away from what the others make."""
+    return round(100 * share, 1) < 0
+
+
 def _difference(x: Matrix) -> Difference:
     norms = np.linalg.norm(x, axis=1)
     return Difference(

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.fidelity import Difference, Fidelity, percent
+from cosim.fidelity import Difference, Fidelity, is_against, percent
 
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
@@ -59,7 +59,7 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
         if name != "unexplained":
-            against = ", against the others" if share < -0.0005 else ""
+            against = ", against the others" if is_against(share) else ""
             yield f"  share of {name.replace('_', ' ')}", percent(share) + against
     yield "  unexplained, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
 

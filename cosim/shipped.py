@@ -1,6 +1,7 @@
 """Files that come with noack, found by name: scenarios and campaigns."""
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,19 +36,16 @@ def find_shipped(name: str, folder: str) -> Path:
     path = Path(name)
     if path.exists() or path.suffix == ".toml":
         return path
-    if (shipped := _place(folder) / f"{name}.toml").is_file():
-        inside = shipped.is_relative_to(Path.cwd())
-        return shipped.relative_to(Path.cwd()) if inside else shipped
     names = shipped_names(folder)
+    if name in names:
+        return _path_of(name, folder)
     if path.parent.name or not names:
         return path
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]}? There" if close else "there"
     kind = folder.removesuffix("s")
     for other in KINDS:
         if name in shipped_names(other):
             raise CallerError(f"{name}: that is a shipped {other.removesuffix('s')}, no {kind}")
-    raise CallerError(f"{name}: no such file, nor a shipped {kind}; {hint} are {', '.join(names)}")
+    raise CallerError(f"{name}: no such file, nor a shipped {kind}; {_hint(name, names)}")
 
 
 def shipped_names(folder: str) -> list[str]:
@@ -57,7 +55,7 @@ def shipped_names(folder: str) -> list[str]:
 
 def all_shipped(folder: str) -> list[Shipped]:
     """Return the scenarios or campaigns that come with noack, by name."""
-    paths = (find_shipped(name, folder) for name in shipped_names(folder))
+    paths = (_path_of(name, folder) for name in shipped_names(folder))
     return [Shipped(path.stem, toml_file.read(path)["description"], path) for path in paths]
 
 
@@ -69,12 +67,21 @@ def text_of(name: str) -> str:
     """
     for folder in KINDS:
         if name in shipped_names(folder):
-            lines = (_place(folder) / f"{name}.toml").read_text(encoding="utf-8").splitlines(True)
+            lines = _path_of(name, folder).read_text(encoding="utf-8").splitlines(keepends=True)
             return "".join(line for line in lines if not line.startswith(_SCHEMA))
     names = [known for folder in KINDS for known in shipped_names(folder)]
+    raise CallerError(f"{name}: nothing of that name is shipped; {_hint(name, names)}")
+
+
+def _hint(name: str, names: Sequence[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean {close[0]}? There" if close else "there"
-    raise CallerError(f"{name}: nothing of that name is shipped; {hint} are {', '.join(names)}")
+    return f"{f'did you mean {close[0]}? There' if close else 'there'} are {', '.join(names)}"
+
+
+def _path_of(name: str, folder: str) -> Path:
+    """Where a shipped file lies; relative to the working directory if that is around it."""
+    path = _place(folder) / f"{name}.toml"
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _place(folder: str) -> Path:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from cosim.fidelity import percent
+from cosim.fidelity import is_against, percent
 from cosim.replay.result import Difference
 
 FIDELITY, REPLAY = "Fidelity", "Replay"
@@ -53,7 +53,7 @@ def _fidelity(found: Mapping[str, Any]) -> Iterator[str]:
         else f"The effects below do not explain it: {left} is left, which is too much."
     )
     yield _events(found)
-    if min(found["shares"].values()) < 0:
+    if any(map(is_against, found["shares"].values())):
         yield (
             "Effects partly cancel: one with a negative share takes away from the difference that "
             "the others make."

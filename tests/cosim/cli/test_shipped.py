@@ -29,6 +29,16 @@ def test_all_are_listed_with_what_they_say_of_themselves() -> None:
             assert f"{name} {content['description']}" in listed
 
 
+def test_a_folder_of_the_same_name_is_not_taken_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cart_pole").mkdir()
+    (found, *_) = json.loads(scenarios("--json").stdout)["scenarios"]
+    assert found["name"] == "cart_pole"
+    assert load(Path(found["path"])).name == "cart_pole"
+
+
 def test_the_list_as_a_document_names_files_that_can_be_read() -> None:
     document = json.loads(scenarios("--json").stdout)
     assert [one["name"] for one in document["scenarios"]] == SCENARIOS

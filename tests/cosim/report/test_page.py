@@ -205,7 +205,7 @@ def test_the_difference_to_the_ideal_loop_is_told_in_words(
         assert text in page.text
     assert "held_actuation" not in page.text
     assert "Replay" not in page.text
-    shares = {"sampling": 1.0, "delay": 0.0, "held_actuation": 0.0, "unexplained": 0.0}
+    shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "unexplained": 0.0}
     page, _, _ = written(
         record, tmp_path, fidelity=fidelity(explained=False, explained_relative=0.4,
                                             shares=shares, parted_event=7)
