@@ -30,8 +30,8 @@ from noack.scenario_file import load
 from noack.wire import Flow, Message
 from plant_server.plant import Plant, plant_of
 
-STEPS = 2000
-"""At most; a run that is shorter has fewer."""
+STEPS = 7500
+"""At most: all of the vehicles' scenario, as its slow steps come late. A shorter run has fewer."""
 PACE_NS = 2_000_000
 SHARE = Goal("<", 20.0)
 """Per cent of its period that a step may take at p99."""

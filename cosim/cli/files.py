@@ -26,7 +26,7 @@ from noack.scenario_file import json_schema, load
 
 
 @command(FILES, [
-    ("noack scenarios", "all of them, a line each"),
+    ("noack scenarios", "all of them, and what each is"),
     ("noack scenarios unstable_pendulum > mine.toml", "a file to change into your own"),
     ("noack scenarios --json", ""),
 ])  # fmt: skip

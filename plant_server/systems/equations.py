@@ -1,6 +1,6 @@
 """The equations of CommonRoad's vehicle models; those with tyres are compiled, as they stand.
 
-Run by Python, a step of the multi-body model takes a third of a period of 2 ms and more. Of the
+Run by Python, the multi-body model takes three times as long, and too long for 500 Hz. Of the
 small models a call of compiled code costs more than it saves: it wants more of the processor's
 caches, which have other contents at each step.
 """

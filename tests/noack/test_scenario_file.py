@@ -422,6 +422,19 @@ def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> N
     assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)  # what it is for
 
 
+@pytest.mark.parametrize(
+    ("key", "begins"),
+    [("network.mansd", "M − 1, the "), ("network.loss", "what is lost, ")],
+)
+def test_what_a_missing_key_is_for_begins_as_in_a_sentence(
+    content: Content, key: str, begins: str, tmp_path: Path
+) -> None:
+    section, last = key.split(".")
+    del content[section][last]
+    (line,) = mistakes(tomli_w.dumps(content), tmp_path)
+    assert line.partition("(")[2].startswith(begins), line
+
+
 def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
     settings = ["mode=x", "plant.rate=1", "trigger.beta=-1", "network.loss.probability=2"]
     lines = mistakes(LANE, tmp_path, settings)

@@ -288,6 +288,7 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
     assert "[/b]" in result.stdout
     told = " ".join(result.stdout.split())
     assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
+    assert "continuous time: the trigger watches always, and the network takes none" in told
 
 
 @pytest.mark.parametrize("width", range(40, 120))

@@ -35,6 +35,7 @@ MISTAKES = {
 NOT_FOUND = {
     "lane_folowing": "did you mean lane_following? There are cart_pole, ",
     "nothing": "nor a shipped scenario; there are cart_pole, ",
+    "mb_vs_zoh": "mb_vs_zoh: that is a shipped campaign, no scenario",
 }
 
 

@@ -121,7 +121,7 @@ def test_a_full_disk_is_one_line(words: tuple[str, ...], tmp_path: Path) -> None
     assert done.stderr.count("\n") == 1
 
 
-def test_a_terminal_gets_the_list_wrapped_and_a_pipe_a_line_each(tmp_path: Path) -> None:
+def test_a_terminal_gets_the_list_wrapped(tmp_path: Path) -> None:
     wrapped = on_a_terminal("scenarios", cwd=tmp_path, COLUMNS="60", NO_COLOR="1")
     assert max(map(len, wrapped.splitlines())) <= 60
     assert "unstable_pendulum" in wrapped
