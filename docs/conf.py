@@ -13,7 +13,15 @@ project = "noack"
 author = "the noack authors"
 version = release = version_of("noack")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "reference_pages"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx-mathjax-offline",  # MathJax is served with the site, not from another host
+    "reference_pages",
+]
+myst_enable_extensions = ["dollarmath"]
 
 # Sections are linked to by the names that GitHub gives them, so that links work there as well.
 myst_heading_anchors = 4

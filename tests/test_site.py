@@ -44,6 +44,21 @@ def test_every_public_name_of_the_library_is_on_its_page(site: Path) -> None:
         assert f'id="noack.{name}"' in text
 
 
+def test_formulas_are_set_by_mathjax_of_the_site_itself(site: Path) -> None:
+    for name in ("theory", "derivations", "mansd"):
+        page = (site / f"{name}.html").read_text()
+        assert '<div class="math notranslate nohighlight">' in page or name == "mansd"
+        (script,) = re.findall(r'<script[^>]*src="(_static/mathjax/[^"?]*)', page)
+        assert (site / script).is_file()
+        left = re.sub(r'<(div|span) class="math.*?</\1>|<script.*?</script>', "", page, flags=re.S)
+        assert not re.search(r"\$|\\(?:lVert|beta|frac)", left)
+
+
+def test_what_noack_does_not_do_is_said_and_linked() -> None:
+    for page, link in (("README.md", "docs/limits.md"), ("docs/index.md", "limits.md")):
+        assert f"]({link})" in (ROOT / page).read_text()
+
+
 def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in site.glob("*.html"):
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", page.read_text())

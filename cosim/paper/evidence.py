@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import schur
 
 from cosim.exact.fates import network_fates
 from cosim.exact.loop import continuous_loop_of
@@ -34,6 +35,8 @@ _SAMPLED_S = 20.0
 _SAMPLES = 101
 _ROUNDING = 1e-12
 """What is smaller is a matter of rounding, and of the machine."""
+_ZERO = 1e-6
+"""Eigenvalues below it in magnitude are 0: the lane's double eigenvalue 0 is defective."""
 
 
 def evidence(path: Path, representative: int) -> Numbers:
@@ -118,28 +121,36 @@ def _exact_model(path: Path) -> Numbers:
 
 
 def _trapped(path: Path) -> Numbers:
-    """For how many directions of x the pair (x, x) has no share in Γ's unstable modes."""
+    """The dimensions of the x whose pair (x, x) lies in the span of Γ's stable modes.
+
+    "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
+    """
     scenario = load_condition(path, BASE)
     draw = 0
     while True:
         loop = loop_of(resolved_draw(scenario, draw, "model"))
-        if open_loop_eigenvalues(loop).real.max() > 0:
+        if (unstable := int((open_loop_eigenvalues(loop).real > _ZERO).sum())) > 0:
             break
         draw += 1
-    found: Numbers = {"draw": draw, "n": loop.n}
-    for mode, H in (("model", loop.H), ("zoh", np.zeros_like(loop.H))):
-        unstable = 0
-        rows = []
-        eigenvalues, left = np.linalg.eig(loop.A.T)
-        for value, w in zip(eigenvalues, left.T, strict=True):
-            if value.real > 1e-6:
-                # (w, v) is a left eigenvector of Γ: v (λI − H) = w BK.
-                v = np.linalg.solve((value * np.eye(loop.n) - H).T, (loop.B @ loop.K).T @ w)
-                rows.append(w + v)
-                unstable += 1
-        found["unstable"] = unstable
-        found[mode] = loop.n - int(np.linalg.matrix_rank(np.array(rows)))
-    return found
+    return {
+        "draw": draw,
+        "n": loop.n,
+        "unstable": unstable,
+        "model": _stable_pairs(loop, loop.H, _ZERO),
+        "zoh": _stable_pairs(loop, np.zeros_like(loop.H), _ZERO),
+        "strictly": _stable_pairs(loop, loop.H, -_ZERO),
+    }
+
+
+def _stable_pairs(loop: Loop, H: Matrix, least_real: float) -> int:
+    """Dimensions of {x: (x, x) has no share in modes of Γ = [[A, BK], [0, H]] beyond a real part.
+
+    The rows of the left invariant subspace of these modes vanish on such a pair.
+    """
+    gamma = np.block([[loop.A, loop.B @ loop.K], [np.zeros_like(H), H]])
+    _, basis, modes = schur(gamma.T, sort=lambda re, im=0.0: re > least_real)
+    rows = basis[:, :modes].T
+    return loop.n - int(np.linalg.matrix_rank(rows[:, : loop.n] + rows[:, loop.n :], tol=_ZERO))
 
 
 def _slow_model(M: int) -> Numbers:
@@ -170,7 +181,7 @@ def _slow_model(M: int) -> Numbers:
             float(np.linalg.norm(state.e_c)) * math.exp(trigger.alpha_per_s * state.t_s)
             for state in ends
         ],
-        "gaps_s": np.diff(run.event_s).tolist(),
+        "first_ratios": (np.diff(run.event_s)[1:5] / run.event_s[1:5]).tolist(),
     }
 
 

@@ -1,9 +1,9 @@
 """Chooses the weight W of the trigger's norm, so that the certificate says as much as it can.
 
 A factor W of P = WᵀW with (H+αI)ᵀP + P(H+αI) ⪯ 0 makes ‖·‖_W contract along the models, hence
-Δ = M on an instant network, the least there is. Among these, the one with the longest certified
-inter-event time is searched for (P solves the Lyapunov equation for some Q ⪰ 0; Q is varied). Its
-scale is such that ‖W e‖ ≤ β holds as much volume as ‖e‖ ≤ β: |det W| = 1.
+Δ ≤ M on an instant network. Among these factors, the one with the longest certified inter-event
+time is searched for (P solves the Lyapunov equation for some Q ⪰ 0; Q is varied). Its scale is such
+that ‖W e‖ ≤ β encloses the same volume as ‖e‖ ≤ β: |det W| = 1.
 """
 
 from collections.abc import Callable
