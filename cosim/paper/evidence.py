@@ -148,7 +148,11 @@ def _stable_pairs(loop: Loop, H: Matrix, least_real: float) -> int:
     The rows of the left invariant subspace of these modes vanish on such a pair.
     """
     gamma = np.block([[loop.A, loop.B @ loop.K], [np.zeros_like(H), H]])
-    _, basis, modes = schur(gamma.T, sort=lambda re, im=0.0: re > least_real)
+
+    def beyond(real: float, imaginary: float) -> bool:
+        return real > least_real
+
+    _, basis, modes = schur(gamma.T, sort=beyond)
     rows = basis[:, :modes].T
     return loop.n - int(np.linalg.matrix_rank(rows[:, : loop.n] + rows[:, loop.n :], tol=_ZERO))
 
