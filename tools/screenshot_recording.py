@@ -22,6 +22,7 @@ from typing import Any
 
 from cosim.viewer.server import RecordingServer
 from noack.errors import CallerError, MachineError, NoackError
+from noack.python_process import python_command
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
@@ -57,15 +58,7 @@ class Browser:
         from_browser, to_us = os.pipe()
         ends = [str(from_us), str(to_us)]
         self.process = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                PLACE_PIPES,
-                *ends,
-                program,
-                *FLAGS,
-                f"--user-data-dir={profile}",
-            ],
+            python_command("-c", PLACE_PIPES, *ends, program, *FLAGS, f"--user-data-dir={profile}"),
             pass_fds=(from_us, to_us),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -31,6 +31,7 @@ from noack.io.code_cache import cache_folder
 from noack.io.private import make_private, private_folder
 from noack.io.star import Secret, answer_to, cause_of, open_star
 from noack.io.udp import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
+from noack.python_process import python_command
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES
 
@@ -95,7 +96,7 @@ def _or_why(measuring: Callable[[], T]) -> T | str:
 
 
 def _probe(*arguments: object) -> list[str]:
-    return [sys.executable, "-P", "-m", "cosim.doctor.probe", *map(str, arguments)]
+    return python_command("-m", "cosim.doctor.probe", *arguments)
 
 
 def _wake_ups(
