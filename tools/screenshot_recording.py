@@ -134,7 +134,7 @@ def take_picture(recording: Path, size: tuple[int, int], theme: str) -> bytes:
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
         contextlib.closing(Browser(program, profile)) as browser,
     ):
-        browser.open(f"{server.start_page()}&theme={theme}&persist=0", *size)
+        browser.open(f"{server.start_page()}?theme={theme}&persist=0", *size)
         last = None
         while time.monotonic() < deadline:
             if server.downloaded.wait(POLL_S):

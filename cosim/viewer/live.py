@@ -16,7 +16,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import FrameType
 
-from cosim.viewer.server import RecordingServer, end_process
+from cosim.viewer.rerun_program import end_process
+from cosim.viewer.server import RecordingServer
 from noack.errors import CallerError, ExitStatus, MachineError
 from noack.python_process import python_command
 
