@@ -13,10 +13,9 @@ from typing import Any
 import pytest
 
 from noack.io.code_cache import cache_folder, compiler
+from tests.attacks.other_user import NOBODY, needs_root
 
 SOURCES = [Path(__file__)]
-NOBODY = 65534
-needs_root = pytest.mark.skipif(os.getuid() != 0, reason="gives folders to another user id")
 
 
 @pytest.fixture

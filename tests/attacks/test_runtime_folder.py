@@ -20,11 +20,10 @@ from noack.io import open_runs
 from noack.io.ticket import Ticket, new_ticket, published, ticket_path, wait_for_ticket
 from noack.resolve import resolve
 from noack.scenario_file import validate
+from tests.attacks.other_user import NOBODY, needs_root
 
-NOBODY = 65534
 OWN = f"noack-{os.getuid()}"
 EMULATOR = session.Session("lab", "tcp/127.0.0.1:1", "secret")
-needs_root = pytest.mark.skipif(os.getuid() != 0, reason="gives files to another user id")
 
 _swaps: list[Callable[[str], None]] = []
 """What another user does as this process opens a file; an audit hook stays for ever."""

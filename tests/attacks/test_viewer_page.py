@@ -14,7 +14,7 @@ import pytest
 from cosim.viewer.peer_user import peer_user
 from cosim.viewer.server import RECORDING, RecordingServer
 from cosim.viewer.web_viewer import HOST
-from tests.attacks.other_user import as_another_user, needs_root, said_by_another_user
+from tests.attacks.other_user import NOBODY, as_another_user, needs_root, said_by_another_user
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/net/tcp").exists(), reason="only Linux tells whose a connection is"
@@ -213,7 +213,7 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
             assert theirs.stdout is not None
             assert theirs.stdout.readline() == "connected\n"
             connection, _ = listening.accept()
-            assert peer_user(connection) == 65534
+            assert peer_user(connection) == NOBODY
         connection.close()
 
 
