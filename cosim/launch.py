@@ -26,6 +26,7 @@ from noack.io.process import TICKET_ON_STDIN
 from noack.io.signals import Signals
 from noack.io.ticket import Ticket, new_ticket, published
 from noack.io.udp import LOOPBACK, free_tcp_port, require_free_tcp_port
+from noack.python_process import python_command
 from noack.resolve import resolve
 from noack.scenario import Scenario
 from noack.topology import PLANT, RECORDER, ROLES
@@ -214,8 +215,7 @@ class _Run:
             self._watcher = Watcher()
 
     def _start(self, role: str, *, live: bool) -> subprocess.Popen[str]:
-        # -P: a module of the folder in which the person stands must not shadow one of ours.
-        command = [sys.executable, "-P", "-m", _MODULES[role]]
+        command = python_command("-m", _MODULES[role])
         if role == RECORDER and live:
             command.append("--live")
         environment = os.environ | {

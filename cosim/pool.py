@@ -9,9 +9,11 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 
-_ONE_THREAD = dict.fromkeys(
+_ENVIRONMENT = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
-)
+) | {"PYTHONSAFEPATH": "1"}
+"""One thread each; and none imports from the current folder (:mod:`noack.python_process`), as
+Python would before multiprocessing hands it the parent's path."""
 
 
 @contextmanager
@@ -23,8 +25,8 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     # A fork would inherit whatever threads the libraries have started.
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(_ONE_THREAD)  # for the children, who inherit it
+    before = {name: os.environ.get(name) for name in _ENVIRONMENT}
+    os.environ.update(_ENVIRONMENT)  # for the children, who inherit it
     with interrupts_held():  # it starts a process that keeps account of semaphores
         pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
     try:

@@ -10,6 +10,8 @@ import warnings
 
 import numpy as np
 
+from noack.python_process import python_command
+
 _OF_NUMBERS = {
     "double", "single", "sparse", "logical",
     "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
@@ -30,7 +32,7 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
         NotImplementedError: it is of MATLAB's v7.3.
         ValueError: it cannot be read.
     """
-    command = [sys.executable, "-P", "-m", __name__, str(most_entries)]
+    command = python_command("-m", __name__, most_entries)
     try:
         done = subprocess.run(
             command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False

@@ -22,6 +22,7 @@ from typing import Any
 
 from cosim.viewer.server import RecordingServer
 from noack.errors import CallerError, MachineError, NoackError
+from noack.python_process import python_command
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (
@@ -57,15 +58,7 @@ class Browser:
         from_browser, to_us = os.pipe()
         ends = [str(from_us), str(to_us)]
         self.process = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                PLACE_PIPES,
-                *ends,
-                program,
-                *FLAGS,
-                f"--user-data-dir={profile}",
-            ],
+            python_command("-c", PLACE_PIPES, *ends, program, *FLAGS, f"--user-data-dir={profile}"),
             pass_fds=(from_us, to_us),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -141,7 +134,7 @@ def take_picture(recording: Path, size: tuple[int, int], theme: str) -> bytes:
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
         contextlib.closing(Browser(program, profile)) as browser,
     ):
-        browser.open(f"{server.start_page()}&theme={theme}&persist=0", *size)
+        browser.open(f"{server.start_page()}?theme={theme}&persist=0", *size)
         last = None
         while time.monotonic() < deadline:
             if server.downloaded.wait(POLL_S):

@@ -233,7 +233,7 @@ def _cache(machine: Machine) -> Finding:
     if machine.cache:
         return Finding(what, Verdict.GOOD, "is kept in your cache", "")
     means = "campaigns, netem on its own, and vehicles with tyres compile anew each time"
-    remedy = "set XDG_CACHE_HOME to a folder that can be written"
+    remedy = "set XDG_CACHE_HOME to a folder that you can write to, and nobody else"
     return Finding(what, Verdict.LIMITED, "cannot be kept", means, remedy)
 
 

@@ -28,9 +28,10 @@ from cosim.viewer.live import has_display
 from noack.clock import NS_PER_S
 from noack.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.io.code_cache import cache_folder
-from noack.io.private import make_private, private_folder
+from noack.io.private import open_private
 from noack.io.star import Secret, answer_to, cause_of, open_star
 from noack.io.udp import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
+from noack.python_process import python_command
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES
 
@@ -95,7 +96,7 @@ def _or_why(measuring: Callable[[], T]) -> T | str:
 
 
 def _probe(*arguments: object) -> list[str]:
-    return [sys.executable, "-P", "-m", "cosim.doctor.probe", *map(str, arguments)]
+    return python_command("-m", "cosim.doctor.probe", *arguments)
 
 
 def _wake_ups(
@@ -242,7 +243,8 @@ def _disk(runs: Path, needed: int) -> Disk:
 
 def _runtime_folder() -> str | None:
     try:
-        make_private(private_folder())
+        with open_private(create=True):
+            pass
     except CallerError as error:
         return str(error)
     return None

@@ -16,8 +16,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import FrameType
 
-from cosim.viewer.server import RecordingServer, end_process
+from cosim.viewer.rerun_program import end_process
+from cosim.viewer.server import RecordingServer
 from noack.errors import CallerError, ExitStatus, MachineError
+from noack.python_process import python_command
 
 _MAGIC = b"RRF"
 _PATIENCE_S = 5.0
@@ -56,7 +58,7 @@ class LiveView:
 
     def show(self, path: Path) -> None:
         """Start showing the file, which exists and may grow; a failure is told by ``status``."""
-        command = [sys.executable, "-m", "cosim.viewer.live", str(path)]
+        command = python_command("-m", "cosim.viewer.live", path)
         if self._native:
             command.append("--native")
         self._host = subprocess.Popen(

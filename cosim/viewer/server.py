@@ -1,38 +1,39 @@
-"""Serves one recording over HTTP on loopback, and starts rerun's viewers on it.
+"""Serves one recording over HTTP on loopback, with the page that shows it, or to a window.
 
-The web viewer's page and the recording come from the same port. A file that still grows is served
-to each viewer at that viewer's pace.
+Every user of the machine can connect. What is served is therefore under a path that begins with a
+secret; everything else does not exist. A file that still grows is served to each viewer at that
+viewer's pace.
 """
 
 import contextlib
-import ctypes
-import http.client
-import importlib.util
 import os
-import signal
-import socket
+import re
+import secrets
 import socketserver
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, Self
-from urllib.parse import quote
+from urllib.parse import parse_qs, quote
 
-from noack.errors import MachineError
+from cosim.viewer.peer_user import peer_user
+from cosim.viewer.rerun_program import start_rerun
+from cosim.viewer.web_viewer import HOST, WebViewer
+from noack.errors import MachineError, PeerError
 
-HOST = "127.0.0.1"
-RECORDING = "/recording.rrd"
+RECORDING = "recording.rrd"
 
 _BLOCK = 1 << 18
 _POLL_S = 0.1
 _START_S = 10.0
 _DRAIN_S = 2.0
-_PR_SET_PDEATHSIG = 1
+_SECRET_BYTES = 32
+_PATH = re.compile(r"/([^/]+)/(.*)")
+_OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
 class RecordingServer:
@@ -46,6 +47,10 @@ class RecordingServer:
         follow: at the end of the file, wait for more until ``finish``.
 
     Attributes:
+        address: what is served lies under it: the page itself, and the recording as
+            ``recording.rrd``. Whoever knows the address can read it.
+        window_address: the same for a window. It is on a command line, which every user can read,
+            and is served to processes of this user only.
         requested: set when a viewer has asked for the recording.
         downloaded: set when a viewer has received all of it.
 
@@ -55,13 +60,15 @@ class RecordingServer:
 
     def __init__(self, path: Path, *, follow: bool) -> None:
         self.path = path
-        self.assets_port = 0
+        self.web_viewer: WebViewer | None = None
         self.finished = threading.Event()
         self.requested = threading.Event()
         self.downloaded = threading.Event()
         self._downloads = 0
         self._lock = threading.Lock()
-        self._assets: subprocess.Popen[bytes] | None = None
+        self._secret, self._window_secret = (
+            secrets.token_urlsafe(_SECRET_BYTES) for _ in range(2)
+        )  # fmt: skip
         if not follow:
             self.finished.set()
         try:
@@ -70,6 +77,8 @@ class RecordingServer:
             raise MachineError(f"cannot serve {path}: {error}") from None
         self._http.recording = self
         self.origin = f"http://{HOST}:{self._http.server_address[1]}"
+        self.address = f"{self.origin}/{self._secret}/"
+        self.window_address = f"{self.origin}/{self._window_secret}/"
         threading.Thread(target=self._http.serve_forever, args=(0.2,), daemon=True).start()
 
     def start_page(self) -> str:
@@ -78,25 +87,14 @@ class RecordingServer:
         Raises:
             MachineError: it does not start.
         """
-        self.assets_port = _free_port()
-        arguments = ["--serve-web", "--bind", HOST, "--web-viewer-port", str(self.assets_port)]
-        # Named a recording that a page can load by itself, the program serves the page and no
-        # more; named a file it spins, and named nothing it opens another port for data.
-        self._assets = _start_viewer([*arguments, self.origin + RECORDING])
-        deadline = time.monotonic() + _START_S
-        while self._assets.poll() is None and time.monotonic() < deadline:
-            with (
-                contextlib.suppress(OSError),
-                socket.create_connection((HOST, self.assets_port), timeout=1),
-            ):
-                return f"{self.origin}/?url={quote(self.origin + RECORDING, safe='')}"
-            time.sleep(0.02)
-        raise MachineError("rerun's web viewer did not start")
+        self.web_viewer = WebViewer()
+        return self.address
 
     def open_window(self) -> subprocess.Popen[bytes] | None:
         """Open a window on the recording; None if it closed before it asked for the recording."""
-        window = _start_viewer(
-            ["--port", "auto", "--bind", HOST, self.origin + RECORDING], start_new_session=True
+        window = start_rerun(
+            ["--port", "auto", "--bind", HOST, self.window_address + RECORDING],
+            start_new_session=True,
         )
         deadline = time.monotonic() + _START_S
         while not self.requested.wait(0.02) and time.monotonic() < deadline:
@@ -116,8 +114,8 @@ class RecordingServer:
 
     def close(self) -> None:
         """Stop serving; windows stay open."""
-        if self._assets is not None:
-            end_process(self._assets)
+        if self.web_viewer is not None:
+            self.web_viewer.close()
         self._http.shutdown()
         self._http.server_close()
 
@@ -126,6 +124,17 @@ class RecordingServer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def admits(self, secret: str, user: Callable[[], int | None]) -> bool:
+        """Whether a request under this secret is answered.
+
+        Args:
+            secret: first part of the path.
+            user: gives the user id of who asks.
+        """
+        if _same(secret, self._secret):
+            return True
+        return _same(secret, self._window_secret) and user() == os.getuid()
 
     @contextlib.contextmanager
     def download(self) -> Iterator[None]:
@@ -140,6 +149,11 @@ class RecordingServer:
                 self._downloads -= 1
 
 
+def _same(secret: str, wanted: str) -> bool:
+    """Whether two secrets are the same, in a time that tells nothing about where they differ."""
+    return secrets.compare_digest(secret.encode(), wanted.encode())
+
+
 class _Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
@@ -150,21 +164,42 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
     def do_GET(self) -> None:
-        """Answer with the recording, or with a file of the web viewer."""
-        if self.headers.get("Host", "").partition(":")[0] not in (HOST, "localhost"):
+        """Answer with the page, one of its files, or the recording."""
+        recording = self.server.recording
+        path, _, query = self.path.partition("?")
+        found = _PATH.fullmatch(path)
+        if not (self.path.isascii() and self.path.isprintable()):
+            self.send_error(400)
+        elif not _OWN_HOST.fullmatch(self.headers.get("Host", "")):
             self.send_error(403)  # a foreign name made to resolve to loopback
-        elif self.path == RECORDING:
-            self._send_recording(self.server.recording)
+        elif found is None or not recording.admits(found[1], lambda: peer_user(self.connection)):
+            self.send_error(404)
+        elif (name := found[2]) == RECORDING:
+            self._send_recording(recording)
+        elif name == "" and "url" not in parse_qs(query):
+            self._send_to_recording(path, query)
         else:
-            self._send_asset(self.server.recording.assets_port)
+            self._send_file(recording.web_viewer, name)
 
     def handle(self) -> None:
-        """Serve one connection; a viewer may break it at any time."""
-        with contextlib.suppress(ConnectionError):
+        """Serve one connection; a viewer may break it at any time, as may the web viewer's."""
+        with contextlib.suppress(ConnectionError, TimeoutError, HTTPException):
             super().handle()
+
+    def end_headers(self) -> None:
+        """Keep the page's address from the servers of what the page loads from elsewhere."""
+        self.send_header("Referrer-Policy", "no-referrer")
+        super().end_headers()
 
     def log_message(self, *_: Any) -> None:
         """Say nothing."""
+
+    def _send_to_recording(self, path: str, query: str) -> None:
+        """Send the browser to the page with the recording's address, as the browser reaches it."""
+        address = quote(f"http://{self.headers['Host']}{path}{RECORDING}", safe="")
+        self.send_response(302)
+        self.send_header("Location", f"{path}?url={address}" + (f"&{query}" if query else ""))
+        self.end_headers()
 
     def _send_recording(self, recording: RecordingServer) -> None:
         try:
@@ -188,72 +223,18 @@ class _Handler(BaseHTTPRequestHandler):
                     recording.finished.wait(_POLL_S)
             recording.downloaded.set()
 
-    def _send_asset(self, port: int) -> None:
-        source = http.client.HTTPConnection(HOST, port, timeout=10)
-        with contextlib.closing(source):
-            try:
-                source.request("GET", self.path)
-                answer = source.getresponse()
-            except OSError:
-                self.send_error(404)
-                return
-            self.send_response(answer.status)
-            for name in ("Content-Type", "rerun-final-length"):
-                if (value := answer.getheader(name)) is not None:
-                    self.send_header(name, value)
-            self.end_headers()
-            while block := answer.read(_BLOCK):
-                self.wfile.write(block)
-
-
-def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) -> None:
-    """End a process that was asked to end ``patience_s`` ago, by SIGTERM, then by SIGKILL."""
-    for wait_s, act in ((patience_s, process.terminate), (1.0, process.kill)):
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(wait_s)
+    def _send_file(self, web_viewer: WebViewer | None, name: str) -> None:
+        if web_viewer is None:
+            self.send_error(404)
             return
-        act()
-    process.wait()
-
-
-def _start_viewer(
-    arguments: list[str], *, start_new_session: bool = False
-) -> subprocess.Popen[bytes]:
-    """Start rerun's program; unless it is a session of its own, it ends when this process does."""
-    tied = sys.platform == "linux" and not start_new_session
-    return subprocess.Popen(
-        [_viewer_program(), *arguments],
-        env=os.environ | {"CI": "1"},  # keeps it quiet
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=start_new_session,
-        # Not SIGTERM, for which a program that stands still waits until it goes on.
-        preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGKILL) if tied else None,
-    )
-
-
-def _prctl() -> Callable[[int, int], int]:
-    """Linux's; looked up here, as little as possible is to be done in a child."""
-    prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
-    return prctl
-
-
-def _viewer_program() -> str:
-    """Path of rerun's own program: the ``rerun`` script only wraps it, and would orphan it."""
-    if chosen := os.environ.get("RERUN_CLI_PATH"):
-        return chosen
-    spec = importlib.util.find_spec("rerun_cli")
-    if spec is not None and spec.origin is not None:
-        folder = Path(spec.origin).parent
-        for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun", "rerun.exe"):
-            if (folder / name).is_file():
-                return str(folder / name)
-    raise MachineError("the viewer of the package rerun-sdk is not installed")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((HOST, 0))
-        port: int = probe.getsockname()[1]
-        return port
+        try:
+            with web_viewer.file(name) as answer:
+                self.send_response(answer.status)
+                for header in ("Content-Type", "rerun-final-length"):
+                    if (value := answer.getheader(header)) is not None:
+                        self.send_header(header, value)
+                self.end_headers()
+                while block := answer.read(_BLOCK):
+                    self.wfile.write(block)
+        except PeerError as error:
+            self.send_error(502, str(error))

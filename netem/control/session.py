@@ -31,20 +31,6 @@ _SESSION = TypeAdapter(Session)
 _KIND = "netem"
 
 
-def _path_of(name: str) -> Path:
-    require_name(name, "emulator")
-    return held.folder_of(_KIND) / f"{name}.json"
-
-
-def make_folder() -> Path:
-    """Make the folder that session files lie in, and return it.
-
-    Raises:
-        CallerError: it cannot be made, or others may look into it.
-    """
-    return held.make_folder(_KIND)
-
-
 @contextmanager
 def published(session: Session) -> Iterator[Path]:
     """Keep a session's file while the context lasts.
@@ -52,11 +38,10 @@ def published(session: Session) -> Iterator[Path]:
     Raises:
         CallerError: the name is unfit or in use, or the folder is not the user's own.
     """
-    path = _path_of(session.name)
-    make_folder()
+    require_name(session.name, "emulator")
     with ExitStack() as stack:
         try:
-            stack.enter_context(held.held(path, session._asdict()))
+            path = stack.enter_context(held.held(_KIND, session.name, session._asdict()))
         except FileExistsError:
             raise CallerError(
                 f"--control {session.name}: an emulator of this name runs; choose another name"
@@ -70,7 +55,7 @@ def running() -> list[str]:
     Raises:
         CallerError: the folder is open to others.
     """
-    return sorted(path.stem for path in held.running(_KIND))
+    return list(_files())
 
 
 def find(name: str | None) -> Session:
@@ -80,20 +65,25 @@ def find(name: str | None) -> Session:
         CallerError: there is no such emulator, or there are several to choose from.
         PeerError: its session file cannot be read.
     """
-    names = running()
-    if not names:
+    files = _files()
+    if not files:
         raise CallerError(
             ("no emulator" if name is None else f"no emulator {name!r}")
             + " runs that can be reached; start one with `noack netem --control NAME …`"
         )
     if name is None:
-        if len(names) > 1:
-            raise CallerError(f"which emulator? There are {', '.join(names)}")
-        name = names[0]
-    elif name not in names:
-        raise CallerError(f"no emulator {name!r} runs; there are {', '.join(names)}")
+        if len(files) > 1:
+            raise CallerError(f"which emulator? There are {', '.join(files)}")
+        (name,) = files
+    elif name not in files:
+        raise CallerError(f"no emulator {name!r} runs; there are {', '.join(files)}")
     try:
-        return _SESSION.validate_json(_path_of(name).read_bytes(), strict=True)
-    except (OSError, ValidationError) as error:
-        what = brief(error) if isinstance(error, ValidationError) else error.strerror
-        raise PeerError(f"emulator {name!r}: its session file cannot be read: {what}") from None
+        return _SESSION.validate_json(files[name].content, strict=True)
+    except ValidationError as error:
+        raise PeerError(
+            f"emulator {name!r}: its session file cannot be read: {brief(error)}"
+        ) from None
+
+
+def _files() -> dict[str, held.Held]:
+    return {file.path.stem: file for file in held.running(_KIND)}

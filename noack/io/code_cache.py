@@ -1,4 +1,8 @@
-"""Where compiled code is kept from one run to the next: in the user's cache, or nowhere."""
+"""Where compiled code is kept from one run to the next: in the user's cache, or nowhere.
+
+Whoever can write there runs code as the user: numba unpickles what it finds. Nothing is kept, or
+read, where that may be another user.
+"""
 
 import fcntl
 import hashlib
@@ -6,6 +10,7 @@ import importlib
 import os
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 import time
@@ -23,25 +28,62 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
     """Return where code of these sources is kept; None if it cannot be kept.
 
     The folder's name depends on what all the sources say: numba itself looks at the file of the
-    outermost function only.
+    outermost function only. It and all above it can be changed by the user and root alone.
     """
     digest = hashlib.blake2b(version("numba").encode(), digest_size=8)
     for source in sources:
         digest.update(source.read_bytes())
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = root / "noack" / f"{name}-{digest.hexdigest()}"
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for file in folder.rglob("*.nb[ic]"):
-            if file.stat().st_size == 0:  # what a power failure leaves; numba fails on it for ever
-                file.unlink(missing_ok=True)
+        folder = (root / "noack" / f"{name}-{digest.hexdigest()}").resolve()
+        _make_own(folder)
+        for file in folder.rglob("*"):
+            _examine(file)
         _forget_old(folder, name)
         with tempfile.TemporaryFile(dir=folder) as probe:
             if next(folder.rglob("*.nbi"), None) is None:
                 os.posix_fallocate(probe.fileno(), 0, _ROOM_BYTES)
-    except (OSError, RuntimeError):  # not writable, full, or there is no home
+    except (OSError, RuntimeError):  # not writable, another user's, full, or there is no home
         return None
     return folder
+
+
+def _make_own(folder: Path) -> None:
+    """Make a folder, and those above it that do not exist, for the user alone.
+
+    Raises:
+        PermissionError: another user may change it, or one above it.
+    """
+    for level in (*reversed(folder.parents), folder):
+        with suppress(FileExistsError):
+            level.mkdir(mode=0o700)
+        status = level.stat(follow_symlinks=False)
+        if level == folder.parent:
+            _require_own(level, status)
+            level.chmod(0o700)  # older versions left it to the umask
+        elif status.st_uid not in (0, os.getuid()) or _others_may_write(status):
+            raise PermissionError(f"{level} can be changed by another user")
+    _require_own(folder, status)
+    folder.chmod(0o700)
+
+
+def _examine(file: Path) -> None:
+    """Require that a file is the user's; remove it if it is useless."""
+    with suppress(FileNotFoundError):  # another process renames what it has written
+        status = file.lstat()
+        _require_own(file, status)
+        if file.suffix in (".nbi", ".nbc") and status.st_size == 0:
+            file.unlink()  # what a power failure leaves; numba fails on it for ever
+
+
+def _others_may_write(status: os.stat_result) -> bool:
+    """Whether others may replace what is the user's; in a sticky folder they may not."""
+    return bool(status.st_mode & 0o022) and not status.st_mode & stat.S_ISVTX
+
+
+def _require_own(path: Path, status: os.stat_result) -> None:
+    if status.st_uid != os.getuid():
+        raise PermissionError(f"{path} belongs to another user")
 
 
 def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
@@ -51,7 +93,7 @@ def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
 
 def while_compiling(what: str, kept: bool) -> str:
     """What a waiting person should know about what takes so long."""
-    once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) takes nothing"
+    once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
     return f"compiling {what} for this machine, {once} ..."
 
 

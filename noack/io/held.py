@@ -11,96 +11,86 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
-from noack.io.private import make_private, private_folder, require_private
+from noack.io.private import PrivateFolder, open_private
 
-
-def folder_of(kind: str) -> Path:
-    """Where the files of a kind lie; the folder need not exist yet."""
-    return private_folder() / kind
+_SUFFIX = ".json"
 
 
-def make_folder(kind: str) -> Path:
-    """Make the folder that files of a kind lie in, and return it.
+class Held(NamedTuple):
+    """A file whose owner runs."""
 
-    Raises:
-        CallerError: it cannot be made, or others may look into it.
-    """
-    folder = folder_of(kind)
-    make_private(folder.parent)
-    make_private(folder)
-    return folder
+    path: Path
+    written_ns: int
+    content: bytes
 
 
 @contextmanager
-def held(path: Path, content: Mapping[str, object]) -> Iterator[Path]:
+def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
     """Keep a file while the context lasts.
 
     Args:
-        path: where, in a folder from :func:`make_folder`.
+        kind: folder of the runtime directory that the file lies in.
+        name: of the file, without suffix.
         content: what it says, as JSON.
 
     Raises:
+        CallerError: the folder cannot be made, or is not the user's own.
         FileExistsError: one that runs has a file of this name.
     """
-    scratch = path.with_suffix(f".{os.getpid()}")
-    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        json.dump(content, file)
-        file.flush()
-        try:
-            _put(scratch, path)
-        finally:
-            scratch.unlink()
-        try:
-            yield path
-        finally:
-            _remove(path, os.fstat(descriptor))
+    with open_private(kind, create=True) as folder:
+        scratch, name = f"{name}.{os.getpid()}", name + _SUFFIX
+        with os.fdopen(folder.create(scratch), "w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            json.dump(content, file)
+            file.flush()
+            try:
+                _put(folder, scratch, name)
+            finally:
+                folder.remove(scratch)
+            try:
+                yield folder.path / name
+            finally:
+                folder.remove_same(name, os.fstat(file.fileno()))
 
 
-def running(kind: str) -> list[Path]:
-    """Return the files of a kind whose owner runs.
+def running(kind: str) -> list[Held]:
+    """Return the files of a kind whose owner runs, by name.
 
     Raises:
-        CallerError: the folder is open to others.
+        CallerError: the folder, or a file in it, is not the user's own.
     """
-    folder = folder_of(kind)
-    if not folder.exists():
+    try:
+        with open_private(kind) as folder:
+            names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
+            return [file for name in names if (file := _alive(folder, name)) is not None]
+    except FileNotFoundError:
         return []
-    require_private(folder)
-    return sorted(path for path in folder.glob("*.json") if _alive(path))
 
 
-def _put(scratch: Path, path: Path) -> None:
+def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
     """Give the file its name, unless one that runs has it."""
     for attempt in range(2):
         try:
-            os.link(scratch, path)
+            folder.link(scratch, name)
             return
         except FileExistsError:
-            if attempt or _alive(path):
+            if attempt or _alive(folder, name) is not None:
                 raise
 
 
-def _remove(path: Path, status: os.stat_result) -> None:
-    """Remove a file unless another has taken its place."""
+def _alive(folder: PrivateFolder, name: str) -> Held | None:
+    """Return a file if its owner runs; the file of one that does not is removed."""
     try:
-        if os.path.samestat(path.stat(), status):
-            path.unlink()
+        descriptor = folder.open(name)
     except FileNotFoundError:
-        pass
-
-
-def _alive(path: Path) -> bool:
-    """Whether the owner of a file runs; the file of one that does not is removed."""
-    try:
-        with path.open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-            _remove(path, os.fstat(file.fileno()))
-    except FileNotFoundError:
-        pass
-    return False
+        return None
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(file.fileno())
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return Held(folder.path / name, status.st_mtime_ns, file.read())
+        folder.remove_same(name, status)
+    return None

@@ -6,7 +6,7 @@ plane, from which the key that authenticates the loop's datagrams cannot be foun
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,9 +53,8 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
     secret = secret_of(ticket)
     run_id = f"{ticket.run_id:016x}"
     run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
-    with ExitStack() as stack:
-        path = held.make_folder(_KIND) / f"{run_id}.json"
-        yield stack.enter_context(held.held(path, run._asdict()))
+    with held.held(_KIND, run_id, run._asdict()) as path:
+        yield path
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
@@ -68,7 +67,8 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
     Raises:
         CallerError: there is none.
     """
-    found = [run for path in _newest_first() if (run := _read(path)) is not None]
+    newest_first = sorted(held.running(_KIND), key=lambda file: file.written_ns, reverse=True)
+    found = [_read(file) for file in newest_first]
     fitting = [
         run
         for run in found
@@ -106,21 +106,10 @@ def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
     return heard(Answer, answer)
 
 
-def _newest_first() -> list[Path]:
-    def written_ns(path: Path) -> int:
-        try:
-            return path.stat().st_mtime_ns
-        except FileNotFoundError:  # it has ended meanwhile
-            return 0
-
-    return sorted(held.running(_KIND), key=written_ns, reverse=True)
-
-
-def _read(path: Path) -> OpenRun | None:
+def _read(file: held.Held) -> OpenRun:
     try:
-        return _OPEN_RUN.validate_json(path.read_bytes(), strict=True)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValidationError) as error:
-        what = brief(error) if isinstance(error, ValidationError) else error.strerror
-        raise PeerError(f"{path}: what tells of a run cannot be read: {what}") from None
+        return _OPEN_RUN.validate_json(file.content, strict=True)
+    except ValidationError as error:
+        raise PeerError(
+            f"{file.path}: what tells of a run cannot be read: {brief(error)}"
+        ) from None

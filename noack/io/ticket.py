@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, ValidationError
 
 from noack.errors import CallerError, PeerError
-from noack.io.private import make_private, private_folder, require_name, require_private
+from noack.io.private import PrivateFolder, open_private, private_folder, require_name
 from noack.mistakes import brief
 from noack.scenario import Scenario
 from noack.section import Section, Seed
@@ -95,10 +95,10 @@ def ticket_path(session: str) -> Path:
     return private_folder() / f"{session}.json"
 
 
-def _in_use(path: Path) -> bool:
+def _in_use(folder: PrivateFolder, name: str) -> bool:
     """Whether the coordinator of the ticket that lies here still listens."""
     try:
-        host, _, port = loads(path.read_text()).endpoint.removeprefix("tcp/").rpartition(":")
+        host, _, port = loads(folder.read_text(name)).endpoint.removeprefix("tcp/").rpartition(":")
         with socket.create_connection((host, int(port)), timeout=1):
             return True
     except (OSError, ValueError, CallerError):
@@ -113,20 +113,21 @@ def published(ticket: Ticket, session: str) -> Iterator[Path]:
         CallerError: the folder is not the user's own.
     """
     path = ticket_path(session)
-    make_private(path.parent)
-    if _in_use(path):
-        raise CallerError(f"session {session!r}: another run is open in it; choose --session NAME")
-    scratch = path.with_suffix(f".{os.getpid()}")
-    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(ticket.dumps())
-    scratch.replace(path)
-    try:
-        yield path
-    finally:
-        with contextlib.suppress(OSError):
-            if loads(path.read_text()).run_id == ticket.run_id:
-                path.unlink()
+    with open_private(create=True) as folder:
+        if _in_use(folder, path.name):
+            raise CallerError(
+                f"session {session!r}: another run is open in it; choose --session NAME"
+            )
+        scratch = f"{session}.{os.getpid()}"
+        with os.fdopen(folder.create(scratch), "w") as file:
+            file.write(ticket.dumps())
+        folder.replace(scratch, path.name)
+        try:
+            yield path
+        finally:
+            with contextlib.suppress(OSError, CallerError):
+                if loads(folder.read_text(path.name)).run_id == ticket.run_id:
+                    folder.remove(path.name)
 
 
 def wait_for_ticket(
@@ -135,18 +136,15 @@ def wait_for_ticket(
     """Wait until a recorder or launcher has published the session's ticket, and return it.
 
     Raises:
+        CallerError: the folder or the file is not the user's own.
         PeerError: none came in time.
     """
     path = ticket_path(session)
-    if path.parent.exists():
-        require_private(path.parent)
     deadline_s = time.monotonic() + timeout_s
     told = False
     while True:
-        with contextlib.suppress(FileNotFoundError):
-            text = path.read_text()
-            require_private(path.parent)
-            return loads(text)
+        with contextlib.suppress(FileNotFoundError), open_private() as folder:
+            return loads(folder.read_text(path.name))
         if stop() or time.monotonic() > deadline_s:
             raise PeerError(
                 f"no run to join in session {session!r}: start `noack record SCENARIO` first"

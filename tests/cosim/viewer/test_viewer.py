@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 import psutil
@@ -171,11 +171,13 @@ def get(url: str, host: str | None = None) -> tuple[int, bytes]:
         target = f"{parts.path}?{parts.query}" if parts.query else parts.path
         connection.request("GET", target, headers={"Host": host or parts.netloc})
         answer = connection.getresponse()
+        if (there := answer.getheader("Location")) is not None:
+            return get(urljoin(url, there))
         return answer.status, answer.read()
 
 
 def recording_url(page: str) -> str:
-    return parse_qs(urlsplit(page).query)["url"][0]
+    return page + RECORDING
 
 
 @pytest.fixture
@@ -459,7 +461,7 @@ def test_a_stalled_viewer_holds_up_nothing(tmp_path: Path, live: LiveView) -> No
     assert live.url is not None
     parts = urlsplit(recording_url(live.url))
     with socket.create_connection((str(parts.hostname), parts.port)) as viewer:
-        viewer.sendall(f"GET {RECORDING} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
+        viewer.sendall(f"GET {parts.path} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
         assert viewer.recv(12) == b"HTTP/1.0 200"
         add_samples(view, 500)
         view.close()
@@ -607,10 +609,11 @@ def test_other_hosts_names_and_files_are_refused(tmp_path: Path) -> None:
     path.write_bytes(b"RRF2 and more")
     with RecordingServer(path, follow=False) as server:
         assert server.origin.startswith("http://127.0.0.1:")
-        assert get(server.origin + RECORDING) == (200, b"RRF2 and more")
-        assert get(server.origin + RECORDING, host="localhost:1")[0] == 200
-        assert get(server.origin + RECORDING, host="rebound.example:1")[0] == 403
-        assert get(server.origin + "/../recording.rrd")[0] == 404
+        recording = server.address + RECORDING
+        assert get(recording) == (200, b"RRF2 and more")
+        assert get(recording, host="localhost:1")[0] == 200
+        assert get(recording, host="rebound.example:1")[0] == 403
+        assert get(server.address + "../recording.rrd")[0] == 404
 
 
 def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> None:

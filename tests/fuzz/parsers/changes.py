@@ -10,8 +10,9 @@ from cosim import coordinator
 from noack.changes import Change, Schedule, settings_bytes, settings_of
 from noack.clock import RunClock
 from noack.errors import PeerError
-from noack.io import held, open_runs
+from noack.io import open_runs
 from noack.io.messages import Announced, Answer, Asked, heard
+from noack.io.private import open_private
 from noack.knobs import SHORT
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
@@ -92,7 +93,8 @@ def _announced(said: bytes) -> None:
 
 def _found(data: bytes) -> None:
     with patch.dict(os.environ, {"XDG_RUNTIME_DIR": str(workspace())}):
-        path = held.make_folder("runs") / "up.json"
+        with open_private("runs", create=True) as folder:
+            path = folder.path / "up.json"
         path.write_bytes(data)
         with path.open() as lock:  # as the launcher has it
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -9,6 +9,7 @@ from unittest.mock import patch
 
 from netem.control import session
 from noack.io import ticket
+from noack.io.private import open_private
 from noack.resolve import resolve
 from noack.scenario_file import json_schema, validate
 from tests.fuzz.choices import EDITS, Choices
@@ -44,7 +45,8 @@ def one_input(data: bytes) -> None:
         assert isinstance(found.run_dir, str)
         assert isinstance(found.launched, bool)
     with patch.dict(os.environ, {"XDG_RUNTIME_DIR": str(workspace())}):
-        path = session.make_folder() / "up.json"
+        with open_private("netem", create=True) as folder:
+            path = folder.path / "up.json"
         path.write_bytes(data)
         with path.open() as lock:  # as the emulator has it
             fcntl.flock(lock, fcntl.LOCK_EX)

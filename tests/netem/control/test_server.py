@@ -17,6 +17,7 @@ from netem.records import Counters
 from netem.words.parser import settings_of
 from noack.errors import CallerError
 from noack.impairments import LinkSettings
+from noack.io.private import private_folder
 from noack.io.star import open_star, star_config
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
@@ -170,12 +171,11 @@ def test_it_listens_on_loopback_only(server: ControlServer) -> None:
 
 
 def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) -> None:
-    from netem.control.session import make_folder
-
-    assert [path.name for path in make_folder().iterdir()] == ["lab.json"]
+    folder = private_folder() / "netem"
+    assert [path.name for path in folder.iterdir()] == ["lab.json"]
     with pytest.raises(CallerError, match="runs; choose another name"):
         ControlServer("lab", Errands(FakeRelay("up"))).__enter__()
-    assert [path.name for path in make_folder().iterdir()] == ["lab.json"]
+    assert [path.name for path in folder.iterdir()] == ["lab.json"]
     assert running() == ["lab"]
 
 

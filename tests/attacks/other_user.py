@@ -1,0 +1,36 @@
+"""A program that runs as another user of this machine, which takes root to start."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+NOBODY = 65534
+needs_root = pytest.mark.skipif(os.getuid() != 0, reason="acts as another user: takes root")
+
+_BECOME = """
+import encodings.idna, http.server, os, sys, urllib.error, urllib.request
+os.setgroups([]); os.setgid({user}); os.setuid({user})
+"""  # imported first: he may not be able to read where Python lies
+
+
+@contextmanager
+def as_another_user(code: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
+    """Run a program as another user while the context lasts; what it prints can be read."""
+    with subprocess.Popen(
+        [sys.executable, "-c", _BECOME.format(user=NOBODY) + code, *arguments],
+        stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def said_by_another_user(code: str, *arguments: str) -> str:
+    """Run a program as another user to its end, and return what it printed."""
+    with as_another_user(code, *arguments) as process:
+        return process.communicate(timeout=60)[0].strip()

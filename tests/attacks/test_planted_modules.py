@@ -1,0 +1,72 @@
+"""Files planted in the current folder: no process that noack starts imports them."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cosim.viewer.live import LiveView
+
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim", "tools")
+SHADOWED = ("socket", "logging", "multiprocessing", "http", "pickle", "concurrent", "fcntl")
+POOL = """
+from cosim.pool import processes
+if __name__ == "__main__":
+    with processes(2) as pool:
+        print(pool.submit(pow, 2, 5).result())
+"""
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stand in a folder whose modules leave a trace when one is imported; return the trace."""
+    folder, trace = tmp_path / "planted", tmp_path / "trace"
+    folder.mkdir()
+    for name in SHADOWED:
+        (folder / f"{name}.py").write_text(f"open({str(trace)!r}, 'a').write('{name} ')\n")
+    monkeypatch.chdir(folder)
+    return trace
+
+
+def test_the_plants_are_imported_where_nothing_prevents_it(planted: Path) -> None:
+    subprocess.run([sys.executable, "-c", "import fcntl"], check=True)
+    assert planted.read_text() == "fcntl "
+
+
+def test_the_live_viewers_process_imports_none(planted: Path) -> None:
+    recording = planted.with_name("recording.rrd")
+    recording.write_bytes(b"RRF2")
+    live = LiveView(native=False)
+    live.show(recording)
+    status = live.status
+    live.close()
+    assert not planted.exists(), planted.read_text()
+    assert status.startswith("live view: http://127.0.0.1:")
+
+
+@pytest.mark.parametrize("flag", [(), ("-P",)])
+def test_workers_import_none(planted: Path, flag: tuple[str, ...]) -> None:
+    """Started as the program ``noack`` starts them, whose own folder is not the current one."""
+    program = planted.with_name("program.py")
+    program.write_text(POOL)
+    done = subprocess.run(
+        [sys.executable, *flag, program], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert not planted.exists(), planted.read_text()
+    assert done.stdout == "32\n", done.stderr
+
+
+def test_one_function_starts_python() -> None:
+    """Whoever names the interpreter himself may forget ``-P``."""
+    naming = [
+        str(path.relative_to(ROOT))
+        for package in PACKAGES
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if re.search(r"\bsys\.executable\b", path.read_text())
+    ]
+    assert naming == ["noack/python_process.py"]

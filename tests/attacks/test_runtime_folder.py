@@ -1,0 +1,184 @@
+"""The user's runtime folder in a place where everybody may write: nobody else is let in.
+
+The other user is impersonated where only the outcome counts; what needs a second user id skips
+without root.
+"""
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.doctor.measure import _runtime_folder
+from netem.control import session
+from noack.errors import CallerError, PeerError
+from noack.io import open_runs
+from noack.io.ticket import Ticket, new_ticket, published, ticket_path, wait_for_ticket
+from noack.resolve import resolve
+from noack.scenario_file import validate
+from tests.attacks.other_user import NOBODY, needs_root
+
+OWN = f"noack-{os.getuid()}"
+EMULATOR = session.Session("lab", "tcp/127.0.0.1:1", "secret")
+
+_swaps: list[Callable[[str], None]] = []
+"""What another user does as this process opens a file; an audit hook stays for ever."""
+
+
+def _as_a_file_is_opened(event: str, details: tuple[Any, ...]) -> None:
+    if event == "open" and _swaps and str(details[0]).rpartition("/")[2].startswith("default."):
+        _swaps.pop()(str(details[0]))
+
+
+sys.addaudithook(_as_a_file_is_opened)
+
+
+@pytest.fixture
+def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder for temporary files, there being no XDG_RUNTIME_DIR."""
+    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def ticket(content: dict[str, Any]) -> Ticket:
+    scenario = resolve(validate(content, "small"))
+    return new_ticket(scenario, "tcp/127.0.0.1:1", Path("run"), launched=False)
+
+
+def join() -> Ticket:
+    return wait_for_ticket("default", 0.0, lambda: False, lambda path: None)
+
+
+def enter(context: Any) -> Callable[[], object]:
+    def use() -> None:
+        with context():
+            pass
+
+    return use
+
+
+USES: dict[str, Callable[[Ticket], Callable[[], object]]] = {
+    "publish a ticket": lambda ticket: enter(lambda: published(ticket, "default")),
+    "join a run": lambda _: join,
+    "publish a run": lambda ticket: enter(lambda: open_runs.published(ticket, None)),
+    "find a run": lambda _: open_runs.find,
+    "publish an emulator": lambda _: enter(lambda: session.published(EMULATOR)),
+    "list emulators": lambda _: session.running,
+}
+
+
+@pytest.mark.parametrize("use", USES.values(), ids=USES)
+def test_a_link_in_the_folders_place_is_refused(
+    use: Callable[[Ticket], Callable[[], object]], shared: Path, ticket: Ticket
+) -> None:
+    """Even one that leads to a folder of the user's own: it can be led elsewhere at any time."""
+    own = shared / "own"
+    for folder in (own, own / "runs", own / "netem"):
+        folder.mkdir(mode=0o700)
+    (own / "default.json").write_text(ticket.dumps())
+    (shared / OWN).symlink_to(own)
+    with pytest.raises(CallerError, match="closed to others"):
+        use(ticket)()
+    assert [file.name for file in own.rglob("*") if file.is_file()] == ["default.json"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "use"),
+    [
+        ("runs", "publish a run"), ("runs", "find a run"),
+        ("netem", "publish an emulator"), ("netem", "list emulators"),
+    ],
+)  # fmt: skip
+def test_so_is_one_inside_it(kind: str, use: str, shared: Path, ticket: Ticket) -> None:
+    for folder in (shared / OWN, shared / "own"):
+        folder.mkdir(mode=0o700)
+    (shared / OWN / kind).symlink_to(shared / "own")
+    with pytest.raises(CallerError, match="closed to others"):
+        USES[use](ticket)()
+
+
+def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(
+    shared: Path, ticket: Ticket
+) -> None:
+    """Between the check of the folder and the opening of the file."""
+    theirs = shared / "theirs"
+    theirs.mkdir()
+
+    def swap(_: str) -> None:
+        (shared / OWN).rename(shared / "away")
+        (shared / OWN).symlink_to(theirs)
+        (theirs / f"default.{os.getpid()}").touch(mode=0o666)  # theirs if it is opened, not made
+
+    with published(ticket, "other"):
+        pass  # the folder exists, as after any earlier run
+    _swaps.append(swap)
+    with published(ticket, "default"):
+        assert not _swaps
+        assert not any(file.read_text() for file in theirs.iterdir())
+
+
+def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
+    shared: Path, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is what the other user put there believed when he swaps the folder back."""
+    theirs, away = shared / "theirs", shared / "away"
+    theirs.mkdir()
+    (theirs / "default.json").write_text(ticket._replace(run_dir="theirs").dumps())
+
+    def swap(_: str) -> None:
+        (shared / OWN).rename(away)
+        (shared / OWN).symlink_to(theirs)
+
+    real = Path.stat
+
+    def swap_back(path: Path, **options: Any) -> os.stat_result:
+        if path == shared / OWN and away.exists():
+            path.unlink()
+            away.rename(path)
+        return real(path, **options)
+
+    with published(ticket, "default"):
+        _swaps.append(swap)
+        monkeypatch.setattr(Path, "stat", swap_back)
+        assert join().run_dir == ticket.run_dir
+    assert not _swaps
+
+
+@needs_root
+@pytest.mark.parametrize("theirs", ["folder", "file"])
+def test_what_belongs_to_another_user_is_not_read(
+    theirs: str, shared: Path, ticket: Ticket
+) -> None:
+    with published(ticket, "default") as path:
+        os.chown(path if theirs == "file" else path.parent, NOBODY, NOBODY)
+        with pytest.raises(CallerError, match="of yours"):
+            join()
+
+
+def test_nor_is_what_is_no_file(shared: Path) -> None:
+    """A named pipe would hold up whoever reads it."""
+    (shared / OWN).mkdir(mode=0o700)
+    os.mkfifo(ticket_path("default"))
+    with pytest.raises(CallerError, match="file of yours"):
+        join()
+
+
+def test_the_doctor_says_what_is_wrong_with_the_folder(shared: Path) -> None:
+    (shared / "own").mkdir(mode=0o700)
+    (shared / OWN).symlink_to(shared / "own")
+    assert "closed to others" in str(_runtime_folder())
+
+
+def test_without_a_folder_there_is_no_run(shared: Path) -> None:
+    with pytest.raises(PeerError, match="no run to join"):
+        join()
+    with pytest.raises(CallerError, match="no run goes on"):
+        open_runs.find()
+    assert session.running() == []
+    assert not (shared / OWN).exists()

@@ -1,0 +1,229 @@
+"""Another user of the machine at the ports of the web viewer: he neither reads nor replaces."""
+
+import http.client
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import psutil
+import pytest
+
+from cosim.viewer.peer_user import peer_user
+from cosim.viewer.server import RECORDING, RecordingServer
+from cosim.viewer.web_viewer import HOST
+from tests.attacks.other_user import NOBODY, as_another_user, needs_root, said_by_another_user
+
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/net/tcp").exists(), reason="only Linux tells whose a connection is"
+)
+
+THEIR_SERVER = """
+class Handler(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200); self.end_headers(); self.wfile.write(b"theirs")
+    def log_message(self, *_): pass
+server = http.server.HTTPServer(("127.0.0.1", int(sys.argv[1])), Handler)
+print(server.server_port, flush=True)
+server.serve_forever()
+"""
+THEIR_GET = """
+try:
+    with urllib.request.urlopen(sys.argv[1]) as answer:
+        print(answer.status, len(answer.read()))
+except urllib.error.HTTPError as error:
+    print(error.code)
+"""
+CONTENT = b"RRF2 and more"
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[RecordingServer]:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(CONTENT)
+    with RecordingServer(path, follow=False) as serving:
+        yield serving
+
+
+def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage, bytes]:
+    """Ask without following redirections, nor mending the path."""
+    parts = urlsplit(url)
+    target = url.removeprefix(f"{parts.scheme}://{parts.netloc}")
+    with socket.create_connection((str(parts.hostname), parts.port)) as connection:
+        connection.sendall(
+            f"GET {target} HTTP/1.1\r\nHost: {host or parts.netloc}\r\n\r\n".encode("latin-1")
+        )
+        answer = http.client.HTTPResponse(connection)
+        with closing(answer):
+            answer.begin()
+            return answer.status, answer.headers, answer.read()
+
+
+def test_the_page_is_at_the_one_address_that_is_printed(server: RecordingServer) -> None:
+    address = server.start_page()
+    status, headers, _ = ask(f"{address}?theme=light")
+    assert status == 302
+    query = parse_qs(urlsplit(headers["Location"]).query)
+    assert query == {"url": [address + RECORDING], "theme": ["light"]}
+    status, _, page = ask(server.origin + headers["Location"])
+    assert status == 200
+    assert b"re_viewer.js" in page
+    assert ask(address + "re_viewer.js")[0] == 200
+    assert ask(query["url"][0])[::2] == (200, CONTENT)
+
+
+def test_through_a_forwarded_port_the_page_finds_the_recording(server: RecordingServer) -> None:
+    _, headers, _ = ask(server.start_page(), host="localhost:4000")
+    (url,) = parse_qs(urlsplit(headers["Location"]).query)["url"]
+    assert url.startswith("http://localhost:4000/")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["", "/", "/recording.rrd", "/re_viewer.js", "//", "/x/recording.rrd", "/%2e/recording.rrd"],
+)
+def test_without_the_secret_nothing_is_there(server: RecordingServer, path: str) -> None:
+    server.start_page()
+    assert ask(f"{server.origin}{path or '/'}")[0] == 404
+
+
+@pytest.mark.parametrize("change", ["", "shorter", "longer", "other case", "no slash"])
+def test_nor_with_nearly_the_secret(server: RecordingServer, change: str) -> None:
+    server.start_page()
+    secret = urlsplit(server.address).path.strip("/")
+    path = {
+        "": "//",
+        "shorter": f"/{secret[:-1]}/",
+        "longer": f"/{secret}x/",
+        "other case": f"/{secret.swapcase()}/",
+        "no slash": f"/{secret}",
+    }[change]
+    assert ask(server.origin + path)[0] == 404
+    assert ask(server.origin + path + RECORDING)[0] == 404
+
+
+def test_the_secret_is_new_each_time_and_cannot_be_guessed(server: RecordingServer) -> None:
+    with RecordingServer(server.path, follow=False) as other:
+        addresses = {server.address, server.window_address, other.address, other.window_address}
+        secrets = {urlsplit(address).path.strip("/") for address in addresses}
+    assert len(secrets) == 4
+    assert all(len(secret) >= 43 for secret in secrets)  # 256 bits in base64
+
+
+def test_the_secret_is_on_no_command_line(server: RecordingServer) -> None:
+    server.start_page()
+    secret = urlsplit(server.address).path.strip("/")
+    lines = [" ".join(child.cmdline()) for child in psutil.Process().children(recursive=True)]
+    assert any("--serve-web" in line for line in lines)
+    assert not any(secret in line for line in lines)
+
+
+@pytest.mark.parametrize("path", ["\xe9", "\x01", "\x7f", "?\xe9"])
+def test_what_is_no_path_gets_a_line(
+    server: RecordingServer, path: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    server.start_page()
+    for prefix in (f"{server.origin}/", server.address):
+        assert ask(prefix + path)[0] == 400
+    assert capfd.readouterr().err == ""
+
+
+def test_nobody_is_told_the_address_by_the_browser(server: RecordingServer) -> None:
+    address = server.start_page()
+    for url in (
+        address,
+        f"{address}?url=x",
+        address + RECORDING,
+        address + "none",
+        server.origin + "/",
+    ):
+        assert ask(url)[1]["Referrer-Policy"] == "no-referrer"
+
+
+def test_when_reruns_program_ends_the_page_does_too(server: RecordingServer) -> None:
+    """Even where another program of this user's takes its port."""
+    address = server.start_page()
+    assert server.web_viewer is not None
+    server.web_viewer.process.kill()
+    server.web_viewer.process.wait()
+    assert ask(address + "re_viewer.js")[0] == 502
+    with RecordingServer(server.path, follow=False) as other:
+        server.web_viewer.port = int(other.origin.rpartition(":")[2])
+        assert ask(address + "re_viewer.js")[0] == 502
+    assert ask(address + RECORDING)[::2] == (200, CONTENT)
+
+
+@needs_root
+def test_another_users_program_on_reruns_port_is_not_believed(server: RecordingServer) -> None:
+    """He has bound the port before rerun, or after it."""
+    address = server.start_page()
+    with as_another_user(THEIR_SERVER, "0") as theirs:
+        assert theirs.stdout is not None
+        assert server.web_viewer is not None
+        server.web_viewer.port = int(theirs.stdout.readline())
+        assert ask(f"http://{HOST}:{server.web_viewer.port}/")[2] == b"theirs"
+        for name in ("?url=x", "re_viewer.js"):
+            status, _, body = ask(address + name)
+            assert status == 502
+            assert b"theirs" not in body
+
+
+@needs_root
+def test_reruns_port_cannot_be_had_by_another_user(server: RecordingServer) -> None:
+    """There is no time in which it is chosen and not yet bound."""
+    server.start_page()
+    assert server.web_viewer is not None
+    code = """
+import socket
+for host in ("127.0.0.1", "0.0.0.0"):
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        try:
+            taken.bind((host, int(sys.argv[1])))
+            taken.listen()
+            print("taken")
+        except OSError as error:
+            print("refused")
+"""
+    assert said_by_another_user(code, str(server.web_viewer.port)) == "refused\nrefused"
+
+
+@needs_root
+def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) -> None:
+    """It is on a command line, so that others know it."""
+    assert said_by_another_user(THEIR_GET, server.window_address + RECORDING) == "404"
+    assert not server.requested.is_set()
+    assert ask(server.window_address + RECORDING)[::2] == (200, CONTENT)
+    assert said_by_another_user(THEIR_GET, server.address + RECORDING) == f"200 {len(CONTENT)}"
+
+
+@needs_root
+def test_the_user_at_the_other_end_is_told() -> None:
+    code = """
+import socket, time
+with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
+    print("connected", flush=True)
+    time.sleep(60)
+"""
+    with socket.create_server((HOST, 0)) as listening:
+        with as_another_user(code, str(listening.getsockname()[1])) as theirs:
+            assert theirs.stdout is not None
+            assert theirs.stdout.readline() == "connected\n"
+            connection, _ = listening.accept()
+            assert peer_user(connection) == NOBODY
+        connection.close()
+
+
+def test_so_is_this_user_once_somebody_has_accepted() -> None:
+    with (
+        socket.create_server((HOST, 0)) as listening,
+        socket.create_connection(listening.getsockname()) as ours,
+    ):
+        assert peer_user(ours) is None  # nobody yet
+        accepted, _ = listening.accept()
+        assert peer_user(ours) == peer_user(accepted) == os.getuid()
+        accepted.close()
+        assert peer_user(ours) is None
