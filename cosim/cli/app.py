@@ -16,7 +16,7 @@ from rich.markup import escape
 from cosim.cli import complete
 from cosim.cli.program import NAME, Program, be_patient
 from cosim.shipped import find_shipped
-from noack.errors import ExitStatus, NoackError
+from noack.errors import ExitStatus, NoackError, why
 from noack.io.command_line import failed
 
 _STORY = (
@@ -145,7 +145,7 @@ def command(
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
             except OSError as error:  # standard output is a full disk
-                what = f"cannot write: {error}"
+                what = f"cannot write: {why(error)}"
                 status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
