@@ -110,7 +110,7 @@ class _Claim(_Part):
     source: str
     bound: str
     ratio: float | None
-    verdict: Literal["held", "violated", "void"]
+    verdict: Literal["held", "violated", "void", "not applicable"]
     since_s: float | None
     why: str
     from_s: float = 0.0
