@@ -90,6 +90,7 @@ class _Compared(_Part):
     rms_x: float
     rms_x_live: float
     explained_relative: float
+    events_ideal: Number
     shares: Reals
 
 

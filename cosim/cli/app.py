@@ -25,7 +25,8 @@ _STORY = (
     ("noack view", "the last run, drawn"),
     ("noack simulate lane_following", "the same in virtual time, in a second"),
     ("noack certify lane_following", "what is guaranteed, on which conditions"),
-    ("noack compare", "how far the last run is from the ideal loop"),
+    ("noack fidelity", "how far the last run is from the ideal loop"),
+    ("noack compare A B", "two or more runs, side by side"),
     ("noack campaign mb_vs_zoh", "many runs over a grid of settings"),
     ("noack netem --explain loss 5%", "the network emulator, for any UDP program"),
 )
@@ -100,6 +101,9 @@ ReportOption = Annotated[
         "--report/--no-report",
         help="Draw report.html, which takes some seconds; `noack report` does it later.",
     ),
+]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", help="Show all tables: timing, assumptions, each claim.")
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")

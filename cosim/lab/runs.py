@@ -169,7 +169,7 @@ class Run:
 
         return replay(self._record)
 
-    def compare(self) -> "Fidelity":
+    def fidelity(self) -> "Fidelity":
         """Compare the run with the ideal loop in continuous time, effect by effect.
 
         Returns:
@@ -178,9 +178,9 @@ class Run:
         Raises:
             NoackError: there is no ideal loop to compare it with, or the record has holes.
         """
-        from cosim.fidelity import compare
+        from cosim.fidelity import fidelity_of
 
-        return compare(self._record)
+        return fidelity_of(self._record)
 
     @cached_property
     def _outcome(self) -> "Outcome":

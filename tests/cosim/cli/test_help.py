@@ -44,7 +44,7 @@ def test_the_help_begins_with_a_story() -> None:
     story, _, panels = text.partition("Options")
     told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
     assert told == [
-        "doctor", "run", "view", "simulate", "certify", "compare", "campaign", "netem",
+        "doctor", "run", "view", "simulate", "certify", "fidelity", "compare", "campaign", "netem",
     ]  # fmt: skip
     assert all(f" {name} " in panels for name in COMMANDS)
     assert "completion" not in panels
