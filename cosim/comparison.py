@@ -157,8 +157,8 @@ def compare_runs(directories: Sequence[Path]) -> Comparison:
     """
     if not 2 <= len(directories) <= len(LABELS):
         raise CallerError(
-            f"{len(directories)} runs to compare: give 2 to {len(LABELS)} run directories; "
-            "`noack fidelity` compares one run with the ideal loop"
+            f"give 2 to {len(LABELS)} run directories to compare, not {len(directories)}; "
+            "`noack fidelity` compares one with the ideal loop"
         )
     runs = tuple(
         ComparedRun(label, path, reopen(path).summary, load_record(path))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
+    from cosim.comparison import Comparison
     from cosim.conclude import Outcome
     from cosim.fidelity import Fidelity
     from cosim.record import RunRecord
@@ -294,6 +295,27 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
+
+
+def compare(*runs: Run | Folder) -> "Comparison":
+    """Put two or more runs beside each other; :meth:`Run.fidelity` is against the ideal loop.
+
+    Args:
+        runs: two to seven, each as a :class:`Run` or a run directory, live or simulated.
+
+    Returns:
+        The comparison: ``numbers`` side by side with their differences to the first run,
+        ``settings`` that differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
+
+    Raises:
+        NoackError: they are too few or too many, or their plants have different numbers of states.
+    """
+    from cosim.comparison import compare_runs
+
+    for one in runs:
+        if isinstance(one, Run):
+            one.summary  # noqa: B018  # a temporary run's is made when it is first asked for
+    return compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
 
 
 @contextmanager

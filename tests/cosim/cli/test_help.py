@@ -96,6 +96,7 @@ MORE = {
     "schema": (),
     "summary": (),
     "replay": (),
+    "fidelity": (),
     "report": (),
     "scenarios": (),
     "certify": (),
@@ -182,4 +183,6 @@ def test_options_that_mean_the_same_have_the_same_name() -> None:
         for one in COMMANDS[name].params:
             if one.param_type_name == "argument":
                 arguments[one.name].add(name)
-    assert arguments.keys() == {"scenario", "run_dir", "recording", "file", "name", "settings"}
+    assert arguments.keys() == {
+        "scenario", "run_dir", "directories", "recording", "file", "name", "settings",
+    }  # fmt: skip
