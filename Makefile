@@ -14,6 +14,7 @@ SCENARIO ?= scenarios/lane_following.toml
 CAMPAIGN ?= mb_vs_zoh
 SETTLING ?= 14
 SESSION ?= default
+RUNS ?=
 MINUTES ?= 10
 N ?= 1000000
 ARGS ?=
@@ -27,7 +28,7 @@ help: ## Explain the targets
 	@printf '\nVariables: SCENARIO=FILE  CAMPAIGN=NAME  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
-.PHONY: doctor demo demo-zoh run simulate view summary replay compare report certify adversary paper campaign design
+.PHONY: doctor demo demo-zoh run simulate view summary replay fidelity compare report certify adversary paper campaign design
 doctor: setup ## Say what this machine grants, and what that means for a run of SCENARIO
 	@$(BIN)/noack doctor "$(SCENARIO)" $(ARGS)
 
@@ -52,8 +53,11 @@ summary: setup ## Show the last run's summary again
 replay: setup ## Feed the last run's machines their inputs again; compare bit for bit
 	@$(BIN)/noack replay $(ARGS)
 
-compare: setup ## Compare the last run with the paper's loop, effect by effect
-	@$(BIN)/noack compare $(ARGS)
+fidelity: setup ## Compare the last run with the ideal loop, effect by effect
+	@$(BIN)/noack fidelity $(ARGS)
+
+compare: setup ## Compare RUNS="runs/A runs/B": numbers side by side, curves overlaid
+	@$(BIN)/noack compare $(RUNS) $(ARGS)
 
 report: setup ## Write the last run's report anew, a page with all figures; print its path
 	@$(BIN)/noack report $(ARGS)

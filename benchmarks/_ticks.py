@@ -86,7 +86,7 @@ class _Silence:
     """A socket that nothing is sent to."""
 
     def __init__(self) -> None:
-        self._endpoint = bind(0, "benchmark", "port")
+        self._endpoint = bind(0, "port")
         self.watched = (self._endpoint.fileno(),)
 
     def receive(self, readable: int) -> Record | None:

@@ -10,11 +10,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.assumptions_table import print_assumptions
 from noack.errors import CallerError
 from noack.linear import Matrix
 from noack.resolve import loop_of, resolve
 from noack.scenario import Scenario
-from noack.theory.assumptions import Verdict, assumptions
+from noack.theory.assumptions import assumptions
 from noack.theory.certificate import Conditions
 from noack.theory.certify import BOX, Certificate, Scope, box, outside_box, own_plant
 from noack.theory.enclosure import NotDecayingError
@@ -29,12 +30,6 @@ SCHEDULE = "schedule"
 
 MOST_LATE = 1000
 _MOST_S = 10.0
-_COLOURS = {
-    Verdict.HOLDS: "green",
-    Verdict.VIOLATED: "yellow",
-    Verdict.NOT_NEEDED: "dim",
-    Verdict.PRESUPPOSED: "cyan",
-}
 
 
 class Limits(NamedTuple):
@@ -194,9 +189,9 @@ def print_study(console: Console, found: Study) -> None:
         console.print(f"[yellow]the box certificates say nothing of this plant:[/] {outside}")
     console.print("assumptions of the certificates under the schedule:")
     certificate = next(c for under, c in found.certificates if under == SCHEDULE)
-    _print_assumptions(console, [a._asdict() for a in certificate.assumptions])
+    print_assumptions(console, [a._asdict() for a in certificate.assumptions])
     console.print("assumptions of the paper's theorems:")
-    _print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
+    print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
     for sentence in in_words(found):
         console.print(sentence, markup=False, highlight=False)
     if found.weight is not None:
@@ -311,17 +306,6 @@ def _print_limits(console: Console, found: Study) -> None:
         table.add_column(heading, justify="right" if heading else "left")
     for scope, limits in found.limits.items():
         table.add_row(scope, *map(_limit, limits))
-    console.print(table)
-
-
-def _print_assumptions(console: Console, found: list[dict[str, Any]]) -> None:
-    table = Table.grid(padding=(0, 2))
-    for assumption in found:
-        verdict = Verdict(assumption["verdict"])
-        table.add_row(
-            f"[{_COLOURS[verdict]}]{verdict}[/]",
-            escape(f"{assumption['what']} ({assumption['source']}): {assumption['why']}"),
-        )
     console.print(table)
 
 

@@ -82,7 +82,7 @@ def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summar
             found["replay"] = replay(record).verdict()
         except Exception as error:  # whatever it is, the run itself went as it went
             found["replay"] = {"bit_exact": None, "error": repr(error)}
-        found["fidelity"] = fidelity_for_summary(record)
+    found["fidelity"] = fidelity_for_summary(record)
     try:
         if (near := linearisation(record.scenario)) is not None:
             found["linearisation"] = near

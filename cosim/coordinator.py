@@ -248,7 +248,7 @@ class Coordinator:
         try:
             respond(role, query)
         except PeerError as error:
-            self.plane.refuse(query, f"{role} cannot join: {error}")
+            self.plane.refuse(query, f"cannot join: {error}")
 
     def _admit(self, role: str, query: zenoh.Query) -> None:
         """Say who a process is in the run.

@@ -118,7 +118,7 @@ class Fidelity:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """All figures, for ``noack compare --json``."""
+        """All figures, for ``noack fidelity --json``."""
         return {**asdict(self), "explained": self.explained, "verdict": self.verdict}
 
     def compact(self) -> dict[str, Any]:
@@ -145,16 +145,16 @@ def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
          "events_ideal", "events_live", "max_event_difference_s", "parted_event")
     )  # fmt: skip
     if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
-        return nothing | {"reason": "the run is long; `noack compare` compares it"}
+        return nothing | {"reason": "the run is long; `noack fidelity` compares it"}
     try:
-        return compare(record, _EVENTS_AT_THE_END).compact()
+        return fidelity_of(record, _EVENTS_AT_THE_END).compact()
     except NoackError as error:
         return nothing | {"reason": str(error)}
     except Exception as error:  # whatever it is, the run itself went as it went
         return nothing | {"reason": repr(error)}
 
 
-def compare(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
+def fidelity_of(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
     """Compare a live run with the ideal loop, effect by effect.
 
     Args:

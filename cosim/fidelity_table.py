@@ -59,9 +59,9 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
         if name != "unexplained":
-            against = ", against the others" if is_against(share) else ""
+            against = " (partly cancels the other effects)" if is_against(share) else ""
             yield f"  share of {name.replace('_', ' ')}", percent(share) + against
-    yield "  unexplained, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
+    yield "  residual, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
 
 
 def _by_state(fidelity: Fidelity) -> Table:

@@ -55,7 +55,7 @@ def new_run_dir(runs: Path, name: str) -> Path:
                 (run_dir / "logs").mkdir()
                 return run_dir
     except OSError as error:
-        raise MachineError(f"{runs}: no run directory can be created: {error}") from None
+        raise MachineError(f"{runs}: no run directory can be created: {why(error)}") from None
     raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
 
 

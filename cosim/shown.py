@@ -90,6 +90,7 @@ class _Compared(_Part):
     rms_x: float
     rms_x_live: float
     explained_relative: float
+    events_ideal: Number
     shares: Reals
 
 
@@ -110,7 +111,7 @@ class _Claim(_Part):
     source: str
     bound: str
     ratio: float | None
-    verdict: Literal["held", "violated", "void"]
+    verdict: Literal["held", "violated", "void", "not applicable"]
     since_s: float | None
     why: str
     from_s: float = 0.0

@@ -11,7 +11,7 @@ from cosim.launch import Ending
 from cosim.record import RunRecord, write_record
 from cosim.run_dir import REPORTS_FILE, new_run_dir, point_to_latest, under_way, write_scenario
 from cosim.virtual import Progress, simulate
-from noack.errors import ExitStatus, MachineError
+from noack.errors import ExitStatus, MachineError, why
 from noack.io.node import HORIZON
 from noack.resolve import resolve
 from noack.scenario import Scenario
@@ -66,7 +66,7 @@ def simulate_run(
     except BaseException as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         if isinstance(error, OSError):
-            raise MachineError(f"{run_dir}: cannot be written: {error}") from None
+            raise MachineError(f"{run_dir}: cannot be written: {why(error)}") from None
         raise
     point_to_latest(run_dir)
     return Ending(run_dir, run_id, ExitStatus.OK, HORIZON)

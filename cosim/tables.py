@@ -1,103 +1,76 @@
-"""The tables that a person sees at the end of a run."""
+"""The numbers, the timing and the claims of a run as tables."""
 
-import sys
-from collections import Counter
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.conclude import Outcome
+from cosim.assumptions_table import print_assumptions
 from cosim.fidelity_table import summary_rows
 from cosim.linearisation import said
-from cosim.run_dir import RECORDING_FILE, REPORT_FILE
 from cosim.summary import Summary
-from noack.theory.assumptions import Verdict
 
+Numbers = tuple[tuple[str, str], ...]
+"""Quantities and their values, as a person reads them."""
 _QUANTILES = ("p50", "p99", "p999", "max")
 
 
-def print_outcome(console: Console, outcome: Outcome) -> None:
-    """Print the tables at the end of a run."""
-    summary = outcome.summary
-    console.print(_run_table(summary))
+def print_details(console: Console, summary: Summary) -> None:
+    """Print everything that a summary has: numbers, timing, assumptions, claims."""
+    console.print(number_table(summary, key_numbers(summary)))
     if summary["lateness_us"]:  # in virtual time nothing is late
         console.print(_timing_table(summary))
         _print_realtime(console, summary["realtime"])
+    console.print("the paper's assumptions, for this scenario:")
     print_assumptions(console, summary["assumptions"])
     print_claims(console, summary)
-    for violation in summary["assumption_violations"]:
-        console.print(
-            f"[bold red]assumption violated[/] at t = {violation['t_s']:.3f} s, "
-            f"seen by {violation['process']}: {escape(violation['what'])}"
-        )
-    for warning in warnings_of(summary):
-        console.print(f"[bold yellow]warning:[/] {escape(warning)}", highlight=False)
-    if outcome.status:
-        console.print(f"[bold red]the run failed:[/] {escape(outcome.reason)}")
-    console.print(f"in short       {_in_short(summary)}", highlight=False, soft_wrap=True)
-    console.print(
-        f"run directory  {outcome.run_dir}", highlight=False, soft_wrap=True, markup=False
-    )
-    if (report := outcome.run_dir / REPORT_FILE).is_file():
-        console.print(f"report         {report}", highlight=False, soft_wrap=True, markup=False)
-    console.print(
-        f"look at it     {_program()} view {outcome.run_dir / RECORDING_FILE}",
-        highlight=False,
-        soft_wrap=True,
-        markup=False,
-    )
 
 
-def _in_short(summary: Summary) -> str:
-    """How far the run came, and what became of its claims."""
-    verdicts = Counter(claim["verdict"] for claim in summary.get("claims") or ())
-    found = [
-        f"[{colour}]{verdicts[name]} {name}[/]"
-        for name, colour in _CLAIM_COLOURS.items()
-        if verdicts[name]
-    ]
-    return f"{summary['reached_s']:g} s; claims: {', '.join(found) or 'none'}"
-
-
-def _run_table(summary: Summary) -> Table:
+def number_table(summary: Summary, rows: Numbers) -> Table:
+    """A run's numbers as a table, headed by what was run."""
     simulated = ", simulated" if summary.get("kind") == "simulated" else ""
     title = f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}{simulated}"
-    table = Table(title=title)
+    table = Table(title=escape(title))
     table.add_column("quantity")
     table.add_column("value", justify="right")
-    for row in key_numbers(summary):
-        table.add_row(*row)
+    for row in rows:
+        table.add_row(*map(escape, row))
     return table
 
 
-def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
-    """What happened in a run: each quantity and its value, as a person reads them."""
-    events, deliveries = summary["events"], summary["deliveries"]
-    arrived = summary["drops"] + deliveries
+def short_numbers(summary: Summary) -> Numbers:
+    """The few numbers of a run that matter most, fit for 80 columns."""
     return (
-        ("events (transmissions)", str(events)),
-        ("deliveries", str(deliveries)),
-        ("  of these forced (t_0 or cap)", str(summary["forced_deliveries"])),
-        ("lost in the network", f"{summary['drops']} ({_percent(summary['drops'], arrived)})"),
-        *_expected(summary.get("loss_expected"), summary["mansd"]),
+        _lost(summary),
+        _longest_burst(summary),
+        _forced(summary),
+        *_intervals(summary),
+        *_norms(summary),
+        *_lateness(summary),
+        *_replay_rows(summary.get("replay")),
+        *_ideal_difference(summary.get("fidelity")),
+    )
+
+
+def key_numbers(summary: Summary) -> Numbers:
+    """What happened in a run: each quantity and its value, as a person reads them."""
+    return (
+        ("transmissions", str(summary["events"])),
+        ("deliveries", str(summary["deliveries"])),
+        _forced(summary),
+        _lost(summary),
+        *_expected(summary.get("loss_expected")),
         *_causes(summary),
         *_acknowledgements(summary.get("acknowledgements")),
-        ("longest drop run", f"{summary['longest_drop_run']} (at most {summary['mansd']})"),
-        ("drop runs beyond M − 1", str(len(summary["assumption_violations"]))),
-        ("shortest inter-event time", _seconds(summary["inter_event_min_s"])),
-        ("median inter-event time", _seconds(summary["inter_event_median_s"])),
-        ("median time between deliveries", _seconds(summary["inter_delivery_median_s"])),
-        ("‖x‖ at the start", _number(summary["initial_state_norm"])),
-        ("‖x‖ at the end", _number(summary["final_state_norm"])),
-        ("largest ‖e_s‖, ‖e_c‖",
-         f"{_number(summary['sup_e_s_norm'])}, {_number(summary['sup_e_c_norm'])}"),
-        ("identity (I1), relative residual", _number(summary["identity_residual_relative"])),
+        _longest_burst(summary),
+        ("loss bursts beyond M − 1", str(len(summary["assumption_violations"]))),
+        *_intervals(summary),
+        *_norms(summary),
+        ("numerical check of x_c − x_s (I1)", _number(summary["identity_residual_relative"])),
         ("missing samples", str(summary["missing_samples"])),
-        ("lost outside the emulator", str(summary["lost_outside_netem"])),
+        ("lost elsewhere (kernel)", str(summary["lost_outside_netem"])),
         *_restarts(summary.get("restarts")),
         *changes_in(summary),
         *_watchdog(summary.get("watchdog")),
@@ -107,6 +80,51 @@ def key_numbers(summary: Summary) -> tuple[tuple[str, str], ...]:
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
+
+
+def _lost(summary: Summary) -> tuple[str, str]:
+    lost = summary["drops"]
+    return "lost in the network", f"{lost} ({_percent(lost, lost + summary['deliveries'])})"
+
+
+def _longest_burst(summary: Summary) -> tuple[str, str]:
+    return f"longest loss burst (cap M − 1 = {summary['mansd']})", str(summary["longest_drop_run"])
+
+
+def _forced(summary: Summary) -> tuple[str, str]:
+    return "deliveries forced by the guarantee", str(summary["forced_deliveries"])
+
+
+def _intervals(summary: Summary) -> Iterator[tuple[str, str]]:
+    yield "shortest inter-event time", _seconds(summary["inter_event_min_s"])
+    yield "median inter-event time", _seconds(summary["inter_event_median_s"])
+    yield "median time between deliveries", _seconds(summary["inter_delivery_median_s"])
+
+
+def _norms(summary: Summary) -> Iterator[tuple[str, str]]:
+    yield "‖x‖ at the start", _number(summary["initial_state_norm"])
+    yield "‖x‖ at the end", _number(summary["final_state_norm"])
+    errors = (summary["sup_e_s_norm"], summary["sup_e_c_norm"])
+    yield "largest ‖e_s‖, ‖e_c‖", ", ".join(map(_number, errors))
+
+
+def _ideal_difference(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    if fidelity is not None and fidelity["reason"] is None:
+        yield next(summary_rows(fidelity))
+
+
+def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Of a live run: how long an update took, and who missed most deadlines."""
+    if latency := summary["latency_us"]:
+        quantiles = " / ".join(_whole(latency[key]) for key in ("p50", "p99"))
+        yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
+    late = summary["lateness_us"]
+    if late:
+        worst = max(late, key=lambda role: late[role]["late_steps"])
+        yield (
+            "most deadlines missed",
+            f"{worst}, {late[worst]['late_steps']} of {late[worst]['steps']}",
+        )
 
 
 def _causes(summary: Summary) -> Iterator[tuple[str, str]]:
@@ -120,12 +138,12 @@ def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]
     if found is not None:
         yield "acknowledgements", str(found["sent"])
         yield "  of these lost", f"{found['lost']} ({_percent(found['lost'], found['sent'])})"
-        yield "  longest run of losses", str(found["longest_loss_run"])
+        yield "  longest loss burst", str(found["longest_loss_run"])
 
 
 def _restarts(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
     for one in found or ():
-        yield f"{one['process']} was started anew", away(one)
+        yield f"{one['process']} was restarted", away(one)
 
 
 def changes_in(summary: Summary) -> Iterator[tuple[str, str]]:
@@ -170,9 +188,9 @@ def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
         )
 
 
-def _expected(rate: float | None, mansd: int) -> Iterator[tuple[str, str]]:
+def _expected(rate: float | None) -> Iterator[tuple[str, str]]:
     if rate is not None:
-        yield f"  in the long run, at most {mansd} in a row", f"{100 * rate:.3g} %"
+        yield "  expected loss rate with the cap", f"{100 * rate:.3g} %"
 
 
 def _disturbances(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
@@ -186,13 +204,7 @@ def print_claims(console: Console, summary: Summary) -> None:
     claims = summary.get("claims")
     if not claims:
         return
-    undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
-    if undisturbed and any("felt after" in c["why"] or " old" in c["why"] for c in claims):
-        console.print(
-            "this machine was late, which voids claims that do not allow for it: a greater "
-            "certificate.late_periods does, where it can be certified; noack simulate is never late"
-        )
-    table = Table(title="claims, and what this run says of them")
+    table = Table(title="claims checked against this run")
     parts = any(map(interval_of, claims))
     for heading in ("source", "claim", *(["of the time"] if parts else []), "used", "verdict"):
         table.add_column(heading, justify="right" if heading == "used" else "left")
@@ -209,8 +221,8 @@ def print_claims(console: Console, summary: Summary) -> None:
     console.print(table)
     if any(claim["ratio"] is not None for claim in claims):
         console.print(
-            "[dim]used: how near the run came to the bound, at its nearest; "
-            "those on ‖e_c‖ that are made of the run itself are tight[/]"
+            "[dim]used: largest share of the bound reached during the run; "
+            "bounds on ‖e_c‖ that are computed from the run itself are tight[/]"
         )
     for verdict, why in dict.fromkeys((c["verdict"], c["why"]) for c in claims):
         if verdict != "held" and why:
@@ -223,7 +235,9 @@ def _sources(claims: list[dict[str, Any]], verdict: str, why: str) -> str:
     return "; ".join(dict.fromkeys(same))
 
 
-_CLAIM_COLOURS = {"held": "green", "violated": "bold red", "void": "yellow"}
+_CLAIM_COLOURS = {
+    "held": "green", "violated": "bold red", "void": "yellow", "not applicable": "dim",
+}  # fmt: skip
 
 
 def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
@@ -240,8 +254,8 @@ def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
 
 
 def _timing_table(summary: Summary) -> Table:
-    table = Table(title="timing, wall µs")
-    for heading in ("", "p50", "p99", "p99.9", "max", "count", "late"):
+    table = Table(title="timing, wall µs; missed: deadlines missed")
+    for heading in ("", "p50", "p99", "p99.9", "max", "count", "missed"):
         table.add_column(heading, justify="right" if heading else "left")
     for role, late in summary["lateness_us"].items():
         table.add_row(
@@ -252,7 +266,10 @@ def _timing_table(summary: Summary) -> Table:
         )
     latency = summary["latency_us"]
     table.add_row(
-        "event → update", *(_whole(latency[key]) for key in _QUANTILES), str(latency["updates"]), ""
+        "sensor-to-controller latency",
+        *(_whole(latency[key]) for key in _QUANTILES),
+        str(latency["updates"]),
+        "",
     )
     return table
 
@@ -269,30 +286,6 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
         console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
-
-
-def print_assumptions(console: Console, assumptions: list[dict[str, str]]) -> None:
-    """Print the paper's assumptions with their verdicts."""
-    table = Table.grid(padding=(0, 2))
-    for assumption in assumptions:
-        holds = assumption["verdict"] == Verdict.HOLDS
-        table.add_row(
-            "[green]holds[/]" if holds else "[yellow]violated[/]",
-            escape(f"{assumption['what']} ({assumption['source']}): {assumption['why']}"),
-        )
-    console.print("the paper's assumptions, for this scenario:")
-    console.print(table)
-
-
-def warnings_of(summary: Summary) -> Iterator[str]:
-    """What a person should know before trusting the numbers of a run, a sentence each."""
-    late = summary["lateness_us"].get("plant")
-    if late and late["steps"] and late["late_steps"] > 0.01 * late["steps"]:
-        share = 100 * late["late_steps"] / late["steps"]
-        yield f"{share:.0f} % of the plant's steps were late: lower speed or plant.rate_hz"
-    first, last = summary["initial_state_norm"], summary["final_state_norm"]
-    if first is not None and last is not None and last > 10 * first > 0:
-        yield f"‖x‖ grew from {first:.3g} to {last:.3g}: the loop diverges"
 
 
 def _mode(summary: Summary) -> str:
@@ -313,10 +306,3 @@ def _number(value: float | None) -> str:
 
 def _whole(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}"
-
-
-def _program() -> str:
-    """How the person called us, so that the next command can be typed alike."""
-    program = Path(sys.argv[0])
-    inside = program.is_absolute() and program.is_relative_to(Path.cwd())
-    return str(program.relative_to(Path.cwd()) if inside else program)

@@ -71,6 +71,9 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cwd=folder, capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
+    for name in ("model", "hold"):  # commands are tried in no order: these are there to compare
+        (folder / "runs" / name).mkdir()
+        (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())
     return folder
 
 

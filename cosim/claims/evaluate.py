@@ -43,6 +43,8 @@ class ClaimVerdict(StrEnum):
     VIOLATED = "violated"
     VOID = "void"
     """The run left the conditions of the claim before it could be judged to the end."""
+    NOT_APPLICABLE = "not applicable"
+    """The bound was exceeded, but an assumption of the claim was not met: it is not refuted."""
 
 
 class Claim(NamedTuple):
@@ -61,7 +63,7 @@ class Claim(NamedTuple):
     of the bound was used; at most 1 where it held."""
     verdict: ClaimVerdict
     since_s: float | None
-    """Since when it was violated, or void."""
+    """Since when it was violated, void, or not applicable."""
     why: str
     from_s: float = 0.0
     """From when on it is claimed: from the start, or after a change of settings."""
@@ -315,8 +317,8 @@ class Claims:
         if not self.record.scenario.is_decaying or not self.record.scenario.knows_state:
             return
         ideal = (
-            "presupposes a trigger that watches always and a network and an input without delay, "
-            "which no sampled loop has"
+            "assumes a continuous trigger, and a network and input without delay, which no sampled "
+            "loop has"
         )
         left, until_s = self._beyond_paper, self._until_s
         yield self._controller_error(
@@ -428,14 +430,18 @@ def _upper(
     what: str, source: str, bound: str, certified: float | None, t_s: Reals, shares: Reals,
     left: Left, why: str,
 ) -> Claim:  # fmt: skip
-    """Judge a bound from the share of it that was used, (k,), at times (k,)."""
+    """Judge a bound from the share of it that was used, (k,), at times (k,).
+
+    ``why`` is the assumption of the claim that this run does not meet; empty if there is none.
+    """
     text = bound.format(certified) if certified is not None else bound
     until_s = math.inf if left is None else left[0]
     judged = shares[t_s < until_s]
     beyond = np.flatnonzero(~(judged <= 1 + _ROUNDING))
     ratio = float(judged.max()) if len(judged) else None
     if len(beyond):
-        verdict, since_s = ClaimVerdict.VIOLATED, float(t_s[beyond[0]])
+        verdict = ClaimVerdict.NOT_APPLICABLE if why else ClaimVerdict.VIOLATED
+        since_s = float(t_s[beyond[0]])
     elif left is not None:
         verdict, since_s = ClaimVerdict.VOID, until_s
         why = "; ".join(filter(None, [why, left[1]]))

@@ -1,11 +1,12 @@
 """The command line ``noack``, by the panels of its help."""
 
-from cosim.cli import runs, knobs, theory, campaigns, design, processes, files, doctor  # noqa: I001 - in the order of the help
+from cosim.cli import runs, comparison, knobs, theory, campaigns, design, processes, files, doctor  # noqa: I001 - in the order of the help
 from cosim.cli.app import app, find_scenario, main
 
 __all__ = [
     "app",
     "campaigns",
+    "comparison",
     "design",
     "doctor",
     "files",

@@ -16,7 +16,7 @@ from rich.markup import escape
 from cosim.cli import complete
 from cosim.cli.program import NAME, Program, be_patient
 from cosim.shipped import find_shipped
-from noack.errors import ExitStatus, NoackError
+from noack.errors import ExitStatus, NoackError, why
 from noack.io.command_line import failed
 
 _STORY = (
@@ -25,7 +25,8 @@ _STORY = (
     ("noack view", "the last run, drawn"),
     ("noack simulate lane_following", "the same in virtual time, in a second"),
     ("noack certify lane_following", "what is guaranteed, on which conditions"),
-    ("noack compare", "how far the last run is from the ideal loop"),
+    ("noack fidelity", "how far the last run is from the ideal loop"),
+    ("noack compare A B", "two or more runs, side by side"),
     ("noack campaign mb_vs_zoh", "many runs over a grid of settings"),
     ("noack netem --explain loss 5%", "the network emulator, for any UDP program"),
 )
@@ -101,6 +102,9 @@ ReportOption = Annotated[
         help="Draw report.html, which takes some seconds; `noack report` does it later.",
     ),
 ]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", help="Show all tables: timing, assumptions, each claim.")
+]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")
 ]
@@ -145,7 +149,7 @@ def command(
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
             except OSError as error:  # standard output is a full disk
-                what = f"cannot write: {error}"
+                what = f"cannot write: {why(error)}"
                 status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 

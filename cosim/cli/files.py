@@ -24,6 +24,8 @@ from noack.scenario import Scenario
 from noack.scenario_file import dumps as scenario_toml
 from noack.scenario_file import json_schema, load
 
+_COMMENT = "# "
+
 
 @command(FILES, [
     ("noack scenarios", "all of them, and what each is"),
@@ -80,21 +82,39 @@ def _print_shipped(console: Console, some: Sequence[Shipped]) -> None:
 def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOption = False) -> int:
     """Check a scenario and print it resolved: defaults, named models and draws made explicit.
 
+    What it assumes follows as comments, so that the output is a scenario file.
+
     A plant that is not linear is made, and what it is said; with one of the user's own that runs
     its code.
     """
-    from cosim.linearisation import linearisation, said
-    from cosim.tables import print_assumptions
+    from cosim.assumptions_table import print_assumptions
     from noack.resolve import resolve
     from noack.theory.assumptions import assumptions
     from noack.trigger.choose import policy_of
-    from plant_server.systems.choose import system_of
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
     policy_of(resolved)  # some need a stable loop
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
-    console = Console(stderr=True)
-    print_assumptions(console, verdicts)
+    console = Console()
+    console.width -= len(_COMMENT)
+    with console.capture() as captured:  # before anything is printed: the plant may be refused
+        console.print("the paper's assumptions, for this scenario:")
+        print_assumptions(console, verdicts)
+        _print_plant(console, resolved)
+    if json:
+        print_json(resolved.model_dump(mode="json"))
+        return ExitStatus.OK
+    print(scenario_toml(resolved))
+    for line in captured.get().splitlines():
+        print(f"{_COMMENT}{line}".rstrip())
+    return ExitStatus.OK
+
+
+def _print_plant(console: Console, resolved: Scenario) -> None:
+    """Print what a plant is near its operating point, and what holds of keys without a value."""
+    from cosim.linearisation import linearisation, said
+    from plant_server.systems.choose import system_of
+
     if not resolved.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
         console.print(f"the plant: {about}", highlight=False, markup=False)
@@ -103,11 +123,6 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
             console.print(f"{what}: {value}", highlight=False, markup=False)
     for line in _in_force(resolved):
         console.print(line, highlight=False, markup=False)
-    if json:
-        print_json(resolved.model_dump(mode="json"))
-    else:
-        print(scenario_toml(resolved), end="")
-    return ExitStatus.OK
 
 
 def _in_force(resolved: Scenario) -> Iterator[str]:

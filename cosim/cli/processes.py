@@ -1,5 +1,7 @@
 """Commands for a person with five terminals: one process each."""
 
+from functools import partial
+
 import typer
 
 from cosim.cli.app import (
@@ -11,10 +13,11 @@ from cosim.cli.app import (
     ScenarioArgument,
     SessionOption,
     SetOption,
+    VerboseOption,
     command,
     find_scenario,
 )
-from cosim.cli.runs import run_processes
+from cosim.cli.runs import conclude_run, run_processes
 from cosim.run_dir import DEFAULT_RUNS
 from noack.scenario_file import load
 from noack.topology import RECORDER
@@ -31,11 +34,13 @@ def record(
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
     report: ReportOption = True,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
     loaded = load(find_scenario(scenario), settings or ())
-    return run_processes(loaded, runs, (RECORDER,), session, live=live, report=report, json=json)
+    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    return run_processes(loaded, runs, (RECORDER,), session, live=live, end=end)
 
 
 @command(PROCESSES, [

@@ -9,7 +9,7 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from noack.errors import ExitStatus, printable
+from noack.errors import ExitStatus, printable, why
 from noack.io.command_line import failed
 
 NAME = "noack"
@@ -47,7 +47,10 @@ class Program(TyperGroup):
                 failed(said, status, who=NAME, as_json="--json" in words)
         except OSError as error:  # help goes to a full disk
             status = failed(
-                f"cannot write: {error}", ExitStatus.FAILED, who=NAME, as_json="--json" in words
+                f"cannot write: {why(error)}",
+                ExitStatus.FAILED,
+                who=NAME,
+                as_json="--json" in words,
             )
         if standalone_mode:
             sys.exit(int(status or 0))

@@ -1,8 +1,9 @@
-"""Commands on runs: make one, live or simulated; look at it, repeat it, compare it."""
+"""Commands on runs: make one, live or simulated; view it, replay it, measure it."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,6 +20,7 @@ from cosim.cli.app import (
     RunsOption,
     ScenarioArgument,
     SetOption,
+    VerboseOption,
     command,
     find_scenario,
     print_json,
@@ -35,8 +37,8 @@ if TYPE_CHECKING:
 
 @command(RUNS, [
     ("noack run lane_following", "the paper's example, 20 s"),
-    ("noack run unstable_pendulum --set horizon_s=5 --live", "shorter, and seen"),
-    ("noack run lane_following --set network.mansd=9 --json", "what became of it, as JSON"),
+    ("noack run unstable_pendulum --set horizon_s=5 --live", "5 s, with the live viewer"),
+    ("noack run lane_following --set network.mansd=9 --json", "its summary, as JSON"),
 ])  # fmt: skip
 def run(
     scenario: ScenarioArgument,
@@ -44,15 +46,17 @@ def run(
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
     report: ReportOption = True,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> int:
     """Run a scenario: start all processes, watch them, record everything."""
     loaded = load(find_scenario(scenario), settings or ())
-    return run_processes(loaded, runs, ROLES, None, live=live, report=report, json=json)
+    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    return run_processes(loaded, runs, ROLES, None, live=live, end=end)
 
 
 @command(RUNS, [
-    ("noack demo", "20 s; tables at the end, all kept in runs/latest"),
+    ("noack demo", "20 s; a verdict at the end, all kept in runs/latest"),
     ("noack demo --zoh --live", "a hold instead of a model, in the viewer"),
     ("noack demo --set speed=4 --set horizon_s=8", "2 s of wall time"),
 ])  # fmt: skip
@@ -62,12 +66,14 @@ def demo(
     runs: RunsOption = DEFAULT_RUNS,
     live: LiveOption = False,
     report: ReportOption = True,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> int:
     """Run the paper's lane-following example in real time."""
     mode = ['mode="zoh"'] if zoh else []
     loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
-    return run_processes(loaded, runs, ROLES, None, live=live, report=report, json=json)
+    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    return run_processes(loaded, runs, ROLES, None, live=live, end=end)
 
 
 class Trigger(StrEnum):
@@ -91,6 +97,7 @@ def simulate(
     ] = Trigger.SAMPLED,
     runs: RunsOption = DEFAULT_RUNS,
     report: ReportOption = True,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> int:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
@@ -103,7 +110,7 @@ def simulate(
     _warn_of_violations(loaded)
     with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
         ending = simulate_run(loaded, runs, progress=progress)
-    return _conclude(ending, report=report, json=json)
+    return conclude_run(ending, report=report, verbose=verbose, json=json)
 
 
 @command(RUNS, [
@@ -138,22 +145,24 @@ def view(
 
 @command(RUNS, [
     ("noack summary", "of the last run"),
+    ("noack summary --verbose", "all tables: timing, assumptions, each claim"),
     ("noack summary runs/latest --json", "all numbers"),
 ])  # fmt: skip
 def summary(
     run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
+    verbose: VerboseOption = False,
     json: JsonOption = False,
 ) -> int:
-    """Show what became of a run; finishes the record of one that was cut short."""
+    """Show a run's summary; finalise an interrupted run first."""
     from cosim.conclude import reopen
-    from cosim.tables import print_outcome
+    from cosim.run_verdict import print_outcome
 
     outcome = reopen(run_dir or latest_run(runs))
     if json:
         print_json(outcome.summary)
     else:
-        print_outcome(Console(), outcome)
+        print_outcome(Console(), outcome, verbose=verbose)
     return ExitStatus.OK
 
 
@@ -185,28 +194,28 @@ def replay(
 
 
 @command(RUNS, [
-    ("noack compare", "sampling, delay and hold of the last run, in numbers"),
-    ("noack compare runs/latest --json", ""),
+    ("noack fidelity", "sampling, delay and hold of the last run, in numbers"),
+    ("noack fidelity runs/latest --json", ""),
 ])  # fmt: skip
-def compare(
+def fidelity(
     run_dir: RunArgument = None,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
     """Compare a run with the ideal loop in continuous time, effect by effect."""
-    from cosim.fidelity import compare as compare_record
+    from cosim.fidelity import fidelity_of
     from cosim.fidelity_table import print_fidelity
     from cosim.progress import PatientConsole
     from cosim.record import load_record
 
     path = run_dir or latest_run(runs)
     with PatientConsole(stderr=True).status("comparing"):
-        fidelity = compare_record(load_record(path))
+        found = fidelity_of(load_record(path))
     if json:
-        print_json(fidelity.as_json())
+        print_json(found.as_json())
     else:
-        print_fidelity(Console(), fidelity)
-    return ExitStatus.OK if fidelity.explained else ExitStatus.FAILED
+        print_fidelity(Console(), found)
+    return ExitStatus.OK if found.explained else ExitStatus.FAILED
 
 
 @command(RUNS, [
@@ -236,10 +245,12 @@ def run_processes(
     session: str | None,
     *,
     live: bool,
-    report: bool,
-    json: bool,
+    end: Callable[["Ending"], int],
 ) -> int:
-    """Run a scenario with the processes ``spawn``; the others join by ``session``."""
+    """Run a scenario with the processes ``spawn``; the others join by ``session``.
+
+    ``end`` concludes the run, and gives the exit status.
+    """
     # Each process of a run waits for the slowest: what is not needed yet is imported later.
     from cosim.launch import launch
     from cosim.progress import PatientConsole, progress_line
@@ -254,7 +265,7 @@ def run_processes(
     except OSError:  # a closed terminal is no reason to lose a run
         if ending is None:
             raise
-    return _conclude(ending, report=report, json=json)
+    return end(ending)
 
 
 def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
@@ -282,10 +293,11 @@ def _warn_of_violations(scenario: Scenario) -> None:
             print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
 
 
-def _conclude(ending: "Ending", *, report: bool, json: bool) -> int:
+def conclude_run(ending: "Ending", *, report: bool, verbose: bool, json: bool) -> int:
+    """Finish a run's record, print its verdict, and return its exit status."""
     from cosim.conclude import conclude
     from cosim.progress import PatientConsole
-    from cosim.tables import print_outcome
+    from cosim.run_verdict import print_outcome
 
     # Of a run of an hour this takes minutes.
     with PatientConsole(stderr=True).status("replaying the run and judging its claims"):
@@ -293,5 +305,5 @@ def _conclude(ending: "Ending", *, report: bool, json: bool) -> int:
     if json:
         print_json(outcome.summary)
     else:
-        print_outcome(Console(), outcome)
+        print_outcome(Console(), outcome, verbose=verbose)
     return outcome.status

@@ -160,7 +160,7 @@ def _round_trips() -> RoundTrips:
 
 def _buffer() -> Buffer:
     with (
-        closing(bind(0, "doctor", "nothing")) as endpoint,
+        closing(bind(0, "nothing")) as endpoint,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
     ):
         sender.connect(endpoint.getsockname())
@@ -182,7 +182,7 @@ def _ports_taken(wanted: Wanted) -> Iterable[str]:
     for name, port in wanted.ports.items():
         try:
             if name in LOOP_ROLES:
-                bind(port, name, f"ports.{name}").close()
+                bind(port, f"ports.{name}").close()
             else:
                 require_free_tcp_port(port, f"ports.{name}")
         except CallerError as error:

@@ -109,10 +109,10 @@ def print_run(console: Console, run: ContinuousRun, resolved: Scenario) -> None:
     table.add_column("quantity")
     table.add_column("value", justify="right")
     for what, value in (
-        ("events (transmissions)", str(figures["events"])),
+        ("transmissions", str(figures["events"])),
         ("deliveries", str(figures["deliveries"])),
         ("dropped by the network", str(figures["drops"])),
-        ("longest drop run", f"{figures['longest_drop_run']} (at most {figures['mansd']})"),
+        (f"longest loss burst (cap M − 1 = {figures['mansd']})", str(figures["longest_drop_run"])),
         ("shortest inter-event time", _seconds(figures["inter_event_min_s"])),
         ("median inter-event time", _seconds(figures["inter_event_median_s"])),
         ("median time between deliveries", _seconds(figures["inter_delivery_median_s"])),

@@ -7,7 +7,7 @@ scenario comes with its first call.
 from importlib.metadata import version
 
 from cosim.lab.certificates import Certificates, certify
-from cosim.lab.runs import Run, open_run, run, simulate
+from cosim.lab.runs import Run, compare, open_run, run, simulate
 from cosim.lab.scenarios import from_system, load, with_settings
 from noack.errors import NoackError
 from noack.scenario import Scenario
@@ -21,6 +21,7 @@ __all__ = [
     "Scenario",
     "__version__",
     "certify",
+    "compare",
     "from_system",
     "load",
     "open_run",

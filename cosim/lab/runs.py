@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from matplotlib.figure import Figure
 
+    from cosim.comparison import Comparison
     from cosim.conclude import Outcome
     from cosim.fidelity import Fidelity
     from cosim.record import RunRecord
@@ -169,7 +170,7 @@ class Run:
 
         return replay(self._record)
 
-    def compare(self) -> "Fidelity":
+    def fidelity(self) -> "Fidelity":
         """Compare the run with the ideal loop in continuous time, effect by effect.
 
         Returns:
@@ -178,9 +179,9 @@ class Run:
         Raises:
             NoackError: there is no ideal loop to compare it with, or the record has holes.
         """
-        from cosim.fidelity import compare
+        from cosim.fidelity import fidelity_of
 
-        return compare(self._record)
+        return fidelity_of(self._record)
 
     @cached_property
     def _outcome(self) -> "Outcome":
@@ -294,6 +295,27 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())
     return Run(outcome.run_dir, lambda: outcome)
+
+
+def compare(*runs: Run | Folder) -> "Comparison":
+    """Put two or more runs beside each other; :meth:`Run.fidelity` is against the ideal loop.
+
+    Args:
+        runs: two to seven, each as a :class:`Run` or a run directory, live or simulated.
+
+    Returns:
+        The comparison: ``numbers`` side by side with their differences to the first run,
+        ``settings`` that differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
+
+    Raises:
+        NoackError: they are too few or too many, or their plants have different numbers of states.
+    """
+    from cosim.comparison import compare_runs
+
+    for one in runs:
+        if isinstance(one, Run):
+            one.summary  # noqa: B018  # a temporary run's is made when it is first asked for
+    return compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
 
 
 @contextmanager

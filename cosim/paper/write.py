@@ -15,7 +15,7 @@ from cosim.paper.page import render
 from cosim.paper.results import Results, dumps, results_of
 from cosim.paper.statistics import quartiles
 from cosim.report.save import save
-from noack.errors import CallerError, MachineError
+from noack.errors import CallerError, MachineError, why
 
 PAGE, FIGURES, RESULTS = "paper.md", "figures", "paper.json"
 FEWEST_DRAWS = 4
@@ -49,7 +49,7 @@ def make_folder(folder: Path) -> None:
     try:
         (folder / FIGURES).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise MachineError(f"{folder}: the page cannot be written: {error}") from None
+        raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
 
 
 def write_page(path: Path, results: Results, folder: Path) -> list[Path]:
@@ -72,7 +72,7 @@ def write_page(path: Path, results: Results, folder: Path) -> list[Path]:
         written.append(figures / "paper-ensemble.png")
         save(ensemble_figure(results), written[-1])
     except OSError as error:
-        raise MachineError(f"{folder}: the page cannot be written: {error}") from None
+        raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
     return written
 
 

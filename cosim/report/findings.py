@@ -14,7 +14,7 @@ _EFFECTS = {
     "held_actuation": "the plant holds an input until it has the next one",
     "unexplained": "what is left: rounding, if all is well",
 }
-"""As ``noack compare`` adds them to the ideal loop, one after the other."""
+"""As ``noack fidelity`` adds them to the ideal loop, one after the other."""
 
 
 class Finding(NamedTuple):

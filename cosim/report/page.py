@@ -9,13 +9,13 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.report.findings import FIDELITY, REPLAY, findings
-from cosim.tables import away, changes_in, interval_of, key_numbers, warnings_of
+from cosim.remarks import remarks
+from cosim.report.findings import findings
+from cosim.tables import interval_of, key_numbers
 from noack.scenario import Scenario
 from noack.trigger.text import trigger_text
 
 _NONE = "–"
-_MOST_ROWS = 40
 _TONES = {
     "held": "good", "holds": "good",
     "violated": "bad",
@@ -49,19 +49,19 @@ def page(
         environment: the content of ``environment.json``; empty if there is none.
     """
     claims = _objects(summary.get("claims"))
-    remarks = list(_remarks(summary, claims))
+    said = list(_remarks(summary, claims))
     status = summary["exit"]["status"]
     kind = "simulated run" if summary.get("kind") == "simulated" else "live run"
     hold = "model-based" if scenario.mode == "model" else "zero-order hold"
-    return _templates().get_template("report.html.jinja").render(
+    return templates().get_template("report.html.jinja").render(
         title=scenario.name,
         subtitle=", ".join(
             filter(None, (kind, hold, f"M − 1 = {scenario.network.mansd}", _started(environment)))
         ),
         description=scenario.description,
         ending=_ending(summary),
-        verdict_tone="bad" if status else "doubt" if remarks else "good",
-        remarks=remarks,
+        verdict_tone="bad" if status else "doubt" if said else "good",
+        remarks=said,
         # These have sections of their own.
         key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
@@ -69,7 +69,7 @@ def page(
         claims=[_claim(claim) for claim in claims],
         assumptions=_objects(summary.get("assumptions")),
         timing=list(_timing(summary)),
-        timing_headings=[*_QUANTILES.values(), "count", "late"],
+        timing_headings=[*_QUANTILES.values(), "count", "deadlines missed"],
         findings=list(findings(summary)),
         scenario_toml=scenario_toml,
         environment=[(_words(key), _line(value)) for key, value in environment.items()],
@@ -77,16 +77,17 @@ def page(
 
 
 @cache
-def _templates() -> Environment:
-    templates = Environment(
+def templates() -> Environment:
+    """The templates of the pages; all text is escaped."""
+    found = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    templates.filters["tone"] = lambda word: _TONES.get(word, "")
-    return templates
+    found.filters["tone"] = lambda word: _TONES.get(word, "")
+    return found
 
 
 def _ending(summary: Mapping[str, Any]) -> str:
@@ -101,35 +102,11 @@ def _ending(summary: Mapping[str, Any]) -> str:
 
 def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """What a person should know before trusting the rest."""
-    yield from warnings_of(dict(summary))
-    violations = summary["assumption_violations"]
-    for violation in violations[:_MOST_ROWS]:
-        yield (
-            f"Assumption violated at t = {violation['t_s']:.3f} s, "
-            f"seen by {violation['process']}: {violation['what']}"
-        )
-    if len(violations) > _MOST_ROWS:
-        yield f"and {len(violations) - _MOST_ROWS} more such violations"
+    yield from (remark.text for remark in remarks(dict(summary)))
     for verdict in ("violated", "void"):
         count = sum(claim.get("verdict") == verdict for claim in claims)
         if count:
             yield f"{count} of {len(claims)} claims {verdict}: see Claims"
-    if (summary.get("replay") or {}).get("bit_exact") is False:
-        yield f"The replay of the run differs from its record: see {REPLAY}"
-    if (summary.get("fidelity") or {}).get("explained") is False:
-        yield f"The run's difference to the ideal loop is not explained: see {FIDELITY}"
-    if summary["missing_samples"]:
-        where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
-        yield f"{summary['missing_samples']} samples are missing in the record: {where}"
-    if summary["lost_outside_netem"]:
-        where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
-        yield f"{summary['lost_outside_netem']} datagrams were lost outside the emulator: {where}"
-    for one in summary.get("restarts") or ():
-        yield f"{one['process']} was started anew, {away(one)}; claims are void from its death on"
-    for when, what in changes_in(dict(summary)):
-        yield f"{when}: {what}"
-    for role, reasons in summary["rejected_datagrams"].items():
-        yield f"{role} rejected datagrams: {_shown(reasons)}"
 
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
@@ -186,7 +163,7 @@ def _timing(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
     latency = summary.get("latency_us")
     if latency:
         quantiles = [_whole(latency[key]) for key in _QUANTILES]
-        yield "event → update", [*quantiles, str(latency["updates"]), ""]
+        yield "sensor-to-controller latency", [*quantiles, str(latency["updates"]), ""]
 
 
 def _started(environment: Mapping[str, Any]) -> str:

@@ -133,7 +133,7 @@ class Node:
         addresses: Mapping[str, Address] = begin["addresses"]
         self._changes = list(begin.get("changes", ()))
         if not addresses.keys() >= set(LOOP_ROLES):
-            raise PeerError(f"{self.role}: the coordinator did not say where everyone receives")
+            raise PeerError("the coordinator did not say where everyone receives")
         if not self.ticket.launched:
             verb = f"takes the place of one before ({self.after})" if self.after else "started"
             print(f"noack {self.role}: {verb}", file=sys.stderr)
@@ -225,7 +225,7 @@ class Node:
         port = port if self._place is None else self._place[1]
         place = LOOP_ROLES.index(self.role) if settings.pin_cores else None
         with (
-            closing(bind(port, self.role, f"ports.{self.role}")) as endpoint,
+            closing(bind(port, f"ports.{self.role}")) as endpoint,
             # Taken before the barrier: locking memory may take a tenth of a second.
             realtime(settings.enabled, settings.fifo_priority, place) as granted,
         ):

@@ -50,7 +50,7 @@ class Plane:
             self.session = open_star(endpoint, secret_of(ticket), listen=listen)
         except zenoh.ZError as error:
             verb = "listen on" if listen else "reach the run's coordinator at"
-            raise PeerError(f"{role}: cannot {verb} {endpoint}: {cause_of(error)}") from None
+            raise PeerError(f"cannot {verb} {endpoint}: {cause_of(error)}") from None
         self._token = self.session.liveliness().declare_token(
             self.key("alive", role, self.instance)
         )
@@ -201,4 +201,4 @@ class Plane:
                 if reply.err is not None:
                     raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
-        raise PeerError(f"{self.role}: no answer to {what!r} within {timeout_s:g} s")
+        raise PeerError(f"no answer to {what!r} within {timeout_s:g} s")

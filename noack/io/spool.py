@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from noack.errors import MachineError
+from noack.errors import MachineError, why
 
 _CHUNK = struct.Struct("<QQ")
 
@@ -46,7 +46,7 @@ class SpoolWriter:
                 file.truncate(file.tell() - written)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+            raise self._unwritable(error) from None
 
     def prepare(self, tables: Iterable[str]) -> None:
         """Open the files of tables before there is anything to write.
@@ -58,7 +58,10 @@ class SpoolWriter:
             for table in tables:
                 self._open(table)
         except OSError as error:
-            raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> MachineError:
+        return MachineError(f"{self._folder}: the record cannot be written: {why(error)}")
 
     def _open(self, table: str) -> BinaryIO:
         file = self._files.get(table)

@@ -39,12 +39,11 @@ MAX_UDP_BYTES = 65_535
 T = TypeVar("T")
 
 
-def bind(port: int, who: str, key: str, host: str = LOOPBACK) -> socket.socket:
+def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
     """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
 
     Args:
         port: the port.
-        who: the process, for the error message.
         key: the scenario key or option that set the port, for the error message.
         host: the local address.
 
@@ -61,7 +60,7 @@ def bind(port: int, who: str, key: str, host: str = LOOPBACK) -> socket.socket:
             errno.EACCES: "needs privileges that this user does not have",
         }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
         raise CallerError(
-            f"{who}: UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
+            f"UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
         ) from None
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,9 @@ def test_check_says_which_defaults_are_in_force(tmp_path: Path, content: dict[st
         path.write_text(tomli_w.dumps(content))
         done = CliRunner().invoke(app, ["check", str(path)])
         assert done.exit_code == 0, done.stderr
-        return " ".join(done.stderr.split())
+        assert done.stderr == ""
+        assert tomllib.loads(done.stdout)["name"] == content["name"]
+        return " ".join(done.stdout.replace("\n# ", "\n").split())
 
     silent = said()
     assert "plant.watchdog: hold when no actuation has come for 0.1 s" in silent
@@ -53,4 +56,4 @@ def test_check_says_which_defaults_are_in_force(tmp_path: Path, content: dict[st
     content["controller"] = {"safe_input": [0.1]}
     content["recovery"] = {"rejoin_within_s": 5.0}
     explicit = said()
-    assert not any(key in explicit for key in ("watchdog", "safe_input", "rejoin_within_s"))
+    assert not any(f"{key}:" in explicit for key in ("watchdog", "safe_input", "rejoin_within_s"))

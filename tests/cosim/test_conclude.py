@@ -13,7 +13,7 @@ from cosim.conclude import reopen
 from cosim.environment import write_environment
 from cosim.record import write_record
 from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
-from cosim.tables import print_outcome
+from cosim.run_verdict import print_outcome
 from cosim.virtual import simulate
 from noack.errors import CallerError
 from noack.records import PLANT_STEP

@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 import cosim.fidelity
 from cosim.cli import app
 from cosim.exact.fates import network_fates
-from cosim.fidelity import Fidelity, compare, fidelity_for_summary
+from cosim.fidelity import Fidelity, fidelity_for_summary, fidelity_of
 from cosim.fidelity_table import summary_rows
 from cosim.record import Rows, RunRecord
 from cosim.schedule import IncomparableError, live_run
@@ -46,7 +46,7 @@ def record() -> RunRecord:
 
 @pytest.fixture(scope="module")
 def fidelity(record: RunRecord) -> Fidelity:
-    return compare(record)
+    return fidelity_of(record)
 
 
 def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
@@ -85,7 +85,7 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
         asked.append(now_ns)
         return None if len(asked) % 3 == 2 else 7_000_000 * (len(asked) % 5)
 
-    fidelity = compare(lane(network, *settings))
+    fidelity = fidelity_of(lane(network, *settings))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
 
@@ -99,7 +99,7 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
     ],
 )
 def test_any_policy_is_explained(policy: str) -> None:
-    fidelity = compare(lane(None, f"trigger={policy}", 'mode="zoh"'))
+    fidelity = fidelity_of(lane(None, f"trigger={policy}", 'mode="zoh"'))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
 
@@ -117,7 +117,7 @@ def test_a_share_that_counts_against_the_others_is_called_so() -> None:
     numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
     told = dict(summary_rows(numbers | {"reason": None}))
     assert told["  share of sampling"] == "142.0 %"
-    assert told["  share of delay"] == "-42.0 %, against the others"
+    assert told["  share of delay"] == "-42.0 % (partly cancels the other effects)"
     assert told["  share of held actuation"] == "0.0 %"
 
 
@@ -126,11 +126,11 @@ def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> N
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
     record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
     with pytest.raises(IncomparableError, match="turns rounding into another run"):
-        compare(record)
+        fidelity_of(record)
 
 
 def test_delay_shows_as_delay() -> None:
-    prompt, late = (compare(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
+    prompt, late = (fidelity_of(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
     assert delay > 2 * prompt.stages[1].difference.rms
     assert sampling == pytest.approx(prompt.stages[0].difference.rms)  # the same fates, no delay
@@ -139,7 +139,7 @@ def test_delay_shows_as_delay() -> None:
 def test_a_start_without_actuation_shows_as_held_actuation() -> None:
     """Known x(0), no event at all: the plant still waits for the first tick, 8 ms late."""
     settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
-    fidelity = compare(lane(None, *settings))
+    fidelity = fidelity_of(lane(None, *settings))
     sampling, delay, held, _ = fidelity.stages
     assert fidelity.events_live == 0
     assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
@@ -154,7 +154,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
     A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
     other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
     rows = {table: record[table] for table in record.tables}
-    fidelity = compare(RunRecord(other, rows, record.notices, record.reports))
+    fidelity = fidelity_of(RunRecord(other, rows, record.notices, record.reports))
     assert fidelity.explained_relative > 0.1
     assert not fidelity.explained
     assert "too much" in fidelity.verdict
@@ -163,11 +163,11 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
-    assert not compare(with_rows(record, plant_step=steps)).explained
+    assert not fidelity_of(with_rows(record, plant_step=steps)).explained
 
 
 def test_at_rest_there_is_nothing_to_explain() -> None:
-    fidelity = compare(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    fidelity = fidelity_of(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
     assert fidelity.explained
     assert fidelity.explained_relative == 0.0
     assert "rounding" in fidelity.verdict
@@ -190,7 +190,7 @@ def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_dela
 
 def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
     """A sampled sensor that looks four times a second has fewer events than the paper's."""
-    fidelity = compare(lane(None, "plant.measure_every=25", 'mode="zoh"'))
+    fidelity = fidelity_of(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live
     assert fidelity.parted_event is not None
     assert fidelity.explained_relative < 1e-9
@@ -211,7 +211,7 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
 def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, why: str) -> None:
     broken = with_rows(record, **{table: record[table][rows]})
     with pytest.raises(IncomparableError, match=why):
-        compare(broken)
+        fidelity_of(broken)
     summary = fidelity_for_summary(broken)
     assert why in summary.pop("reason")
     assert set(summary.values()) == {None}
@@ -220,7 +220,7 @@ def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, wh
 def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecord) -> None:
     """The sensor was the first to end."""
     short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
-    fidelity = compare(short)
+    fidelity = fidelity_of(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
 
@@ -229,13 +229,13 @@ def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][300:] = math.nan
     with pytest.raises(IncomparableError, match="diverged"):
-        compare(with_rows(record, plant_step=steps))
+        fidelity_of(with_rows(record, plant_step=steps))
 
 
 def test_a_loop_whose_events_accumulate_says_so() -> None:
     unstable = lane(None, "model.parameters.gain=-1.0", "horizon_s=20")
     with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
-        compare(unstable, max_events=200)
+        fidelity_of(unstable, max_events=200)
 
 
 def test_the_summary_has_the_same_keys_whatever_happens(
@@ -248,12 +248,12 @@ def test_the_summary_has_the_same_keys_whatever_happens(
     def broken(*_: object) -> Fidelity:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(cosim.fidelity, "compare", broken)
+    monkeypatch.setattr(cosim.fidelity, "fidelity_of", broken)
     bad = fidelity_for_summary(record)
     assert bad.keys() == good.keys()
     assert bad["reason"] == "RuntimeError('a bug')"
     monkeypatch.setattr(cosim.fidelity, "_STEPS_AT_THE_END", 100)
-    assert "noack compare" in fidelity_for_summary(record)["reason"]
+    assert "noack fidelity" in fidelity_for_summary(record)["reason"]
 
 
 def noack(*arguments: str | Path) -> Result:
@@ -270,11 +270,11 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_last_run_is_compared(simulated: Path) -> None:
-    done = noack("compare", "--runs", simulated)
+    done = noack("fidelity", "--runs", simulated)
     assert done.exit_code == 0, done.output
     assert "held actuation" in done.stdout
     assert done.stderr == ""
-    document = json.loads(noack("compare", simulated / "latest", "--json").stdout)
+    document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
     assert document["explained"] is True
     assert [stage["name"] for stage in document["stages"]] == [
         "sampling", "delay", "held actuation", "unexplained"
@@ -288,14 +288,14 @@ def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Pat
     moved: Callable[[np.ndarray], np.ndarray] = lambda x: x + np.linspace(0, 1, len(x))  # noqa: E731
     column = pa.array(moved(table["x_3"].to_numpy()))
     pq.write_table(table.set_column(table.schema.get_field_index("x_3"), "x_3", column), path)
-    done = noack("compare", run)
+    done = noack("fidelity", run)
     assert done.exit_code == 1
     assert "too much" in done.stdout
-    assert noack("compare", run, "--json").exit_code == 1
+    assert noack("fidelity", run, "--json").exit_code == 1
 
 
 def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
-    done = noack("compare", tmp_path)
+    done = noack("fidelity", tmp_path)
     assert done.exit_code == 2
     assert "not a run directory" in done.stderr
 
@@ -317,4 +317,4 @@ def test_a_record_with_times_that_no_run_has_is_not_compared(
     rows[table][column][len(rows[table]) // 2] = value
     damaged = RunRecord(record.scenario, rows, [], record.reports)
     with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
-        compare(damaged)
+        fidelity_of(damaged)

@@ -39,7 +39,7 @@ def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
         plane.put(question, bad)
         barrier.poll()
         assert bad.error is not None
-        assert bad.error.startswith("plant cannot join: ")
+        assert bad.error.startswith("cannot join: ")
     for number, role in enumerate((*LOOP_ROLES, RECORDER)):
         address = None if role == RECORDER else ["127.0.0.1", 1 + number]
         hello = json.dumps({"pid": 1, "instance": role, "address": address}).encode()

@@ -22,14 +22,14 @@ def test_what_the_network_loses_in_the_long_run_is_told_beside_what_it_lost() ->
     summary = simulated("lane_following", horizon_s=2.0).summary
     drops = sum(0.8**k for k in range(1, 5))
     assert summary["loss_expected"] == pytest.approx(drops / (1 + drops))
-    assert ("  in the long run, at most 4 in a row", "70.3 %") in key_numbers(summary)
+    assert ("  expected loss rate with the cap", "70.3 %") in key_numbers(summary)
 
 
 def test_of_a_run_that_is_changed_no_long_run_is_told() -> None:
     change = {"at_s": 1.0, "set": {"network.loss.probability": 0.2}}
     summary = simulated("lane_following", horizon_s=2.0, changes=[change]).summary
     assert summary["loss_expected"] is None
-    assert not any("long run" in quantity for quantity, _ in key_numbers(summary))
+    assert not any("expected loss" in quantity for quantity, _ in key_numbers(summary))
 
 
 @pytest.mark.parametrize(("beta", "level"), [(0.02, "βe^(−0.3t), from"), (1e-3, "ε")])

@@ -22,7 +22,7 @@ GOOD: dict[str, Any] = {
     "replay": {"bit_exact": True, "complete": True, "inputs": 7},
     "claims": [
         {"verdict": "held", "since_s": None, "what": "a", "source": "b", "why": ""},
-        {"verdict": "violated", "since_s": 1.0, "what": "a", "source": "b", "why": "presupposes"},
+        {"verdict": "not applicable", "since_s": 1.0, "what": "a", "source": "b", "why": "ideal"},
         {"verdict": "void", "since_s": 1.0, "what": "a", "source": "b", "why": "late"},
     ],
 }
@@ -82,7 +82,7 @@ def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
         ("replay", None, "the replay"),
         ("replay", {"bit_exact": True, "complete": True, "inputs": 6}, "7 on the way"),
         ("claims", [], "no claim"),
-        ("claims", [GOOD["claims"][1] | {"why": ""}], "violated since 1.0 s"),
+        ("claims", [GOOD["claims"][1] | {"verdict": "violated"}], "violated since 1.0 s"),
     ],
 )
 def test_a_bad_end_is_told(key: str, value: object, told: str) -> None:

@@ -215,6 +215,8 @@ def test_the_page_is_one_file_and_escapes_what_users_write(
     html = (full.folder / "campaign.html").read_text(encoding="utf-8")
     assert "<script" not in html
     assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
+    assert html.count("Student&#39;s t") == 2  # as docs/campaigns.md and statistics.py have it
+    assert "(normal)" not in html
     assert html.count("<figure id=") == len(campaign.figures)
     assert html.count("<svg") == len(campaign.figures)
     again = list(figures_module.figures(summary, full))

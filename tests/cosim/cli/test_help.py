@@ -44,7 +44,7 @@ def test_the_help_begins_with_a_story() -> None:
     story, _, panels = text.partition("Options")
     told = re.findall(r"^ +noack (\w+)", story, re.MULTILINE)
     assert told == [
-        "doctor", "run", "view", "simulate", "certify", "compare", "campaign", "netem",
+        "doctor", "run", "view", "simulate", "certify", "fidelity", "compare", "campaign", "netem",
     ]  # fmt: skip
     assert all(f" {name} " in panels for name in COMMANDS)
     assert "completion" not in panels
@@ -96,6 +96,7 @@ MORE = {
     "schema": (),
     "summary": (),
     "replay": (),
+    "fidelity": (),
     "report": (),
     "scenarios": (),
     "certify": (),
@@ -182,4 +183,6 @@ def test_options_that_mean_the_same_have_the_same_name() -> None:
         for one in COMMANDS[name].params:
             if one.param_type_name == "argument":
                 arguments[one.name].add(name)
-    assert arguments.keys() == {"scenario", "run_dir", "recording", "file", "name", "settings"}
+    assert arguments.keys() == {
+        "scenario", "run_dir", "directories", "recording", "file", "name", "settings",
+    }  # fmt: skip

@@ -1,6 +1,10 @@
 """A mistake in how a command is called is one line, with what would be right."""
 
 import json
+import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
@@ -78,3 +82,31 @@ def test_without_a_command_the_help_is_shown() -> None:
     assert done.exit_code == 2
     assert "noack doctor" in done.stdout
     assert done.stderr == ""
+
+
+def test_a_process_that_fails_is_named_once(tmp_path: Path) -> None:
+    """The process names itself in its log, and the launcher names it; neither does so twice."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        settings = ("ports={}", f"ports.sensor={port}", "horizon_s=1")
+        done = subprocess.run(
+            [sys.executable, "-m", "cosim.cli", "run", "double_integrator", "--runs", tmp_path,
+             *(word for setting in settings for word in ("--set", setting))],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    (run_dir,) = tmp_path.iterdir()
+    said = (
+        f"sensor: UDP port 127.0.0.1:{port} is already taken by another program; "
+        "set ports.sensor to another port, or to 0 for any"
+    )
+    assert done.returncode == 2
+    assert done.stderr == f"noack: {said} (logs in {run_dir / 'logs'})\n"
+    assert (run_dir / "logs/sensor.log").read_text() == f"noack {said}\n"
+
+
+def test_a_folder_that_cannot_be_written_is_named_once() -> None:
+    done = noack("simulate double_integrator --runs /dev/null/runs")
+    assert (
+        done.stderr == "noack: /dev/null/runs: no run directory can be created: Not a directory\n"
+    )

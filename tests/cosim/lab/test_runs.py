@@ -30,7 +30,7 @@ def test_a_run_says_what_became_of_it(simulated: noack.Run) -> None:
 
 def test_its_machines_repeat_it(simulated: noack.Run) -> None:
     assert simulated.replay().bit_exact
-    assert simulated.compare().explained
+    assert simulated.fidelity().explained
 
 
 def test_a_temporary_run_is_there_as_long_as_its_object() -> None:

@@ -19,9 +19,9 @@ from cosim.launch import Ending
 from cosim.record import finish_record, load_record, write_record
 from cosim.replay import replay
 from cosim.run_dir import ENVIRONMENT_FILE, RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.run_verdict import print_outcome
 from cosim.summary import dumps as summary_text
 from cosim.summary import summarise
-from cosim.tables import print_outcome
 from cosim.virtual import simulate
 from noack.io.spool import SpoolWriter
 from noack.io.telemetry import notices_of

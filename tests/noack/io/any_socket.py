@@ -23,7 +23,7 @@ class Ear:
     """A sensor's socket, which hears measurements of two entries from ``peer``."""
 
     def __init__(self, peer: socket.socket, endpoint: socket.socket | None = None) -> None:
-        self._endpoint = bind(0, "test", "port") if endpoint is None else endpoint
+        self._endpoint = bind(0, "port") if endpoint is None else endpoint
         self.decoder = Decoder(Flow.MEASUREMENT, 2, RUN_ID, KEY)
         self.encoder = Encoder(RUN_ID, KEY)
         self.address = self._endpoint.getsockname()

@@ -278,3 +278,14 @@ def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> N
             second.poll()
         second.close()
         knocking.result()
+
+
+def test_a_process_that_gets_no_answer_is_named_by_who_reports_it(
+    ticket: Ticket, coordinator: Coordinator
+) -> None:
+    """So that nobody reads ``noack sensor: sensor: no answer``."""
+    with (
+        Plane(ticket, "sensor") as plane,
+        pytest.raises(PeerError, match=r"^no answer to 'nothing'"),
+    ):
+        plane.request("nothing", {}, timeout_s=0.05)

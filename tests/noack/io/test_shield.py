@@ -163,7 +163,7 @@ def test_work_between_two_looks_at_the_clock_is_bounded(stack: ExitStack) -> Non
 def test_what_came_before_the_peer_was_known_is_heard_first(stack: ExitStack) -> None:
     """Who takes another's place in a run is sent to before it can know by whom."""
     peer = stack.enter_context(opened())
-    endpoint = stack.enter_context(bind(0, "test", "port"))
+    endpoint = stack.enter_context(bind(0, "port"))
     encoder, early = Encoder(RUN_ID, KEY), 2 * IN_AN_INTERVAL
     for sequence in range(early):
         peer.sendto(encoder.encode(Ear.message(sequence)), endpoint.getsockname())
