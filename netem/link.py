@@ -106,6 +106,11 @@ class Link:
         """Datagrams, and copies, that are delayed now."""
         return self._state.link.under_way
 
+    @property
+    def delays(self) -> bool:
+        """Whether what passes may have to be kept."""
+        return self._program.tracks
+
     def flow(self, flow: int) -> FlowState | None:
         """What is remembered of a flow; None if none of its datagrams has come."""
         row = self._rows.get(flow)

@@ -10,6 +10,8 @@ class ExitStatus(IntEnum):
     OK = 0
     FAILED = 1
     CALLER = 2
+    UNINTENDED_LOSSES = 3
+    """An emulator on its own lost datagrams unintentionally: its guarantee does not hold."""
     INTERRUPTED = 130
     TERMINATED = 143
 

@@ -29,7 +29,10 @@ class CaptureTap:
     def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
         """Offer a copy, as the relay goes on writing where these are."""
         if events.size:
-            self._writer.offer(events.copy(), data.copy())
+            try:
+                self._writer.offer(events.copy(), data.copy())
+            except MemoryError:
+                self.missing(len(events))
 
     def missing(self, events: int) -> None:
         """Count events that there was no room for; of which side is not known."""

@@ -9,11 +9,15 @@ from netem.cli import options as command_line
 from netem.cli import relaying
 from netem.cli.explain import explain
 from netem.cli.totals import print_totals
+from netem.control.statistics import unintended
 from noack.errors import ExitStatus
 
 
 def alone(arguments: Sequence[str]) -> ExitStatus:
     """Run the emulator on its own until Ctrl-C, or explain what it would do.
+
+    Returns:
+        UNINTENDED_LOSSES if there were any, as the guarantee does not hold then.
 
     Raises:
         CallerError: the command line says something wrong.
@@ -31,4 +35,4 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
     else:
         console = Console(stderr=True, highlight=False)
         print_totals(totals, console, predicted=options.replay_fates is None)
-    return ExitStatus.OK
+    return ExitStatus.UNINTENDED_LOSSES if unintended(totals) else ExitStatus.OK

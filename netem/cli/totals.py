@@ -8,7 +8,14 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.control.figures import NONE, percent_text, time_text
-from netem.control.statistics import DirectionStatistics, LinkStatistics, Quantiles, Statistics
+from netem.control.statistics import (
+    DirectionStatistics,
+    LinkStatistics,
+    Quantiles,
+    Statistics,
+    unintended,
+)
+from noack.errors import ExitStatus
 
 _CAUSES = {
     "dropped": "dropped by loss",
@@ -41,16 +48,12 @@ def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> No
     """
     for link in totals["links"]:
         console.print(_table(link, predicted))
-    unintended = sum(_unintended(link) for link in totals["links"])
-    if unintended:
+    if lost := unintended(totals):
+        status = ExitStatus.UNINTENDED_LOSSES
         console.print(
-            f"{unintended:,} datagrams were lost that nobody ordered: the cap does not hold for "
-            "them", style="bold red", soft_wrap=True,
+            f"unintended losses: {lost:,} datagrams; the guarantee does not hold (exit status "
+            f"{status})", style="bold red", soft_wrap=True,
         )  # fmt: skip
-
-
-def _unintended(link: LinkStatistics) -> int:
-    return sum(sum(side["unintended"].values()) for side in (link["forward"], link["back"]))
 
 
 def _table(link: LinkStatistics, predicted: bool) -> Table:

@@ -95,7 +95,7 @@ class DirectionStatistics(TypedDict):
     """The cap on that; null if there is none."""
     loss: Loss
     unintended: dict[str, int]
-    """Losses that nobody ordered, by cause; any breaks the guarantee."""
+    """Unintended losses, by cause; any breaks the guarantee."""
     under_way: int
     """Datagrams that are delayed, or queue for a bottleneck, now."""
     most_under_way: int
@@ -234,6 +234,12 @@ def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> 
         "delay_ns": quantiles(after.delays - before.delays),
         "lateness_ns": quantiles(after.lateness - before.lateness),
     }
+
+
+def unintended(totals: Statistics) -> int:
+    """Return how many datagrams were lost unintentionally in all links."""
+    directions = [link[side] for link in totals["links"] for side in ("forward", "back")]
+    return sum(sum(direction["unintended"].values()) for direction in directions)
 
 
 def loss_share(after: Counters, before: Counters) -> float | None:

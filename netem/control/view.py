@@ -105,7 +105,7 @@ def _clients_text(link: LinkStatistics) -> str:
 
 
 def _unintended(link: LinkStatistics) -> Text | None:
-    """Return the line on losses that nobody ordered, if there are any."""
+    """Return the line on unintended losses, if there are any."""
     causes = [
         f"{number:,} {cause.replace('_', ' ')} ({name})"
         for name in DIRECTIONS

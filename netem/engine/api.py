@@ -65,8 +65,8 @@ class DirectionReport:
     settings: LinkSettings
     counters: Counters
     unintended: Mapping[str, int]
-    """Losses that nobody ordered: ``lost_in_kernel`` (the receive buffer overflowed), and by the
-    system's message what could not be sent. Any breaks the guarantee."""
+    """Unintended losses: ``lost_in_kernel`` (the receive buffer overflowed), and by the system's
+    message what could not be sent, or kept until then. Any breaks the guarantee."""
     under_way: int
     """Datagrams that are delayed now."""
     flows: Sequence[FlowReport]

@@ -35,7 +35,7 @@ from netem.engine.pump.layout import (
     SERVER_NAME,
     STORE_FULL,
 )
-from netem.engine.sockets import raise_file_limit, stamp_arrivals, take_together
+from netem.engine.sockets import raise_file_limit, stamp_arrivals
 from netem.engine.unreachable import Unreachable
 from netem.records import Counters, Verdict, dtype_of
 from noack.errors import CallerError
@@ -102,11 +102,7 @@ class BatchedRelay:
                     )
                 )
                 self._losses.append(Losses(link.spec.name, direction))
-            if segment:
-                take_together(link.endpoint)
-        self._clients = Clients(
-            self._links, self._ways, self._memory, self._functions, self._epoll, segment
-        )
+        self._clients = Clients(self._links, self._ways, self._memory, self._functions, self._epoll)
         for number in range(len(self._ways)):
             self._stamp_arrivals(number)
         self._verdicts = np.zeros(1, dtype_of(Verdict))
@@ -229,7 +225,7 @@ class BatchedRelay:
             name = self._memory.memory.in_names[pump["batch_next"]].tobytes()
             self._clients.add(int(pump["batch_socket"]), name)
         elif reason == STORE_FULL:
-            self._memory.add_room()
+            self._memory.pump["no_memory"] = not self._memory.add_room()
         elif reason == EVENTS_FULL:
             self._tell_taps()
 
@@ -242,6 +238,7 @@ class BatchedRelay:
             pump["events"] = pump["data"] = 0
 
     def _keep_house(self, now_ns: int) -> None:
+        self._memory.pump["no_memory"] = 0  # ask again
         self._look_at_losses()
         self._clients.ask_some()
         if now_ns >= self._rarely_ns:

@@ -19,7 +19,6 @@ from netem.engine.sockets import (
     has_data,
     return_path,
     stamp_arrivals,
-    take_together,
 )
 from noack.io.udp import drops_of
 
@@ -35,7 +34,6 @@ class Clients:
         memory: the pump's.
         functions: the pump's, compiled.
         epoll: what the pump waits with.
-        together: whether the kernel may hand over runs of equal size at once.
     """
 
     def __init__(
@@ -45,11 +43,9 @@ class Clients:
         memory: PumpMemory,
         functions: Functions,
         epoll: Epoll,
-        together: bool,
     ) -> None:
         self._links, self._ways = links, ways
         self._memory, self._functions, self._epoll = memory, functions, epoll
-        self._together = together
         self._free_rows = list(reversed(range(len(memory.memory.clients))))
         self._free_places: list[list[int]] = [[] for _ in links]
         self._places = [0] * len(links)
@@ -178,8 +174,6 @@ class Clients:
 
     def _set_path(self, row: int, path: Endpoint) -> None:
         memory, place = self._memory.memory, self._memory.first_path + row
-        if self._together:
-            take_together(path)
         if self._ways[2 * int(memory.clients["link"][row]) + 1].program.tracks:
             stamp_arrivals(path)
         self._paths[row] = path

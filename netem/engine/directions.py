@@ -12,7 +12,7 @@ from netem.engine.pump.layout import TABLES
 from netem.program import empty_state, program_of, recent_width
 from netem.records import Decision
 from netem.rules.link import Program, State
-from noack.impairments import LinkSettings
+from noack.impairments import Corrupt, LinkSettings
 
 _ROWS = 16
 
@@ -107,6 +107,8 @@ class Way:
             row[f"{name}_rows"] = len(table)
         for name in ("mansd", "limit", "scored", "tracks"):
             row[name] = getattr(self.program, name)
+        corrupts = any(isinstance(one, Corrupt) for one in self.settings.impairments)
+        row["keeps"] = self.program.tracks or corrupts
         state: Any = self.state
         for name in ("flows", "memory", "recent_ns", "queues", "departures_ns"):
             row[name] = getattr(state, name).ctypes.data

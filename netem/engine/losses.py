@@ -1,5 +1,6 @@
-"""Losses that nobody ordered: they break the guarantee, and are never silent."""
+"""Unintended losses: no setting caused them, they break the guarantee, and are never silent."""
 
+import errno
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -8,6 +9,11 @@ from netem.engine.api import Direction
 from netem.say import say
 
 KERNEL = "lost_in_kernel"
+_HOW = {
+    KERNEL: "were lost in the kernel, as its receive buffer was full",
+    os.strerror(errno.ENOBUFS): "were lost, as a queue on the way out was full",
+    os.strerror(errno.ENOMEM): "were lost, as there was no memory to delay them",
+}
 
 
 class Losses:
@@ -28,7 +34,7 @@ class Losses:
         self._set(KERNEL, datagrams)
 
     def not_sent(self, error: int, datagrams: int) -> None:
-        """Say how many could not be sent so far, for a reason by its errno."""
+        """Say how many could not be sent, or kept until then, for a reason by its errno."""
         self._set(os.strerror(error), datagrams)
 
     def counts(self) -> Mapping[str, int]:
@@ -40,16 +46,11 @@ class Losses:
         for what, datagrams in self._counts.items():
             if datagrams > self._told[what]:
                 self._told[what] = datagrams
-                say(f"{self._where}: {datagrams} datagrams {_how(what)}, against the guarantee")
+                how = _HOW.get(what, f"could not be sent ({what})")
+                say(f"{self._where}: {datagrams} datagrams {how}, against the guarantee")
 
     def _set(self, what: str, datagrams: int) -> None:
         if datagrams > 0:
             self._counts[what] = datagrams
             if not self._told[what]:
                 self.tell()
-
-
-def _how(what: str) -> str:
-    if what == KERNEL:
-        return "were lost in the kernel, as its receive buffer was full"
-    return f"could not be sent ({what})"

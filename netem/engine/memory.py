@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from netem.engine.headroom import has_headroom
 from netem.engine.histogram import BUCKETS
 from netem.engine.pump import layout
 from netem.engine.pump.layout import Array, Memory
@@ -14,6 +15,7 @@ from netem.records import Counters, LinkState, dtype_of
 _BUFFERS = 64
 _READY = 64
 _LEAVING = 128
+_ERRORS = 16
 _VECTORS = 1024
 """As many as one message may have."""
 _CLIENTS = 64
@@ -29,7 +31,7 @@ class PumpMemory:
 
     Args:
         links: how many.
-        segment: whether runs of equal size come and leave as one.
+        segment: whether datagrams of equal size leave as one message.
         taps: 0 none, 1 some, 2 some that want data.
     """
 
@@ -59,6 +61,8 @@ class PumpMemory:
             in_vectors=rows(_BUFFERS, layout.VECTOR),
             in_names=np.zeros((_BUFFERS, layout.NAME_BYTES // 8), np.int64),
             in_controls=np.zeros((_BUFFERS, layout.CONTROL_BYTES // 8), np.int64),
+            error_headers=rows(_ERRORS, layout.HEADER),
+            error_controls=np.zeros((_ERRORS, layout.ERROR_CONTROL_BYTES // 8), np.int64),
             out_headers=rows(_LEAVING, layout.HEADER),
             out_first=np.zeros(_LEAVING, np.int32),
             out_vectors=rows(_VECTORS, layout.VECTOR),
@@ -82,8 +86,6 @@ class PumpMemory:
         self._lay_out_buffers()
         self._free_slots(0)
         self.add_chunk()
-        if segment:
-            self.read_controls()
 
     @property
     def pump(self) -> Any:
@@ -97,9 +99,15 @@ class PumpMemory:
         headers["control"] = controls.ctypes.data + np.arange(len(headers)) * layout.CONTROL_BYTES
         headers["control_bytes"] = layout.CONTROL_BYTES
 
-    def add_room(self) -> None:
-        """Make room for more that is delayed: for one datagram of any size, and its copy."""
+    def add_room(self) -> bool:
+        """Make room for more that is delayed: for one datagram of any size, and its copy.
+
+        Returns:
+            Whether there is memory for it.
+        """
         old = self.memory
+        if not has_headroom(2 * (old.heap.nbytes + old.slots.nbytes)):
+            return False
         if self.pump["free_slots"] < 2:
             count = len(old.slots)
             self.memory = old._replace(heap=_doubled(old.heap), slots=_doubled(old.slots))
@@ -107,6 +115,7 @@ class PumpMemory:
         # Any two datagrams fit into a chunk.
         if self.pump["free_blocks"] < layout.CHUNK_BLOCKS // 2:
             self.add_chunk()
+        return True
 
     def add_chunk(self) -> None:
         """Add a chunk of blocks."""
@@ -165,6 +174,10 @@ class PumpMemory:
         headers["name_bytes"] = layout.NAME_BYTES
         headers["vectors"] = memory.in_vectors.ctypes.data + numbers * layout.VECTOR.itemsize
         headers["n_vectors"] = 1
+        controls = memory.error_controls
+        memory.error_headers["control"] = (
+            controls.ctypes.data + np.arange(_ERRORS) * layout.ERROR_CONTROL_BYTES
+        )
 
 
 def _doubled(array: Array) -> Array:

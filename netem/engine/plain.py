@@ -17,6 +17,7 @@ from netem.engine.api import (
     LinkSpec,
     Tap,
 )
+from netem.engine.headroom import has_headroom
 from netem.engine.opened import OpenLink, open_links
 from netem.engine.plain_taps import Ends, PlainTaps, Way
 from netem.engine.plain_way import Departure, PlainWay
@@ -25,6 +26,7 @@ from netem.engine.sockets import (
     Endpoint,
     address_of,
     has_data,
+    icmp_errors,
     raise_file_limit,
     return_path,
 )
@@ -37,9 +39,9 @@ _PERIOD_NS = 20_000_000
 _RARELY_NS = 250_000_000
 _NS = 1_000_000_000
 _BATCH = 64
-_TRIES = 3
+_TRIES, _MOST_TRIES = 3, 64
 _PATIENCE_S = 0.05
-_FULL = (errno.EAGAIN, errno.ENOBUFS)
+"""See :mod:`netem.engine.pump.send`."""
 _REPORTED_FLOWS = 16
 
 
@@ -77,6 +79,13 @@ class _PlainLink:
         self.refusals = Refusals(spec)
         self.unreachable = Unreachable(spec)
 
+    def take_errors(self, endpoint: Endpoint) -> bool:
+        """Whether there are ICMP errors of earlier datagrams; no more are there then."""
+        found = icmp_errors(endpoint)
+        if endpoint is not self.link.endpoint:
+            self.port_unreachable += found.count(errno.ECONNREFUSED)
+        return bool(found)
+
     def way(self, back: bool) -> Way:
         """A direction, as taps are told."""
         mansd = self.ways[back].settings.mansd
@@ -112,6 +121,7 @@ class PlainRelay:
             self._selector.register(link.link.endpoint, selectors.EVENT_READ, (link, None))
         self._epoch_ns = 0
         self._rarely_ns = 0
+        self._no_memory = False
         self.began_unix_ns: int | None = None
         """Unix time at which the relay began to run, to which its times refer."""
 
@@ -127,6 +137,8 @@ class PlainRelay:
             self._taps.unix_ns = self.began_unix_ns
         while not stop():
             housekeeping()
+            # Until the next time, datagrams take less than the headroom.
+            self._no_memory = not has_headroom()
             self._keep_house()
             until_ns = self._now_ns() + _PERIOD_NS
             while (now_ns := self._now_ns()) < until_ns:
@@ -200,16 +212,18 @@ class PlainRelay:
         """Take what there is at a socket: a client's return path, or where the link listens."""
         back = client is not None
         endpoint = client.path if client is not None else link.link.endpoint
+        if endpoint is None:
+            return
         way = link.ways[back]
-        for _ in range(_BATCH):
+        for number in range(_BATCH):
             try:
-                data, source = endpoint.recvfrom(MAX_UDP_BYTES)  # type: ignore[union-attr]
-            except BlockingIOError:
-                return
-            except ConnectionRefusedError:
-                link.port_unreachable += 1
-                continue
-            except OSError:  # another ICMP error, which concerns no one
+                data, source = endpoint.recvfrom(MAX_UDP_BYTES)
+            except OSError as failure:
+                nothing = isinstance(failure, BlockingIOError)
+                if not (nothing and number):  # then it was ready for an ICMP error
+                    link.take_errors(endpoint)
+                if nothing:
+                    return
                 continue
             now_ns = self._now_ns()
             self._let_out(now_ns)
@@ -218,6 +232,9 @@ class PlainRelay:
                 link.refused += 1
                 continue
             sender.last_ns = now_ns
+            if self._no_memory and way.link.delays:
+                way.errors[errno.ENOMEM] += 1
+                continue
             verdict, departures = way.admit(sender.number, data, now_ns)
             sender.under_way += (verdict.release_ns > now_ns) + (verdict.copy_ns > now_ns)
             if self._taps:
@@ -355,12 +372,13 @@ def _transmit(link: _PlainLink, endpoint: Endpoint, data: bytes, place: Any) -> 
                 endpoint.sendto(data, place)
         except OSError as failure:
             error = failure.errno or errno.EIO
-            if error in _FULL and time.monotonic() < give_up_s:
+            if error == errno.EAGAIN and time.monotonic() < give_up_s:
                 time.sleep(0.001)
                 continue
-            link.port_unreachable += error == errno.ECONNREFUSED
+            if error in (errno.EAGAIN, errno.ENOBUFS):
+                return error
             tries += 1
-            if error in _FULL or tries == _TRIES:
+            if tries >= (_MOST_TRIES if link.take_errors(endpoint) else _TRIES):
                 return error
         else:
             return 0

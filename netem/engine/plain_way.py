@@ -55,7 +55,7 @@ class PlainWay:
         self.link = Link(settings, spec.seed, spec.name, direction, decisions=decisions)
         self.losses = Losses(spec.name, direction)
         self.errors: Counter[int] = Counter()
-        """Datagrams that could not be sent, by errno."""
+        """Datagrams that could not be sent, or kept until then, by errno."""
         self._delays, self._lateness = empty(), empty()
         self._kept: dict[tuple[int, int], _Kept] = {}
 

@@ -4,6 +4,7 @@ import ctypes
 import errno
 import socket
 import struct
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv6Address, ip_address
@@ -18,8 +19,14 @@ _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_SNDBUFFORCE = 32
 _SO_ATTACH_FILTER = 26
 _BPF_RETURN = 6
-_UDP_GRO = 104
 _SO_TIMESTAMPNS = 35
+_MSG_ERRQUEUE = 0x2000
+_EXTENDED_ERROR = struct.Struct("=IB")
+"""Begin of struct sock_extended_err: errno and origin."""
+_ICMP_ORIGINS = (2, 3)
+_RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
+"""Levels and options: IP_RECVERR, IPV6_RECVERR."""
+_ERROR_BYTES = 128
 
 Endpoint = socket.socket
 
@@ -107,7 +114,7 @@ def one_way_path(server: Place) -> Endpoint:
         if endpoint.getsockname()[1] == 0:
             endpoint.bind(("", 0))
         endpoint.setblocking(False)
-        _enlarge_send_buffer(endpoint)
+        _prepare_to_send(endpoint)
     except BaseException:
         endpoint.close()
         raise
@@ -132,16 +139,26 @@ def leads_to(server: Place, here: Place) -> bool:
     return bound == host
 
 
-def take_together(endpoint: Endpoint) -> None:
-    """Let the kernel hand over runs of equal size at once, where it does."""
-    with suppress(OSError):
-        endpoint.setsockopt(socket.IPPROTO_UDP, _UDP_GRO, 1)
-
-
 def stamp_arrivals(endpoint: Endpoint) -> None:
     """Let the kernel say when datagrams came, where it does."""
     with suppress(OSError):
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+
+def icmp_errors(endpoint: Endpoint) -> list[int]:
+    """Empty a socket's error queue; return the errno of each error that came by ICMP.
+
+    The compiled engine does the same by itself (:mod:`netem.engine.pump.error_queue`).
+    """
+    found: list[int] = []
+    with suppress(OSError):
+        while sys.platform == "linux":
+            _, ancillary, _, _ = endpoint.recvmsg(0, _ERROR_BYTES, _MSG_ERRQUEUE)
+            for level, kind, data in ancillary:
+                if (level, kind) in _RECVERR and len(data) >= _EXTENDED_ERROR.size:
+                    error, origin = _EXTENDED_ERROR.unpack_from(data)
+                    found += [error] if origin in _ICMP_ORIGINS else []
+    return found
 
 
 def has_data(endpoint: Endpoint) -> bool:
@@ -176,10 +193,19 @@ def _host(name: Sequence[Any]) -> IPv4Address | IPv6Address:
 def _prepare(endpoint: Endpoint) -> None:
     endpoint.setblocking(False)
     enlarge_buffer(endpoint)
-    _enlarge_send_buffer(endpoint)
+    _prepare_to_send(endpoint)
 
 
-def _enlarge_send_buffer(endpoint: Endpoint) -> None:
+def _prepare_to_send(endpoint: Endpoint) -> None:
+    """Take a large buffer, and let a full queue on the way out fail a send (ENOBUFS), where it can.
+
+    Linux else drops there without a word. What it then reports beside, in the socket's error queue,
+    has to be taken.
+    """
+    if sys.platform == "linux":
+        for level, option in _RECVERR:
+            with suppress(OSError):  # the socket is not of IPv6
+                endpoint.setsockopt(level, option, 1)
     try:
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, _BUFFER_BYTES)
     except OSError:

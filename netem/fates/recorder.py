@@ -91,7 +91,11 @@ class FateRecorder:
 
     def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
         """Take what has come in; called in the relay's thread."""
-        rows = events.view(_RAW)[events["departure"] == 0]
+        try:
+            rows = events.view(_RAW)[events["departure"] == 0]
+        except MemoryError:
+            self.missing(len(events))
+            return
         if self._taken - self._done + len(rows) > self._most_waiting:
             self.missing(len(rows))
         elif len(rows):

@@ -13,7 +13,7 @@ from netem.engine.pump.layout import (
     STORE_FULL,
     Memory,
 )
-from netem.engine.pump.libc import array_at
+from netem.engine.pump.libc import ENOMEM, array_at
 from netem.engine.pump.store import blocks_for, keep, pop, push
 from netem.records import Verdict
 from netem.rules.link import Program, State, admit, leave
@@ -23,9 +23,6 @@ _HEAD_BYTES = 16
 """Of a control message: its length, its level and its kind."""
 _STAMP = 1 | 35 << 32
 """Level and kind: SOL_SOCKET, SCM_TIMESTAMPNS."""
-_SEGMENT = 17 | 104 << 32
-"""Level and kind: SOL_UDP, UDP_GRO."""
-_LOW_WORD = 0xFFFFFFFF
 _NS = 1_000_000_000
 
 
@@ -103,25 +100,28 @@ def decide(memory: Memory, program_like: Program, state_like: State, verdict: Ve
     )
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
-        if pump.batch_offset == 0:
-            _read_control(memory)
+        _read_arrival(memory)
         # Never before what was decided already; so what is due between two datagrams leaves there.
         now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
         reason = let_out_due(memory, state_like, now_ns)
         if reason != CARRY_ON:
             return reason
         pump.now_ns = now_ns
-        begin = pump.batch_offset
-        size_bytes = min(header.size_bytes - begin, pump.segment_bytes)
-        address = memory.in_vectors[pump.batch_next].base + begin
+        size_bytes = header.size_bytes
+        address = memory.in_vectors[pump.batch_next].base
         if pump.leaving + 2 > len(memory.leaving):
             return LEAVING_FULL
         if not has_room(memory, size_bytes):
             return EVENTS_FULL
-        if pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes):
-            return STORE_FULL
         taken = True
-        if not back:
+        if direction.keeps != 0 and (
+            pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes)
+        ):
+            if pump.no_memory == 0:
+                return STORE_FULL
+            memory.errors[way, ENOMEM] += 1
+            taken = False
+        elif not back:
             name = memory.in_names[pump.batch_next]
             key0, key1, key2, key3 = key_of(name, link)
             client_row = find(memory.table, memory.clients, key0, key1, key2, key3)
@@ -148,28 +148,22 @@ def decide(memory: Memory, program_like: Program, state_like: State, verdict: Ve
                         verdict.fate, verdict.copy_ns, verdict.copy_bit, True,
                         not intact and verdict.copy_bit < 0,
                     )  # fmt: skip
-        pump.batch_offset = begin + size_bytes
-        if pump.batch_offset >= header.size_bytes:
-            header.name_bytes = NAME_BYTES
-            header.control_bytes = pump.control_bytes
-            pump.batch_offset = 0
-            pump.batch_next += 1
+        header.name_bytes = NAME_BYTES
+        header.control_bytes = pump.control_bytes
+        pump.batch_next += 1
     return CARRY_ON
 
 
-def _read_control(memory: Memory) -> None:
-    """Read when the datagrams at hand came, and their size if there are several."""
+def _read_arrival(memory: Memory) -> None:
+    """Read when the datagram at hand came."""
     pump = memory.pump[0]
     header, words = memory.in_headers[pump.batch_next], memory.in_controls[pump.batch_next]
     pump.arrival_ns = pump.read_ns
-    pump.segment_bytes = header.size_bytes
     place, left_bytes = 0, header.control_bytes
     while left_bytes >= _HEAD_BYTES and place + 3 < len(words):
         used_bytes = (words[place] + 7) & ~7
         if words[place + 1] == _STAMP:
             pump.arrival_ns = words[place + 2] * _NS + words[place + 3] - pump.real_ns
-        elif words[place + 1] == _SEGMENT and words[place + 2] & _LOW_WORD > 0:
-            pump.segment_bytes = words[place + 2] & _LOW_WORD
         left_bytes -= used_bytes
         place += used_bytes >> 3
 

@@ -49,14 +49,12 @@ PUMP = np.dtype(
         ("real_ns", "<i8"),  # what to add for the real-time clock
         ("stamps", "<i8"),  # 1: the kernel says when a datagram came
         ("arrival_ns", "<i8"),  # of what lies in the receive buffer at hand
-        ("segment_bytes", "<i8"),  # size of the datagrams in it
         ("first_path", "<i8"),  # where the clients' return paths begin among the sockets
         ("buffers", "<i8"),  # address of the receive buffers
         ("slots_in", "<i8"),  # how many there are
         ("batch_socket", "<i8"),
         ("batch_next", "<i8"),  # the receive buffer at hand
         ("batch_end", "<i8"),
-        ("batch_offset", "<i8"),  # within it, of the datagram at hand
         ("ready", "<i8"),  # sockets that are ready
         ("ready_next", "<i8"),
         ("stamp", "<i8"),
@@ -68,10 +66,11 @@ PUMP = np.dtype(
         ("free_slots", "<i8"),
         ("free_block", "<i8"),
         ("free_blocks", "<i8"),
+        ("no_memory", "<i8"),  # 1: there is none for more of these
         ("taps", "<i8"),  # 0: none, 1: without data, 2: with data
         ("events", "<i8"),
         ("data", "<i8"),
-        ("segment", "<i8"),  # 1: let runs of equal size leave as one
+        ("segment", "<i8"),  # 1: let datagrams of equal size leave as one message
         ("segment_below", "<i8"),  # the kernel refuses to segment what is as long
         ("control_bytes", "<i8"),  # room for control messages of what is received, 0: none
         ("sleeps", "<i8"),  # 0: by epoll_pwait2, 1: by ppoll and epoll_wait
@@ -116,6 +115,7 @@ DIRECTION = np.dtype(
         ("limit", "<i8"),
         ("scored", "<i8"),
         ("tracks", "<i8"),
+        ("keeps", "<i8"),  # 1: what it lets out may have to be kept
         ("sends", "<i8"),  # NO_NAME, SERVER_NAME or CLIENT_NAME
         ("name_bytes", "<i8"),
         ("name", "u1", (NAME_BYTES,)),  # forward: the server's
@@ -170,7 +170,7 @@ HEADER = np.dtype(
     [
         ("name", "<i8"), ("name_bytes", "<u4"), ("pad0", "<u4"), ("vectors", "<i8"),
         ("n_vectors", "<i8"), ("control", "<i8"), ("control_bytes", "<i8"), ("flags", "<i4"),
-        ("pad1", "<u4"), ("size_bytes", "<u4"), ("pad2", "<u4"),
+        ("pad1", "<u4"), ("size_bytes", "<i4"), ("pad2", "<u4"),
     ]
 )  # fmt: skip
 """struct mmsghdr of 64-bit Linux."""
@@ -178,6 +178,8 @@ VECTOR = np.dtype([("base", "<i8"), ("size_bytes", "<i8")])
 """struct iovec."""
 CONTROL_BYTES = 64
 """Room for the control messages of what is received."""
+ERROR_CONTROL_BYTES = 128
+"""Room for those of an error: a timestamp, the error, and the address of who reports it."""
 CONTROL = np.dtype(
     [("bytes", "<i8"), ("level", "<i4"), ("kind", "<i4"), ("size_bytes", "<i4"), ("pad", "<i4")]
 )
@@ -205,7 +207,7 @@ class Memory(NamedTuple):
     """(2 · links, BUCKETS) Histograms."""
     lateness: Array
     errors: Array
-    """(2 · links, 256) Datagrams that could not be sent, by errno."""
+    """(2 · links, 256) Datagrams that could not be sent, or kept until then, by errno."""
     time: Array
     """(2,) int64: struct timespec."""
     poll: Array
@@ -218,6 +220,9 @@ class Memory(NamedTuple):
     """(slots_in, 4) int64: socket addresses."""
     in_controls: Array
     """(slots_in, CONTROL_BYTES / 8) int64."""
+    error_headers: Array
+    error_controls: Array
+    """(error_headers, k) int64."""
     out_headers: Array
     out_first: Array
     """(out_headers,) int32: the first datagram of each."""

@@ -33,6 +33,7 @@ sendto = _function("sendto", types.int64, _int, _word, _word, _int, _word, types
 syscall = _function("syscall", types.int64, *[types.int64] * 7)
 
 ECONNREFUSED = 111
+ENOMEM = 12
 CLOCK_REALTIME = 0
 CLOCK_MONOTONIC = 1
 MSG_DONTWAIT = 0x40

@@ -1,6 +1,7 @@
 """The loop: wait, receive, decide, send, and let out what is due."""
 
 from netem.engine.pump.decide import decide, let_out_due
+from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.layout import (
     CARRY_ON,
     HEADER,
@@ -12,14 +13,12 @@ from netem.engine.pump.layout import (
 from netem.engine.pump.libc import (
     CLOCK_MONOTONIC,
     CLOCK_REALTIME,
-    ECONNREFUSED,
     MSG_DONTWAIT,
     POLLIN,
     SYS_EPOLL_PWAIT2,
     address_of,
     clock_ns,
     epoll_wait,
-    errno,
     ppoll,
     recvmmsg,
     syscall,
@@ -29,6 +28,7 @@ from netem.records import Verdict
 from netem.rules.link import Program, State
 
 _HEADER_BYTES = HEADER.itemsize
+_EPOLLERR = 8
 _NS = 1_000_000_000
 _FEW_BUFFERS = 16
 _HOUSEKEEPING_NS = 500_000
@@ -120,8 +120,11 @@ def _wait(memory: Memory, until_ns: int) -> bool:
 def _receive(memory: Memory) -> None:
     """Take what there is at the next socket that is ready, as far as there is room."""
     pump = memory.pump[0]
-    socket = memory.ready[pump.ready_next * READY_WORDS + READY_WORDS - 2]
+    event = pump.ready_next * READY_WORDS
+    socket = memory.ready[event + READY_WORDS - 2]
     pump.ready_next += 1
+    if memory.ready[event] & _EPOLLERR:
+        take_errors(memory, socket)
     begin = pump.batch_end
     headers = address_of(memory.in_headers) + begin * _HEADER_BYTES
     fd = memory.sockets[socket].fd
@@ -129,11 +132,7 @@ def _receive(memory: Memory) -> None:
     pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
     if pump.stamps != 0:
         pump.real_ns = clock_ns(CLOCK_REALTIME, memory.time) - pump.read_ns
-    if taken < 0 and socket >= pump.first_path and errno(memory.integers) == ECONNREFUSED:
-        # An ICMP error; what else it fails with, if not for want of datagrams, concerns no one.
-        memory.directions[2 * memory.clients[socket - pump.first_path].link].port_unreachable += 1
     if taken > 0:
         pump.batch_socket = socket
         pump.batch_next = begin
         pump.batch_end = begin + taken
-        pump.batch_offset = 0

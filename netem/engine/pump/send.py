@@ -1,6 +1,7 @@
 """Sends what is lined up: by one call for each socket, and each flow in its order."""
 
 from netem.engine.histogram import bucket_of
+from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.events import tell_departure
 from netem.engine.pump.layout import (
     BLOCK_BYTES,
@@ -15,7 +16,6 @@ from netem.engine.pump.layout import (
 )
 from netem.engine.pump.libc import (
     CLOCK_MONOTONIC,
-    ECONNREFUSED,
     MSG_DONTWAIT,
     POLLOUT,
     address_of,
@@ -43,9 +43,12 @@ _SEGMENT_CONTROL_BYTES = 18
 _MOST_SEGMENTS = 64
 _MOST_SEGMENTED_BYTES = 65_507
 _TRIES = 3
-"""An earlier datagram's ICMP error fails a send, once; what fails again will fail."""
+_MOST_TRIES = 64
+"""An earlier datagram's ICMP error fails a send, once. What fails with none in the error queue, or
+so often, will fail again."""
 _PATIENCE_NS = 50_000_000
-"""So long, at most, a socket may be full."""
+"""So long, at most, a socket may be full. A full queue of the device (ENOBUFS) is not waited for:
+other links would be late."""
 
 
 def send(memory: Memory) -> None:
@@ -72,7 +75,7 @@ def send(memory: Memory) -> None:
             headers, following = _fill(memory, number)
             done = headers
             if socket.fd >= 0:
-                done = _transmit(memory, socket.fd, headers)
+                done = _transmit(memory, memory.order[place], headers, following)
             else:
                 for k in range(headers):
                     memory.leaving[memory.out_first[k]].error = socket.error
@@ -173,12 +176,18 @@ def _add_vectors(memory: Memory, vectors: int, number: int) -> int:
     return vectors + blocks_for(leaving.size_bytes)
 
 
-def _transmit(memory: Memory, fd: int, headers: int) -> int:
+def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
     """Send messages; return how many are done with.
 
     The others have to be filled in again, as the kernel does not segment the first of them.
+
+    Args:
+        memory: the pump's.
+        socket: number of the socket.
+        headers: how many messages there are.
+        following: the datagram after those in them; −1 none.
     """
-    pump = memory.pump[0]
+    pump, fd = memory.pump[0], memory.sockets[socket].fd
     done, tries, waited_ns = 0, 0, 0
     base, vectors = address_of(memory.out_headers), address_of(memory.out_vectors)
     while done < headers:
@@ -199,30 +208,32 @@ def _transmit(memory: Memory, fd: int, headers: int) -> int:
         error = errno(memory.integers)
         if error == _EINTR:
             continue
-        if error in (_EAGAIN, _ENOBUFS) and waited_ns < _PATIENCE_NS:
-            waited_ns += _wait_for_room(memory, fd, error)
+        if error == _EAGAIN and waited_ns < _PATIENCE_NS:
+            waited_ns += _wait_for_room(memory, fd)
             continue
-        if error == ECONNREFUSED:
-            way = memory.leaving[memory.out_first[done]].direction
-            memory.directions[way & ~1].port_unreachable += 1
-        tries += 1
-        if tries < _TRIES and error not in (_EAGAIN, _ENOBUFS):
-            continue
-        if header.control_bytes > 0:
-            first = memory.leaving[memory.out_first[done]]
-            pump.segment_below = min(pump.segment_below, first.size_bytes)
-            return done
-        memory.leaving[memory.out_first[done]].error = error
+        number = memory.out_first[done]
+        if error not in (_EAGAIN, _ENOBUFS):
+            tries += 1
+            if tries < (_MOST_TRIES if take_errors(memory, socket) > 0 else _TRIES):
+                continue
+            if header.control_bytes > 0:
+                size_bytes = memory.leaving[number].size_bytes
+                pump.segment_below = min(pump.segment_below, size_bytes)
+                return done
         done += 1
         tries = 0
+        end = memory.out_first[done] if done < headers else following
+        while number != end:
+            memory.leaving[number].error = error
+            number = memory.leaving[number].next
     return done
 
 
-def _wait_for_room(memory: Memory, fd: int, error: int) -> int:
+def _wait_for_room(memory: Memory, fd: int) -> int:
     """Wait until a socket takes more, 1 ms at most; return how long, in ns."""
     begun_ns = clock_ns(CLOCK_MONOTONIC, memory.time)
     memory.poll[0] = fd
-    memory.poll[1] = POLLOUT if error == _EAGAIN else 0
+    memory.poll[1] = POLLOUT
     poll(address_of(memory.poll), 1, 1)
     return max(clock_ns(CLOCK_MONOTONIC, memory.time) - begun_ns, 1000)
 

@@ -110,5 +110,5 @@ def test_losses_that_nobody_ordered_are_told() -> None:
     assert "unintended: lost in kernel 7" in lines
     assert "unintended: Network is unreachable 2" in lines
     assert lines[-1] == (
-        "9 datagrams were lost that nobody ordered: the cap does not hold for them"
+        "unintended losses: 9 datagrams; the guarantee does not hold (exit status 3)"
     )

@@ -39,7 +39,7 @@ from tests.netem.engine.relays import HOSTS, KeepAll, drain, endpoints, link, na
 ENGINES: Sequence[Engine] = ("batched", "plain")
 pytestmark = pytest.mark.parametrize("engine", ENGINES)
 HALF = LossOf(loss=Bernoulli(probability=0.5))
-UDP_SEGMENT = 103
+UDP_SEGMENT, SEGMENTS = 103, 64
 
 
 def numbers(datagrams: Sequence[tuple[bytes, Any]]) -> list[int]:
@@ -349,6 +349,22 @@ def test_what_the_kernel_drops_is_counted_to_the_last(
     assert "link test, forward:" in said
     assert "link test, back:" in said
     assert "lost in the kernel" in said
+
+
+def test_what_the_kernel_drops_of_cut_messages_is_counted_to_the_last(engine: Engine) -> None:
+    """Every datagram of them, though a client hands them over as one."""
+    messages, size = 3000, 72
+    with (
+        endpoints(HOSTS[4], HOSTS[4]) as (server, client),
+        running([link(name_of(server))], engine, segment=True, start=False) as one,
+    ):
+        client.connect(one.relay.addresses()["test"])
+        client.setsockopt(socket.IPPROTO_UDP, UDP_SEGMENT, size)
+        for _ in range(messages):
+            client.send(bytes(size * SEGMENTS))
+        one.start()
+        one.until(lambda: all_of(one.relay.report()[0].forward) == messages * SEGMENTS)
+        assert one.report().forward.unintended["lost_in_kernel"] > 1000
 
 
 def all_of(way: Any) -> int:

@@ -53,16 +53,21 @@ class Emulator:
         self.port = int(port)
 
     def finish(self) -> dict[str, Any]:
-        """End it; return what it says of its link."""
-        self._process.send_signal(signal.SIGINT)
-        stdout, stderr = self._process.communicate(timeout=30)
-        assert self._process.returncode == 0, stderr
+        """End it, which has lost nothing by itself; return what it says of its link."""
+        link, status, stderr = self.end()
+        assert status == 0, stderr
         # A program may end with something on its way to it.
         assert all("ICMP port unreachable" in line for line in stderr.splitlines()), stderr
-        (link,) = json.loads(stdout)["links"]
         for direction in ("forward", "back"):
             assert not any(link[direction]["unintended"].values()), link[direction]["unintended"]
-        return dict(link)
+        return link
+
+    def end(self) -> tuple[dict[str, Any], int, str]:
+        """End it; return what it says of its link, its exit status, and its standard error."""
+        self._process.send_signal(signal.SIGINT)
+        stdout, stderr = self._process.communicate(timeout=30)
+        (link,) = json.loads(stdout)["links"]
+        return dict(link), self._process.returncode, stderr
 
     def kill(self) -> None:
         if self._process.poll() is None:

@@ -3,18 +3,21 @@
 There is no other way from client to server: nobody forwards packets.
 """
 
+import errno
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
+from noack.errors import ExitStatus
 from noack.records import Fate
 from tests.netem.programs.conftest import Emulate
 from tests.netem.programs.emulator import LET_OUT
@@ -165,3 +168,84 @@ def test_each_client_address_is_a_flow_with_a_way_back(
         assert flow["longest_run"] <= 2
     assert len(ports) == len(outer.clients)
     assert len(seen) == link["forward"]["forwarded"]
+
+
+# It holds less than comes, for seconds.
+SLOW_LINE = ["tbf", "rate", "800kbit", "burst", "80kb", "limit", "160kb"]
+MANY = 3000
+QUEUE_FULL = os.strerror(errno.ENOBUFS)
+
+
+@pytest.fixture
+def slow_line(namespaces: Namespaces) -> Iterator[Callable[[], int]]:
+    """A queue on the way from emulator to server; tells how many datagrams are in it."""
+    tc = (*namespaces.inside("emulator"), "tc")
+    if shutil.which("tc") is None:
+        pytest.skip("tc (iproute2) is not installed")
+    made = subprocess.run(
+        [*tc, "qdisc", "add", "dev", "inner", "root", *SLOW_LINE], capture_output=True, check=False
+    )
+    if made.returncode:
+        pytest.skip(f"no queue discipline here: {made.stderr.decode().strip()}")
+
+    def queued() -> int:
+        show = [*tc, "-s", "-j", "qdisc", "show", "dev", "inner"]
+        (found,) = json.loads(subprocess.check_output(show))
+        return int(found["qlen"])
+
+    yield queued
+    subprocess.run([*tc, "qdisc", "del", "dev", "inner", "root"], check=True)
+
+
+def unread(namespaces: Namespaces, version: int, port: int) -> int:
+    """Bytes that have come to a port of the emulator, and that it has not taken yet."""
+    table = "/proc/net/udp" if version == 4 else "/proc/net/udp6"
+    rows = subprocess.check_output([*namespaces.inside("emulator"), "cat", table], text=True)
+    for row in rows.splitlines()[1:]:
+        _, local, _, _, queues, *_ = row.split()
+        if int(local.rpartition(":")[2], 16) == port:
+            return int(queues.partition(":")[2], 16)
+    raise AssertionError(rows)
+
+
+@pytest.mark.parametrize("version", [4, 6], ids=["IPv4", "IPv6"])
+@pytest.mark.parametrize(
+    "options", [(), ("--one-way",), ("--segment",), ("--engine", "plain")], ids=" ".join
+)
+def test_what_a_full_queue_on_the_way_out_refuses_is_counted(
+    namespaces: Namespaces,
+    slow_line: Callable[[], int],
+    emulate: Emulate,
+    version: int,
+    options: Sequence[str],
+) -> None:
+    """Every datagram is in one counter, and the guarantee is not said to hold."""
+    outer, inner = OUTER[version], INNER[version]
+    with subprocess.Popen(
+        [*namespaces.inside("server"), sys.executable, str(ECHO), "count", inner.servers],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as counting:  # fmt: skip
+        try:
+            assert counting.stdout is not None
+            emulator = emulate(
+                url(inner.servers, int(counting.stdout.readline())), "loss 20% mansd 2", *options,
+                listen=url(outer.servers, 0), inside=namespaces.inside("emulator"),
+            )  # fmt: skip
+            send = [sys.executable, str(ECHO), "send", outer.servers, str(emulator.port), str(MANY)]
+            # From the emulator's own side, where nothing is lost before it.
+            subprocess.run([*namespaces.inside("emulator"), *send], check=True, timeout=60)
+            while unread(namespaces, version, emulator.port):
+                time.sleep(0.1)
+            link, status, stderr = emulator.end()
+            while slow_line():
+                time.sleep(0.1)
+            said, _ = counting.communicate(timeout=60)
+        finally:
+            counting.kill()
+    forward = link["forward"]
+    kernel, queue = (forward["unintended"][key] for key in ("lost_in_kernel", QUEUE_FULL))
+    assert forward["arrived"] + kernel == MANY
+    assert forward["forwarded"] == int(said) + queue
+    assert queue > 0
+    assert "queue on the way out was full" in stderr
+    assert status == ExitStatus.UNINTENDED_LOSSES
