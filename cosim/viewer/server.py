@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Self
 from urllib.parse import quote
 
+from cosim.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
 from noack.errors import MachineError
 
 HOST = "127.0.0.1"
@@ -95,9 +96,13 @@ class RecordingServer:
 
     def open_window(self) -> subprocess.Popen[bytes] | None:
         """Open a window on the recording; None if it closed before it asked for the recording."""
+        port = _free_port()
         window = _start_viewer(
-            ["--port", "auto", "--bind", HOST, self.origin + RECORDING], start_new_session=True
+            ["--port", str(port), "--bind", HOST, self.origin + RECORDING], start_new_session=True
         )
+        if (t_ns := opening_time_ns(self.path)) is not None:
+            move = partial(move_window_to, t_ns, window, port)
+            threading.Thread(target=move, daemon=True).start()
         deadline = time.monotonic() + _START_S
         while not self.requested.wait(0.02) and time.monotonic() < deadline:
             if window.poll() is not None:
@@ -156,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
         elif self.path == RECORDING:
             self._send_recording(self.server.recording)
         else:
-            self._send_asset(self.server.recording.assets_port)
+            self._send_asset(self.server.recording)
 
     def handle(self) -> None:
         """Serve one connection; a viewer may break it at any time."""
@@ -188,8 +193,8 @@ class _Handler(BaseHTTPRequestHandler):
                     recording.finished.wait(_POLL_S)
             recording.downloaded.set()
 
-    def _send_asset(self, port: int) -> None:
-        source = http.client.HTTPConnection(HOST, port, timeout=10)
+    def _send_asset(self, recording: RecordingServer) -> None:
+        source = http.client.HTTPConnection(HOST, recording.assets_port, timeout=10)
         with contextlib.closing(source):
             try:
                 source.request("GET", self.path)
@@ -204,6 +209,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.end_headers()
             while block := answer.read(_BLOCK):
                 self.wfile.write(block)
+            is_page = self.path.partition("?")[0] == "/"
+            if is_page and (t_ns := opening_time_ns(recording.path)) is not None:
+                self.wfile.write(script_to_open_at(t_ns))
 
 
 def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) -> None:
