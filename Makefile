@@ -127,9 +127,9 @@ format: setup-dev ## Format the code
 bench: setup-dev ## Measure against the alternatives, in one run; prints tables
 	$(BIN)/python -m benchmarks $(ARGS)
 
-screenshots: setup ## Make docs/run.png from a run that ends with the controller misled; needs Chromium
-	@$(BIN)/noack demo --set horizon_s=4.1
-	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png
+screenshots: setup ## Make docs/run.png, light as the page it is on; needs Chromium
+	@$(BIN)/noack simulate lane_following --no-report
+	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png --size 1600x900
 
 schema: setup ## Write the JSON Schemas of scenario, campaign and links files to docs/
 	$(BIN)/noack schema > docs/scenario.schema.json

@@ -71,6 +71,8 @@ def _summarise(
     if diverged_at_s is not None and exit_status == ExitStatus.OK:
         exit_status, reason = ExitStatus.FAILED, _why_diverged(record, diverged_at_s)
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
+    common = joined.since_delivery(scenario)
+    common_s, e_c_norm = joined.t_ns[common] * 1e-9, joined.e_c_norm[common]
     live = record.kind == "live"
     summary = {
         "kind": record.kind,
@@ -109,7 +111,8 @@ def _summarise(
         "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
         "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
-        "sup_e_c_norm": _or_none(np.max, joined.e_c_norm[joined.since_delivery(scenario)]),
+        "sup_e_c_norm": _or_none(np.max, e_c_norm),
+        "sup_e_c_at_s": _or_none(lambda e_c: common_s[np.argmax(e_c)], e_c_norm),
         "identity_residual_max": _or_none(np.max, residual),
         "identity_residual_relative": _or_none(
             lambda values: np.max(values) / max(np.abs(joined.x_s).max(), np.finfo(float).tiny),

@@ -160,7 +160,7 @@ def main() -> int:
     parser.add_argument("recording", type=Path, metavar="RRD")
     parser.add_argument("picture", type=Path, metavar="PNG")
     parser.add_argument("--size", type=_size, default=(1600, 1000), metavar="WxH")
-    parser.add_argument("--theme", choices=("dark", "light"), default="dark")
+    parser.add_argument("--theme", choices=("dark", "light"), default="light")
     arguments = parser.parse_args()
     try:
         picture = take_picture(arguments.recording, arguments.size, arguments.theme)

@@ -222,7 +222,7 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> Figure:
         finite.append(at[seen])
         axes.plot(at[seen], share[seen], drawstyle="steps-post", **style)
         shown.append((Line2D([], [], **style), plain(label, _LONGEST_LABEL)))
-    axes.set(xlabel=METRICS[metric].label, ylabel="share of runs [1]", ylim=(0, 1.02))
+    axes.set(xlabel=METRICS[metric].label, ylabel="share of runs", ylim=(0, 1.02))
     if METRICS[metric].logarithmic and _far(np.concatenate(finite)):
         logarithmic(axes, "x")
     legend(axes, shown)

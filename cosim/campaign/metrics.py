@@ -45,7 +45,7 @@ class Description(NamedTuple):
     @property
     def label(self) -> str:
         """Of an axis."""
-        return f"{self.title} {self.meaning} [{self.unit or 1}]".replace("  ", " ")
+        return f"{self.title} {self.meaning}".strip() + (f" [{self.unit}]" if self.unit else "")
 
 
 METRICS: Mapping[Metric, Description] = {

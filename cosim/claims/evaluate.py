@@ -79,13 +79,15 @@ _NO_CLAIM = Claim(
 
 
 class Envelope(NamedTuple):
-    """A certified curve beside a measured one."""
+    """A curve that bounds a measured one."""
 
     label: str
     quantity: Literal["e_c", "x", "inter_event"]
     """``"e_c"`` for ‖e_c‖_W, ``"x"`` for ‖x‖, ``"inter_event"`` for a lower bound in seconds."""
     t_s: Reals
     values: Reals
+    kind: Literal["certified", "identity", "printed"] = "certified"
+    """What it rests on: a certificate, identity (I1), or a formula printed in the paper."""
 
 
 class Part(NamedTuple):
@@ -203,11 +205,11 @@ class Claims:
         return [*self._identity(), *self._printed(), *self._certified()]
 
     def envelopes(self) -> list[Envelope]:
-        """The certified curves, at the measurements."""
+        """The bounds, at the measurements."""
         if self.record.scenario.is_acknowledged:
             return []
         t_s = self._t_s
-        found: list[Envelope] = []  # in this order, a certificate looks alike in every figure
+        found: list[Envelope] = []
         for certificate in self.certificates:
             if certificate.constants is not None:
                 label = f"certified for {certificate.scope}"
@@ -215,11 +217,13 @@ class Claims:
                 found.append(Envelope(label, "x", t_s, certificate.state(t_s)))
             if certificate.inter_event_s is not None:
                 found.append(self._least_interval(label, certificate.inter_event_s))
-        found.append(Envelope("bound from (I1)", "e_c", t_s, self._bounds[0]))
+        found.append(Envelope("bound from (I1)", "e_c", t_s, self._bounds[0], "identity"))
         if (theorem := self._theorem_2) is not None:
             alpha = self.record.scenario.decaying.alpha_per_s
-            found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, theorem.state(t_s, alpha)))
-            found.append(self._least_interval("Theorem 2 (eq:tau)", theorem.inter_event_s))
+            state = theorem.state(t_s, alpha)
+            found.append(Envelope("Theorem 2 (eq:normXt)", "x", t_s, state, "printed"))
+            least = self._least_interval("Theorem 2 (eq:tau)", theorem.inter_event_s)
+            found.append(least._replace(kind="printed"))
         return found
 
     def _least_interval(self, label: str, interval_s: float) -> Envelope:

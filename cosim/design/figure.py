@@ -36,7 +36,7 @@ def trade_off(found: Found) -> Figure:
     (front,) = axes.plot(
         [t.measured.transmissions for t in found.front],
         [t.measured.settling_s for t in found.front],
-        drawstyle="steps-post", color=printed(palette.FORCED), linewidth=1.4,
+        drawstyle="steps-post", color=printed(palette.NETWORK), linewidth=1.4,
     )  # fmt: skip
     limit = axes.axhline(
         found.limits.settling_s, color=printed(palette.CERTIFIED), linestyle=(0, (6, 2))
@@ -47,9 +47,9 @@ def trade_off(found: Found) -> Figure:
         axes.errorbar(
             [best.transmissions], [best.settling_s],
             yerr=[[best.settling_s - best.settling_low_s], [high_s - best.settling_s]],
-            xerr=[best.halfwidth], color=printed(palette.DROPPED), marker="*", markersize=12,
+            xerr=[best.halfwidth], color=printed(palette.LOST), marker="*", markersize=12,
         )  # fmt: skip
-    star = Line2D([], [], color=printed(palette.DROPPED), marker="*", linestyle="none")
+    star = Line2D([], [], color=printed(palette.LOST), marker="*", linestyle="none")
     shown += [(front, labels[-3]), (limit, labels[-2]), (star, labels[-1])]
     axes.set(
         xlabel="transmissions (mean)",

@@ -40,15 +40,15 @@ SHOWN_S = 20.0
 _STEP_S = 0.01
 _BINS = 30
 _PANELS = (
-    ("events", "transmissions", "count [1]", True),
-    ("deliveries", "deliveries", "count [1]", True),
+    ("events", "transmissions", "count", True),
+    ("deliveries", "deliveries", "count", True),
     ("settled_5_s", "settling to 5 %", "time [s]", False),
     ("gap_min_s", "shortest interval", "time [s]", True),
 )
 _LEFT_IN, _HEAD_IN, _ABOVE_IN, _GAP_IN, _BELOW_IN = 0.78, 0.62, 1.5, 0.75, 1.85
 _COLOURS: Mapping[Mode, Any] = {
-    "model": printed(palette.SERIES[5]),
-    "zoh": printed(palette.SERIES[4]),
+    "model": printed(palette.SERIES[2]),
+    "zoh": printed(palette.SERIES[3]),
 }
 _DOT = printed(palette.PLANT)
 
@@ -99,7 +99,7 @@ def ensemble_figure(results: Results) -> Figure:
         both: dict[Mode, Vector] = {mode: results.column(f"{mode}.{name}") for mode in MODES}
         above = place(figure, left_in, _HEAD_IN, width_in, _ABOVE_IN)
         shown = _histogram(above, both, logarithm=logarithm)
-        above.set(title=title, xlabel=unit, ylabel="draws [1]" if i == 0 else "")
+        above.set(title=title, xlabel=unit, ylabel="draws" if i == 0 else "")
         below = place(figure, left_in, _HEAD_IN + _ABOVE_IN + _GAP_IN, width_in, _BELOW_IN)
         _against(below, both["model"], both["zoh"], logarithm=logarithm)
         below.set(xlabel=f"MB-ET, {unit}", ylabel=f"ZOH-ET, {unit}")

@@ -6,8 +6,9 @@ each other, and gives the same figure the same bytes.
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,8 +20,21 @@ from cosim import palette
 from cosim.report.decimate import Reals, decimate
 from cosim.report.style import NotebookFigure, printed
 
-Curve = tuple[str, Reals, Reals]
-"""Label, times in s (k,), values (k,)."""
+BoundKind = Literal["certified", "identity", "printed"]
+"""What a bound rests on: a certificate, identity (I1), or a formula printed in the paper."""
+
+
+class Bound(NamedTuple):
+    """A curve that bounds what was measured."""
+
+    label: str
+    t_s: Reals
+    """(k,)"""
+    values: Reals
+    """(k,)"""
+    kind: BoundKind = "certified"
+
+
 Shown = tuple[Artist, str]
 """What is drawn and what the legend calls it."""
 
@@ -39,9 +53,14 @@ _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 _LARGEST = 1e150
 _LONGEST_NAME = 16
 
-# What the curves that they bound do not use.
-_BOUND_COLOURS = (palette.FORCED, palette.SERIES[4], palette.SERIES[5], palette.NETWORK)
-_BOUND_DASHES = ((0, (6, 2.5)), (0, (2, 1.5)), (0, (6, 2, 1.5, 2)), (0, (1, 2)))
+_BOUND_STYLES: dict[BoundKind, tuple[palette.Colour, tuple[Any, ...]]] = {
+    # There may be several certificates, for different conditions.
+    "certified": (
+        palette.CERTIFIED, ((0, (6, 2.5)), (0, (3, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 3)))
+    ),
+    "identity": (palette.IDENTITY, ((0, (1.2, 1.4)),)),
+    "printed": (palette.PRINTED, ((0, (6, 1.5, 1, 1.5, 1, 1.5)),)),
+}  # fmt: skip
 
 
 def place(
@@ -89,10 +108,11 @@ def head_in(labels: Sequence[str], width_in: float = WIDTH_IN - LEFT_IN - RIGHT_
 def _legend_columns(labels: Sequence[str], width_in: float) -> int:
     """As many as there is room for beside the title."""
     entries_in = [_HANDLE_IN + _CHARACTER_IN * len(_MARKUP.sub("", label)) for label in labels]
-    room_in = width_in - _TITLE_IN
-    if sum(entries_in) <= room_in:
-        return max(len(labels), 1)
-    return max(int(room_in / max(entries_in)), 1)
+    for columns in range(len(labels), 1, -1):
+        widths_in = [max(column) for column in np.array_split(entries_in, columns)]
+        if sum(widths_in) <= width_in - _TITLE_IN:
+            return columns
+    return 1
 
 
 def legend(axes: Axes, shown: Sequence[Shown]) -> None:
@@ -153,22 +173,25 @@ def stems(axes: Axes, t_s: Reals, values: Reals, **style: Any) -> None:
     axes.plot(np.repeat(t_s[keep], 3), feet.ravel(), linewidth=1.0, **style)
 
 
-def bounds(axes: Axes, curves: Sequence[Curve]) -> list[Shown]:
-    """Draw certified curves, dashed, on a logarithmic axis."""
+def bounds(axes: Axes, curves: Sequence[Bound]) -> list[Shown]:
+    """Draw bounds, dashed, on a logarithmic axis."""
     shown = []
-    for i, (label, t_s, values) in enumerate(curves):
-        values = finite(values, positive=True)
-        shown += line(axes, np.asarray(t_s), values, label, **bound_style(i))
+    for bound, style in zip(curves, bound_styles(curves), strict=True):
+        values = finite(bound.values, positive=True)
+        shown += line(axes, np.asarray(bound.t_s), values, bound.label, **style)
     return shown
 
 
-def bound_style(i: int) -> dict[str, Any]:
-    """How the i-th bound in a figure is drawn."""
-    return {
-        "color": printed(_BOUND_COLOURS[i % len(_BOUND_COLOURS)]),
-        "linestyle": _BOUND_DASHES[i % len(_BOUND_DASHES)],
-        "linewidth": 1.6,
-    }
+def bound_styles(curves: Sequence[Bound]) -> list[dict[str, Any]]:
+    """How each bound of a figure is drawn: one colour per kind, one dash per bound of a kind."""
+    drawn: Counter[BoundKind] = Counter()
+    styles = []
+    for bound in curves:
+        colour, dashes = _BOUND_STYLES[bound.kind]
+        dash = dashes[drawn[bound.kind] % len(dashes)]
+        drawn[bound.kind] += 1
+        styles.append({"color": printed(colour), "linestyle": dash, "linewidth": 1.6})
+    return styles
 
 
 def finish(axes: Axes, t_s: Reals | None = None) -> None:

@@ -22,9 +22,9 @@ from cosim.report.axes import (
     RIGHT_IN,
     TIME,
     WIDTH_IN,
-    Curve,
+    Bound,
     Shown,
-    bound_style,
+    bound_styles,
     bounds,
     finish,
     finite,
@@ -44,11 +44,10 @@ from cosim.report.style import PAPER, NotebookFigure, printed, styled
 Flags = NDArray[np.bool_]
 
 _PLANT, _SENSOR, _CONTROLLER = map(printed, (palette.PLANT, palette.SENSOR, palette.CONTROLLER))
-_THRESHOLD, _FORCED, _DROPPED = map(printed, (palette.THRESHOLD, palette.FORCED, palette.DROPPED))
+_THRESHOLD, _FORCED, _LOST = map(printed, (palette.THRESHOLD, palette.FORCED, palette.LOST))
 _ERRORS = (r"$\|e_c\|$ controller", r"$\|e_s\|$ sensor", "threshold")
 _STATE = r"$\|x\|$ plant"
 _PERIOD = "one period"
-_UNIT = "[model units]"
 _MOST_STATES = 16
 _LONGEST_TITLE = 40
 _DECADES = 6
@@ -107,7 +106,7 @@ def paper_figure(
         axes = place(figure, left_in, tops_in[row], width_in, height_in)
         known = None if x_hat is None else x_hat[:, i]
         shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
-        axes.set_ylabel(f"{plain(state_names[i])}\n{_UNIT}")
+        axes.set_ylabel(plain(state_names[i]))
         axes.tick_params(labelbottom=i + columns >= drawn)
         axes.set_xlabel(TIME if i + columns >= drawn else "")
         finish(axes, t_s)
@@ -157,7 +156,7 @@ def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[S
 def _broadcasts(axes: Axes, t_s: Reals, dropped: Flags) -> None:
     interval_s = _intervals(t_s)
     stems(axes, t_s, interval_s, color=_SENSOR)
-    lost: dict[str, Any] = {"color": _DROPPED, "marker": "x", "size": 6.5, "markeredgewidth": 1.8}
+    lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 6.5, "markeredgewidth": 1.8}
     shown = marks(axes, t_s[~dropped], interval_s[~dropped], "sent", color=_SENSOR, marker="o")
     shown += marks(axes, t_s[dropped], interval_s[dropped], "sent, dropped", **lost)
     axes.set_title("Broadcasting intervals")
@@ -168,7 +167,7 @@ def _receptions(axes: Axes, t_s: Reals, forced: Flags, dropped_s: Reals) -> None
     interval_s = _intervals(t_s)
     stems(axes, t_s, interval_s, color=_CONTROLLER)
     diamond: dict[str, Any] = {"color": _FORCED, "marker": "D", "size": 6.0}
-    lost: dict[str, Any] = {"color": _DROPPED, "marker": "x", "size": 5.0, "zorder": 3}
+    lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 5.0, "zorder": 3}
     free = ~forced
     shown = marks(axes, t_s[free], interval_s[free], "received", color=_CONTROLLER, marker="o")
     shown += marks(axes, t_s[forced], interval_s[forced], "received, forced", **diamond)
@@ -188,7 +187,7 @@ def error_figure(
     e_s_norm: Reals,
     threshold: Reals,
     e_c_norm: Reals,
-    envelopes: Sequence[Curve] = (),
+    envelopes: Sequence[Bound] = (),
 ) -> Figure:
     """‖e_s‖ with its threshold, and ‖e_c‖ with what bounds it, on a logarithmic axis.
 
@@ -199,7 +198,7 @@ def error_figure(
         e_c_norm: (k,) ‖x_c − x‖; NaN where unknown.
         envelopes: certified bounds on ‖e_c‖.
     """
-    labels = [*_ERRORS, *(label for label, _, _ in envelopes)]
+    labels = [*_ERRORS, *(label for label, *_ in envelopes)]
     figure, (axes,) = single(2.7, labels)
     logarithmic(axes, "y")
     shown = []
@@ -218,7 +217,7 @@ def error_figure(
 
 
 @styled
-def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Curve] = ()) -> Figure:
+def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()) -> Figure:
     """‖x‖ with what bounds it, on a logarithmic axis.
 
     Args:
@@ -226,7 +225,7 @@ def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Curve] = ()
         x_norm: (k,) ‖x‖.
         envelopes: certified bounds on ‖x‖.
     """
-    figure, (axes,) = single(2.1, [_STATE, *(label for label, _, _ in envelopes)])
+    figure, (axes,) = single(2.1, [_STATE, *(label for label, *_ in envelopes)])
     logarithmic(axes, "y")
     style = {"color": _PLANT, "linewidth": 2.4}
     shown = line(axes, t_s, finite(x_norm, positive=True), _STATE, **style)
@@ -239,7 +238,7 @@ def _norms(
 ) -> Figure:
     """Label a figure of norms; near what was measured, for a reset goes down to rounding."""
     legend(axes, shown)
-    axes.set(title=title, xlabel=TIME, ylabel=f"norm {_UNIT}")
+    axes.set(title=title, xlabel=TIME, ylabel="norm")
     finish(axes, t_s)
     seen = finite(measured, positive=True)
     seen = seen[np.isfinite(seen)]
@@ -273,7 +272,7 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
         }
         shown += line(axes, t_s, finite(u[:, i]), name, **style)
     legend(axes, shown)
-    axes.set(title=r"Control input $u = K x_c$", xlabel=TIME, ylabel=f"input {_UNIT}")
+    axes.set(title=r"Control input $u = K x_c$", xlabel=TIME, ylabel="input")
     finish(axes, t_s)
     return figure
 
@@ -300,7 +299,9 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
         rule = axes.axvline(period_us, color=_THRESHOLD, linewidth=1.2, linestyle=(0, (4, 3)))
         shown.append((rule, _PERIOD))
     legend(axes, shown)
-    axes.set(title="Lateness", xlabel="lateness [wall µs]", ylabel="share of steps ≥ it [1]")
+    axes.set(
+        title="Lateness", xlabel="lateness [wall µs]", ylabel="share of steps at least as late"
+    )
     return figure
 
 
@@ -333,7 +334,7 @@ def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) 
 
 @styled
 def inter_event_figure(
-    broadcast_s: Reals, lower_bounds: Sequence[Curve] = (), until_s: float | None = None
+    broadcast_s: Reals, lower_bounds: Sequence[Bound] = (), until_s: float | None = None
 ) -> Figure:
     """Inter-event times t_i − t_{i−1} over time, and how often each occurs.
 
@@ -352,12 +353,12 @@ def _over_time(
     t_s: Reals,
     values: Reals,
     colour: Any,
-    lower_bounds: Sequence[Curve],
+    lower_bounds: Sequence[Bound],
     until_s: float | None,
 ) -> tuple[Figure, Axes]:
     """Draw values over time, and beside it their histogram on the same logarithmic axis."""
     values = finite(values, positive=True)
-    figure, (axes, beside) = single(2.1, [label for label, _, _ in lower_bounds], beside_in=2.0)
+    figure, (axes, beside) = single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
     logarithmic(axes, "y")
     shown = bounds(axes, lower_bounds)
     marks(axes, t_s, values, color=colour, marker="o", markeredgecolor=PAPER, markeredgewidth=0.5)
@@ -370,10 +371,10 @@ def _over_time(
         beside.hist(seen, bins, orientation="horizontal", color=colour, rwidth=0.9)
     finish(axes, None if until_s is None else np.array([0.0, t_s.max(initial=until_s)]))
     finish(beside)
-    for i, (_, _, bound) in enumerate(lower_bounds):
-        if len(bound):
-            beside.axhline(float(np.min(bound)), **bound_style(i))
+    for bound, style in zip(lower_bounds, bound_styles(lower_bounds), strict=True):
+        if len(bound.values):
+            beside.axhline(float(np.min(bound.values)), **style)
     axes.set_xlabel(TIME)
-    beside.set_xlabel("count [1]")
+    beside.set_xlabel("count")
     beside.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
     return figure, axes

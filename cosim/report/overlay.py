@@ -120,7 +120,7 @@ def _norms(axes: Axes, title: str, curves: Sequence[tuple[Reals, Reals, Reals | 
     if largest:
         low, high = axes.get_ylim()
         axes.set_ylim(max(low, 10.0 ** (math.floor(math.log10(largest)) - _DECADES)), high)
-    axes.set(title=title, ylabel="norm\n[model units]")
+    axes.set(title=title, ylabel="norm, model units")
 
 
 def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
@@ -135,7 +135,7 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
         colour = _style(number)["color"]
         stroke: dict[str, Any] = {"color": colour, "marker": "|", "markeredgewidth": 1.6}
         marks(axes, t_s[delivered], np.full(int(delivered.sum()), row), size=13.0, **stroke)
-        lost: dict[str, Any] = {"color": printed(palette.DROPPED), "marker": "x"}
+        lost: dict[str, Any] = {"color": printed(palette.LOST), "marker": "x"}
         crosses = marks(axes, t_s[~delivered], np.full(int((~delivered).sum()), row), "lost",
                         size=4.5, **lost)  # fmt: skip
         shown = shown or crosses

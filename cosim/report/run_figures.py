@@ -12,7 +12,7 @@ from cosim.estimation import true_states
 from cosim.join import Joined, join_all
 from cosim.record import RunRecord
 from cosim.report import figures
-from cosim.report.axes import Curve
+from cosim.report.axes import Bound, BoundKind
 from cosim.report.decimate import Reals
 from cosim.summary import latency_us, lateness_us
 from noack.clock import NS_PER_S
@@ -27,8 +27,8 @@ from noack.records import (
 from noack.scenario import Scenario
 from noack.topology import LOOP_ROLES
 
-Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals]
-"""A certified bound: label, what it bounds, times in s (k,), values (k,)."""
+Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
+"""A bound: label, what it bounds, times in s (k,), values (k,), what it rests on."""
 
 
 class Picture(NamedTuple):
@@ -80,8 +80,12 @@ def pictures(
     return found
 
 
-def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Curve]:
-    return [(label, t_s, values) for label, what, t_s, values in envelopes if what == quantity]
+def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
+    return [
+        Bound(label, t_s, values, kind)
+        for label, what, t_s, values, kind in envelopes
+        if what == quantity
+    ]
 
 
 def _states(record: RunRecord, joined: Joined) -> Picture:
@@ -134,7 +138,7 @@ def _known(scenario: Scenario) -> str:
     return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
 
 
-def _errors(record: RunRecord, joined: Joined, bounds: list[Curve]) -> Picture:
+def _errors(record: RunRecord, joined: Joined, bounds: list[Bound]) -> Picture:
     t_s = _seconds(joined.t_ns)
     return Picture(
         "errors",
@@ -154,7 +158,7 @@ def _errors(record: RunRecord, joined: Joined, bounds: list[Curve]) -> Picture:
     )
 
 
-def _state_norm(record: RunRecord, bounds: list[Curve]) -> Picture:
+def _state_norm(record: RunRecord, bounds: list[Bound]) -> Picture:
     steps = record[PLANT_STEP]
     with np.errstate(all="ignore"):
         x_norm = np.linalg.norm(steps["x"], axis=1)
@@ -178,7 +182,7 @@ def _input(record: RunRecord) -> Picture:
     )
 
 
-def _inter_event(record: RunRecord, lower_bounds: list[Curve]) -> Picture:
+def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> Picture:
     measurements = record[SENSOR_MEASUREMENT]
     event_s = _seconds(measurements["t_ns"][measurements["event"] != NO_SEQUENCE])
     return Picture(
@@ -216,7 +220,7 @@ def _latency(record: RunRecord) -> Picture:
     )
 
 
-def _dashed(curves: Sequence[Curve]) -> str:
+def _dashed(curves: Sequence[Bound]) -> str:
     return " Dashed: the bounds that are claimed." if curves else ""
 
 

@@ -5,7 +5,7 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ========================  =================================================================
 ``about``                 Markdown text about the run (static)
 ``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
-``error/norm``            ‖e_s‖, threshold, ‖e_c‖, its bound from (I1) (4 scalars)
+``error/norm``            bound of ‖e_c‖ from (I1), ‖e_s‖, threshold, ‖e_c‖ (4 scalars)
 ``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
 ``size/log10``            ‖x‖ and its certified bound as decimal logarithms (2 scalars)
 ``input``                 u = K x_c (m scalars)
@@ -20,21 +20,23 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``log``                   text
 ``picture/…``             the plant, as a picture that moves (``cosim/viewer/pictures/``)
 ``network/…``             the loop's processes, and packets under way
+``key/…``                 which colour is what
 ========================  =================================================================
 """
 
 import math
 from collections.abc import Sequence
 from typing import Literal
+from uuid import UUID
 
 import rerun as rr
 import rerun.blueprint as rrb
 
 from cosim.palette import (
-    BOUND,
     CERTIFIED,
     CONTROLLER,
-    DROPPED,
+    IDENTITY,
+    LOST,
     PLANT,
     PROCESSES,
     SENSOR,
@@ -43,8 +45,10 @@ from cosim.palette import (
     Colour,
 )
 from cosim.palette import FORCED as FORCED_COLOUR
+from cosim.viewer.colour_key import ColourKey, input_colour
 from cosim.viewer.pictures.network import Diagram
 from cosim.viewer.pictures.picture import TIMELINE, Picture, panel
+from noack.clock import NS_PER_S
 
 ABOUT = "about"
 ERROR = "error/norm"
@@ -57,6 +61,9 @@ DROP = "drop"
 LOG = "log"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
+_TIME_MARGIN = 1.06
+_GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
+"""Id of rerun's own view that holds what linked views share."""
 
 
 def state_path(name: str) -> str:
@@ -78,9 +85,10 @@ def styles(
         colors=[PLANT, SENSOR, CONTROLLER],
         widths=[4.5, 1.5, 1.5],
     )
-    errors = ["‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "bound (I1)", "certified"]
-    colours = [SENSOR, THRESHOLD, CONTROLLER, BOUND, CERTIFIED]
-    widths = [1.5, 2.0, 1.5, 1.0, 2.0]
+    # What comes later is drawn above: ‖e_c‖ is often equal to its bound, and stays visible on it.
+    errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
+    colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
+    widths = [3.5, 1.5, 2.0, 1.5, 2.0]
     found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
         state_path(name): triple for name in state_names
     }
@@ -95,7 +103,7 @@ def styles(
     m = len(input_names)
     found[INPUT] = rr.SeriesLines(
         names=list(input_names),
-        colors=[SERIES[i % len(SERIES)] for i in range(m)],
+        colors=[input_colour(i) for i in range(m)],
         # Inputs often coincide: the first ones, wider, stay visible beneath the last.
         widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
     )
@@ -104,7 +112,7 @@ def styles(
     found[RECEPTION_STEM] = _stem("received", CONTROLLER)
     found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
     found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
-    found[DROP] = _mark("dropped", DROPPED, "cross", 5.0)
+    found[DROP] = _mark("lost", LOST, "cross", 5.0)
     for i, process in enumerate(processes):
         found[lateness_path(process)] = rr.SeriesLines(
             names=process,
@@ -132,13 +140,15 @@ def layout(
     state_names: Sequence[str],
     input_names: Sequence[str],
     processes: Sequence[str],
+    horizon_s: float,
     *,
     picture: Picture | None = None,
     diagram: Diagram | None = None,
 ) -> rrb.Blueprint:
     """Lay out the panels: picture and packets on the left, above words; curves on the right.
 
-    Without a picture or diagram, the curves have the place to themselves.
+    Without a picture or diagram, the curves have the place to themselves. Plots have no legend of
+    their own, which would cover them: the colours are named in a panel beside them.
     """
     intervals = rrb.Horizontal(
         _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
@@ -149,12 +159,13 @@ def layout(
         ),
     )
     norms = rrb.Tabs(
-        _plot("Error norms, log10", ERROR_LOG10),
-        _plot("Error norms", ERROR),
-        _plot("State norm, log10", SIZE_LOG10),
+        _plot("log10 ‖e‖", ERROR_LOG10),
+        _plot("‖e‖", ERROR),
+        _plot("log10 ‖x‖", SIZE_LOG10),
     )
     inputs = _plot("Control input u = K x_c", INPUT)
     words = rrb.Tabs(
+        ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
         *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
         rrb.TextLogView(
@@ -179,7 +190,7 @@ def layout(
             states, rrb.Horizontal(norms, inputs), intervals, row_shares=[2, 1, 1]
         )
         whole = rrb.Horizontal(
-            rrb.Vertical(*drawings, words, row_shares=[*shares, 3]), curves, column_shares=[1, 1]
+            rrb.Vertical(*drawings, words, row_shares=[*shares, 3.6]), curves, column_shares=[1, 1]
         )
     else:
         whole = rrb.Horizontal(
@@ -188,7 +199,7 @@ def layout(
             column_shares=[2, 1],
         )
     return rrb.Blueprint(
-        whole,
+        rrb.Horizontal(whole, _common_time_axis(horizon_s)),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
         collapse_panels=True,
     )
@@ -205,23 +216,33 @@ def _states(names: Sequence[str]) -> rrb.Container:
 def _page(names: Sequence[str]) -> rrb.Container:
     title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
     crowded = len(names) > _PAGE_OF_FEW
-    panels = [
-        _plot(f"State {name}", state_path(name), legend=i == 0 or not crowded)
-        for i, name in enumerate(names)
-    ]
+    panels = [_plot(f"State {name}", state_path(name)) for name in names]
     if len(panels) < _PAGE_OF_FEW:
         return rrb.Vertical(*panels, name=title)
     return rrb.Grid(*panels, grid_columns=3 if crowded else 2, name=title)
 
 
-def _plot(
-    name: str, origin: str, contents: Sequence[str] = ("$origin",), *, legend: bool = True
-) -> rrb.TimeSeriesView:
+def _common_time_axis(horizon_s: float) -> rrb.View:
+    """Give what all plots show at first: the whole run, and room for the number of the last tick.
+
+    The viewer keeps the common range with a view of its own, which is known by its id.
+    """
+    end_ns = round(_TIME_MARGIN * horizon_s * NS_PER_S)
+    whole_run = rr.TimeRange(
+        start=rr.TimeRangeBoundary.absolute(nanos=0),
+        end=rr.TimeRangeBoundary.absolute(nanos=end_ns),
+    )
+    view = rrb.TimeSeriesView(visible=False, axis_x=rrb.TimeAxis(view_range=whole_run))
+    view.id = _GLOBAL_VIEW
+    return view
+
+
+def _plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
     """One time series; all share the time axis, so that zooming one zooms all."""
     return rrb.TimeSeriesView(
         origin=origin,
         contents=[path if path.startswith("$") else f"/{path}" for path in contents],
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
-        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
+        plot_legend=rrb.PlotLegend(visible=False),
     )

@@ -38,6 +38,7 @@ def open_view(
         state_names=loop.state_names,
         input_names=loop.input_names,
         processes=LOOP_ROLES if kind == "live" else (),
+        horizon_s=scenario.horizon_s,
         picture=picture_of(scenario),
         diagram=Diagram(acknowledged=scenario.is_acknowledged),
         live=live,

@@ -14,6 +14,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from cosim.viewer import blueprint as bp
+from cosim.viewer.colour_key import COLOUR_KEY, ColourKey
 from cosim.viewer.live import LiveView
 from cosim.viewer.pictures.network import DIAGRAM, Diagram
 from cosim.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
@@ -51,6 +52,7 @@ class RunView:
         state_names: names of the n coordinates of x.
         input_names: names of the m coordinates of u.
         processes: names of the processes whose lateness is shown; none in a simulated run.
+        horizon_s: the run's length, which the plots' time axis shows.
         picture: of the plant; None does without.
         diagram: of the network; None does without.
         live: shows the file while it is written.
@@ -72,6 +74,7 @@ class RunView:
         state_names: Sequence[str],
         input_names: Sequence[str],
         processes: Sequence[str],
+        horizon_s: float,
         picture: Picture | None = None,
         diagram: Diagram | None = None,
         live: LiveView | None = None,
@@ -89,7 +92,7 @@ class RunView:
         self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=run_id)
         names = (state_names, input_names, processes)
         try:
-            layout = bp.layout(*names, picture=picture, diagram=diagram)
+            layout = bp.layout(*names, horizon_s, picture=picture, diagram=diagram)
             self._recording.save(path, default_blueprint=layout, write_footer=indexed)
         except RuntimeError as error:
             raise ViewError(f"{path}: cannot create the recording: {error}") from None
@@ -98,7 +101,8 @@ class RunView:
         self._recording.log(bp.ABOUT, document, static=True)
         for entity, style in bp.styles(*names).items():
             self._recording.log(entity, style, static=True)
-        for below, drawing in ((PICTURE, picture), (DIAGRAM, diagram)):
+        key = ColourKey(input_names)
+        for below, drawing in ((PICTURE, picture), (DIAGRAM, diagram), (COLOUR_KEY, key)):
             for entity, shape in ({} if drawing is None else drawing.scenery()).items():
                 self._recording.log(f"{below}/{entity}", shape, static=True)
         if live is not None:
@@ -147,7 +151,7 @@ class RunView:
             )
         ]
         bounds = _shaped("e_c_bounds", e_c_bounds, (k, 2))
-        norms = np.column_stack([*measured, bounds])
+        norms = np.column_stack([bounds[:, 0], *measured, bounds[:, 1]])
         # On a linear scale, a certified bound would flatten everything else.
         self._send(bp.ERROR, times, norms[:, :4])
         self._send(bp.ERROR_LOG10, times, _log10(norms, threshold))

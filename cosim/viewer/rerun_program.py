@@ -4,9 +4,11 @@ import contextlib
 import ctypes
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import IO, Any
 from noack.errors import MachineError
 
 _PR_SET_PDEATHSIG = 1
+_POLL_S = 0.02
 
 
 def start_rerun(
@@ -45,6 +48,25 @@ def start_rerun(
         # Not SIGTERM, for which a program that stands still waits until it goes on.
         preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGKILL) if tied else None,
     )
+
+
+def logged_port(
+    process: "subprocess.Popen[Any]", output: IO[bytes], address: re.Pattern[bytes], within_s: float
+) -> int | None:
+    """Wait until rerun logs an address; return its port, None if that takes too long.
+
+    Args:
+        process: from :func:`start_rerun`.
+        output: what it was given.
+        address: its first group is the port.
+        within_s: how long to wait.
+    """
+    deadline_s = time.monotonic() + within_s
+    while process.poll() is None and time.monotonic() < deadline_s:
+        if found := address.search(os.pread(output.fileno(), 1 << 16, 0)):
+            return int(found[1])
+        time.sleep(_POLL_S)
+    return None
 
 
 def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) -> None:

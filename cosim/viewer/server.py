@@ -11,15 +11,18 @@ import re
 import secrets
 import socketserver
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import parse_qs, quote
 
+from cosim.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
 from cosim.viewer.peer_user import peer_user
 from cosim.viewer.rerun_program import start_rerun
 from cosim.viewer.web_viewer import HOST, WebViewer
@@ -92,10 +95,15 @@ class RecordingServer:
 
     def open_window(self) -> subprocess.Popen[bytes] | None:
         """Open a window on the recording; None if it closed before it asked for the recording."""
-        window = start_rerun(
-            ["--port", "auto", "--bind", HOST, self.window_address + RECORDING],
-            start_new_session=True,
-        )
+        arguments = ["--port", "auto", "--bind", HOST, self.window_address + RECORDING]
+        t_ns = opening_time_ns(self.path)
+        if t_ns is None:
+            window = start_rerun(arguments, start_new_session=True)
+        else:
+            output = tempfile.TemporaryFile()
+            window = start_rerun(arguments, output=output, start_new_session=True)
+            move = partial(move_window_to, t_ns, window, output)
+            threading.Thread(target=move, daemon=True).start()
         deadline = time.monotonic() + _START_S
         while not self.requested.wait(0.02) and time.monotonic() < deadline:
             if window.poll() is not None:
@@ -236,5 +244,8 @@ class _Handler(BaseHTTPRequestHandler):
                 self.end_headers()
                 while block := answer.read(_BLOCK):
                     self.wfile.write(block)
+                t_ns = opening_time_ns(self.server.recording.path) if name == "" else None
+                if t_ns is not None:
+                    self.wfile.write(script_to_open_at(t_ns))
         except PeerError as error:
             self.send_error(502, str(error))

@@ -10,18 +10,16 @@ import http.client
 import os
 import re
 import tempfile
-import time
 from collections.abc import Iterator
 
 from cosim.viewer.peer_user import peer_user
-from cosim.viewer.rerun_program import end_process, start_rerun
+from cosim.viewer.rerun_program import end_process, logged_port, start_rerun
 from noack.errors import MachineError, PeerError
 
 HOST = "127.0.0.1"
 
 _START_S = 10.0
 _TIMEOUT_S = 10.0
-_POLL_S = 0.02
 _SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
 
 
@@ -39,14 +37,11 @@ class WebViewer:
         arguments = ["--serve-web", "--bind", HOST, "--web-viewer-port", "0"]
         with tempfile.TemporaryFile() as output:
             self.process = start_rerun([*arguments, f"http://{HOST}/recording.rrd"], output=output)
-            deadline_s = time.monotonic() + _START_S
-            while self.process.poll() is None and time.monotonic() < deadline_s:
-                if found := _SERVED_AT.search(os.pread(output.fileno(), 1 << 16, 0)):
-                    self.port = int(found[1])
-                    return
-                time.sleep(_POLL_S)
-        self.close()
-        raise MachineError("rerun's web viewer did not start")
+            port = logged_port(self.process, output, _SERVED_AT, _START_S)
+        if port is None:
+            self.close()
+            raise MachineError("rerun's web viewer did not start")
+        self.port = port
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[http.client.HTTPResponse]:

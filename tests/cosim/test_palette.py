@@ -54,8 +54,20 @@ TO_OKLAB = np.array(
 )
 BODIES = (palette.PLANT, palette.SENSOR, palette.CONTROLLER)
 """What is drawn one on the other in every picture and plot of states."""
-CURVES = (*BODIES, palette.THRESHOLD, palette.CERTIFIED)
-COLOURS = {*palette.SERIES, *palette.PROCESSES.values(), *CURVES, palette.FORCED, palette.BOUND}
+PANELS: dict[str, tuple[palette.Colour, ...]] = {
+    "states": BODIES,
+    "errors": (
+        palette.SENSOR, palette.CONTROLLER, palette.THRESHOLD, palette.CERTIFIED, palette.IDENTITY,
+        palette.PRINTED,
+    ),
+    "norm of the state": (palette.PLANT, palette.CERTIFIED, palette.PRINTED),
+    "broadcasts": (palette.SENSOR, palette.LOST, palette.CERTIFIED, palette.PRINTED),
+    "receptions": (palette.CONTROLLER, palette.FORCED, palette.LOST),
+    "packets": (*BODIES, palette.NETWORK, palette.LOST, palette.FORCED),
+    "lateness": tuple(palette.PROCESSES.values()),
+    "series": palette.SERIES,
+}  # fmt: skip
+CONCEPTS = {colour for colours in PANELS.values() for colour in colours}
 
 
 def linear(colour: palette.Colour) -> NDArray[np.float64]:
@@ -78,17 +90,20 @@ def distance(one: palette.Colour, other: palette.Colour, vision: NDArray[np.floa
 def test_every_colour_stands_out_from_its_background(background: str) -> None:
     """3 to 1, what WCAG asks of graphics."""
     behind = luminance(BACKGROUNDS[background])
-    for colour in COLOURS:
+    for colour in CONCEPTS:
         low, high = sorted((luminance(colour), behind))
         assert (high + 0.05) / (low + 0.05) >= 3, colour
 
 
 @pytest.mark.parametrize("vision", VISIONS)
-def test_colours_that_meet_can_be_told_apart(vision: str) -> None:
-    for least, colours in (
-        (0.15, BODIES),
-        (0.09, CURVES),
-        (0.07, sorted({*CURVES, palette.FORCED})),
-    ):
-        for one, other in combinations(colours, 2):
-            assert distance(one, other, VISIONS[vision]) > least, (one, other)
+@pytest.mark.parametrize("panel", PANELS)
+def test_colours_of_one_panel_can_be_told_apart(panel: str, vision: str) -> None:
+    least = 0.15 if panel == "states" else 0.09
+    for one, other in combinations(PANELS[panel], 2):
+        assert distance(one, other, VISIONS[vision]) > least, (one, other)
+
+
+def test_no_two_concepts_look_the_same_to_anybody() -> None:
+    for vision in VISIONS.values():
+        for one, other in combinations(CONCEPTS, 2):
+            assert distance(one, other, vision) > 0.05, (one, other)

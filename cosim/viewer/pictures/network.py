@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from cosim.palette import CONTROLLER, DROPPED, FORCED, NETWORK, PLANT, SENSOR
+from cosim.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
 from cosim.viewer.pictures.picture import (
     STILL,
     Columns,
@@ -35,10 +35,10 @@ _APART_S = 0.025
 _LEG_NS, _FALL_NS, _APART_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _APART_S))
 _FRAME_NS = round(NS_PER_S / 60)
 
-_APART = 3.5
+_APART = 4.4
 _BOXES = {name: i * _APART for i, name in enumerate(("plant", "sensor", "network", "controller"))}
 _, _SENSOR, _NETWORK, _CONTROLLER = _BOXES.values()
-_HALF_WIDE, _HALF_HIGH = 1.2, 0.62
+_HALF_WIDE, _HALF_HIGH = 1.6, 0.62
 _BACK = -0.4
 """Acknowledgements go back a little below the updates."""
 _LOW = -2.5
@@ -99,7 +99,7 @@ class Diagram:
             origin=DIAGRAM,
             name=f"Packets (drawn {LEG_S:g} s a leg)",
             visual_bounds=rrb.VisualBounds2D(
-                x_range=[-1.5, _CONTROLLER + 1.5], y_range=[-1.7, -_LOW + 0.6]
+                x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]
             ),
         )
 
@@ -125,7 +125,7 @@ class Diagram:
         head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
         found["input"] = lines([home, head], STILL, 0.03)
         found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
-        found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), DROPPED)
+        found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
         found["forced/word"] = label("forced through", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
             ("broadcast", SENSOR), ("delivered", CONTROLLER), ("acknowledgement", NETWORK),
@@ -136,7 +136,7 @@ class Diagram:
                 draw_order=5.0,
             )
         found["forced"] = style(FORCED, 0.1, order=6.0)
-        found["lost"] = style(DROPPED, 0.1, order=6.0)
+        found["lost"] = style(LOST, 0.1, order=6.0)
         return found
 
     def add(

@@ -15,12 +15,15 @@ from matplotlib.figure import Figure
 
 from cosim import palette
 from cosim.report import figures
+from cosim.report.axes import Bound, BoundKind
 from cosim.report.save import inline, save
 from cosim.report.style import printed, settings
 from tests.cosim.report.conftest import HOSTILE
 
 SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
-UNITS = re.compile(r"\[(s|1|wall µs|model units)\]$")
+UNITS = re.compile(r"\[(s|wall µs)\]$")
+UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
+"""Pure numbers, and what is in the model's own units."""
 
 
 def values(case: str, k: int, columns: int | None = None) -> np.ndarray:
@@ -37,7 +40,7 @@ def drawn_for(case: str) -> dict[str, Figure]:
     t_s = np.arange(k) * 0.002
     e = k // 50
     event_s, lost = np.arange(e) * 0.1, np.arange(e) % 3 > 0
-    bound = [("certified", t_s, 5 * np.exp(-t_s))]
+    bound = [Bound("certified", t_s, 5 * np.exp(-t_s))]
     return {
         "paper": figures.paper_figure(
             mode="zoh",
@@ -74,9 +77,10 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
     for name, figure in drawn.items():
         for axes in figure.axes:
             beside = len(axes.figure.axes) == 2 and axes is axes.figure.axes[1] and name != "paper"
-            assert beside or UNITS.search(axes.get_ylabel()), (name, axes.get_ylabel())
             shared = axes.xaxis.get_tick_params().get("labelbottom") is False
-            assert shared or UNITS.search(axes.get_xlabel()), (name, axes.get_xlabel())
+            for label, is_hidden in ((axes.get_ylabel(), beside), (axes.get_xlabel(), shared)):
+                has_unit = UNITS.search(label) or UNITLESS.fullmatch(label)
+                assert is_hidden or has_unit, (name, label)
 
 
 def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> None:
@@ -183,12 +187,37 @@ def test_names_are_taken_literally() -> None:
 
 def test_bounds_are_dashed_and_the_measured_is_not() -> None:
     t_s = np.arange(1.0, 5.0)
-    bound = [(f"bound {i}", t_s, 3.0 + t_s + i) for i in range(5)]
+    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i) for i in range(5)]
     (axes,) = figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
     assert [line.get_linestyle() for line in axes.lines] == ["-"] * 3 + ["--"] * 5
-    assert labels(axes)[3:] == [label for label, _, _ in bound]
+    assert labels(axes)[3:] == [one.label for one in bound]
     styles = {(line.get_color(), str(line._dash_pattern)) for line in axes.lines[3:7]}
     assert len(styles) == 4
+
+
+def test_a_bound_has_the_colour_of_what_it_rests_on_in_every_figure() -> None:
+    t_s = np.arange(1.0, 5.0)
+    kinds: list[BoundKind] = ["identity", "certified", "printed", "certified"]
+    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
+    own = {
+        "identity": palette.IDENTITY, "certified": palette.CERTIFIED, "printed": palette.PRINTED,
+    }  # fmt: skip
+    for drawn, measured in (
+        (figures.error_figure(t_s, t_s, t_s, t_s, bound), 3),
+        (figures.state_norm_figure(t_s, t_s, bound), 1),
+    ):
+        lines = drawn.axes[0].lines[measured:]
+        assert [line.get_color() for line in lines] == [printed(own[kind]) for kind in kinds]
+        assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 4
+
+
+def test_a_legend_takes_as_few_rows_as_there_is_room_for() -> None:
+    t_s = np.arange(1.0, 5.0)
+    names = ("for the scenario's plant", "for every plant of the uncertainty box")
+    bound = [Bound(f"certified {name}", t_s, 3.0 + t_s) for name in names]
+    bound.append(Bound("bound from (I1)", t_s, 2.0 + t_s, "identity"))
+    (axes,) = figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+    assert axes.get_legend()._ncols == 2
 
 
 def test_no_legend_covers_data() -> None:

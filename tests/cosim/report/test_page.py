@@ -309,7 +309,11 @@ def test_the_verdict_comes_first(
 
 def test_envelopes_are_drawn_where_they_belong(record: RunRecord, tmp_path: Path) -> None:
     t_s = np.linspace(0, 1, 50)
-    envelopes = [("a", "e_c", t_s, 1 + t_s), ("b", "x", t_s, t_s), ("c", "inter_event", t_s, t_s)]
+    envelopes = [
+        ("a", "e_c", t_s, 1 + t_s, "identity"),
+        ("b", "x", t_s, t_s, "certified"),
+        ("c", "inter_event", t_s, t_s, "printed"),
+    ]
     page, html, _ = written(record, tmp_path, envelopes)
     check(page, html)
     dashed = {

@@ -206,14 +206,14 @@ def test_each_packet_is_seen_to_become_what_it_became() -> None:
         assert shown.count(False) == count, entity  # each is seen to end
     lost_ns = [t_ns for t_ns, shapes in seen["lost"].items() if shapes]
     assert min(lost_ns) >= (0.6 + LEG_S) * S
-    # The network is at 7, between sensor and controller at 3.5 and 10.5.
-    assert max(x for shapes in seen["delivered"].values() for x, _ in shapes) > 9
-    assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 7.5
+    # The network is at 8.8, between sensor and controller at 4.4 and 13.2.
+    assert max(x for shapes in seen["delivered"].values() for x, _ in shapes) > 11
+    assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 9.3
 
 
 def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
     seen = rows_of(sent(Diagram(), PACKETS[:1], delay_s=0.8), [3 * S])
-    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if [7.0, 0.0] in shapes]
+    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if [8.8, 0.0] in shapes]
     assert min(waiting) == pytest.approx((0.5 + LEG_S) * S, abs=S / 50)
     assert max(waiting) == pytest.approx(1.3 * S, abs=S / 50)
 

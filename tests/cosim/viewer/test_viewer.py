@@ -61,6 +61,7 @@ def new_view(
         state_names=states or STATES,
         input_names=INPUTS,
         processes=PROCESSES,
+        horizon_s=20.0,
         picture=picture,
         diagram=diagram,
         live=live,
@@ -200,7 +201,7 @@ def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> N
         x = t_ns * 1e-9 + i
         np.testing.assert_array_equal(values, np.stack((x, x + 100, x + 200), axis=1))
     t_ns, values = series(chunks, "error/norm")
-    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [0, 1, 2, 3])
+    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [3, 0, 1, 2])
     t_ns, values = series(chunks, "error/log10")
     certified = 10 ** values[:, 4]
     np.testing.assert_allclose(certified, t_ns * 1e-9 + 4, rtol=1e-12)
@@ -229,9 +230,12 @@ def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> Non
     assert len(set(colours)) == 3
     for name in STATES[1:]:
         assert static(chunks, f"state/{name}", "SeriesLines:colors") == colours
-    sensor, threshold, controller, *bounds = static(chunks, "error/log10", "SeriesLines:colors")
-    assert len({sensor, threshold, controller, *bounds}) == 5
-    assert static(chunks, "error/norm", "SeriesLines:colors")[2] == controller
+    errors = static(chunks, "error/log10", "SeriesLines:colors")
+    identity, sensor, threshold, controller, certified = errors
+    assert len(set(errors)) == 5
+    assert static(chunks, "error/norm", "SeriesLines:colors") == errors[:4]
+    assert static(chunks, "event/certified", "SeriesLines:colors") == [certified]
+    assert static(chunks, "key/1/1/sample", "LineStrips2D:colors") == [identity]
     assert (sensor, controller) == (colours[1], colours[2])
     assert threshold not in colours
     assert static(chunks, "event/interval", "SeriesPoints:colors") == [sensor]
@@ -259,6 +263,43 @@ def test_the_file_carries_its_identity_about_text_and_layout(tmp_path: Path) -> 
     }
     assert {f"State {name}" for name in STATES} <= titles
     assert {"Broadcasting intervals [s]", "Receiving intervals [s]", "About this run"} <= titles
+
+
+def test_no_legend_covers_a_plot_and_a_key_beside_them_names_the_colours(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    layout = read(path, "blueprint")
+    legends = [
+        visible
+        for entity, chunks in layout.items() if entity.endswith("/PlotLegend")
+        for visible in column(chunks, "PlotLegend:visible")
+    ]  # fmt: skip
+    plots = sum(
+        kind == ["TimeSeries"]
+        for entity, chunks in layout.items() if entity.count("/") == 1
+        for c in chunks if "ViewBlueprint:class_identifier" in c.to_record_batch().schema.names
+        for kind in column([c], "ViewBlueprint:class_identifier")
+    )  # fmt: skip
+    # All but the one, never seen, that holds what the plots share.
+    assert legends == [[False]] * (plots - 1)
+    chunks = read(path)
+    named = {
+        static(chunks, entity, "Points2D:labels")[0]
+        for entity in chunks if entity.startswith("key/") and entity.endswith("/name")
+    }  # fmt: skip
+    assert {"threshold", "bound from (I1)", "certified bound", "lost", *INPUTS} <= named
+
+
+def test_the_plots_show_the_whole_run_and_room_for_the_number_of_the_last_tick(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    layout = read(path, "blueprint")
+    shared = layout["view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"]
+    ((whole,),) = column(shared, "TimeAxis:view_range")
+    assert whole["start"] == 0
+    assert 1.05 * 20 * S < whole["end"] < 1.1 * 20 * S
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 16, 17, 64])
@@ -297,8 +338,8 @@ def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
             times(0, 3), x, x, x, error, threshold, error, np.stack([none, none], axis=1), none
         )
     _, values = series(read(path), "error/log10")
-    np.testing.assert_allclose(values[:, 0], [-1.0, -4.0, np.nan], rtol=1e-12)
-    np.testing.assert_allclose(values[:, 1], -1.0, rtol=1e-12)
+    np.testing.assert_allclose(values[:, 1], [-1.0, -4.0, np.nan], rtol=1e-12)
+    np.testing.assert_allclose(values[:, 2], -1.0, rtol=1e-12)
 
 
 @pytest.mark.parametrize("threshold", [0.0, np.inf, np.nan])
@@ -310,7 +351,7 @@ def test_a_rule_without_a_threshold_still_gives_a_plot(tmp_path: Path, threshold
         view.samples(times(0, 2), x, x, x, e, np.full(2, threshold), e, none, none[:, 0])
     for entity in ("error/norm", "error/log10"):
         assert not np.isinf(series(read(path), entity)[1]).any()
-    assert series(read(path), "error/log10")[1][0, 0] == pytest.approx(-3.0)
+    assert series(read(path), "error/log10")[1][0, 1] == pytest.approx(-3.0)
 
 
 def test_every_event_is_a_mark_on_a_stem_and_the_first_stands_on_the_axis(tmp_path: Path) -> None:
