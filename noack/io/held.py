@@ -8,6 +8,7 @@ by whoever finds it.
 import fcntl
 import json
 import os
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,7 +44,7 @@ def held(path: Path, content: Mapping[str, object]) -> Iterator[Path]:
     Raises:
         FileExistsError: one that runs has a file of this name.
     """
-    scratch = path.with_suffix(f".{os.getpid()}")
+    scratch = path.with_suffix(f".{secrets.token_hex(8)}")
     descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
     with os.fdopen(descriptor, "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)

@@ -7,18 +7,17 @@ a file that only its owner can read, in the user's runtime directory.
 
 import contextlib
 import json
-import os
 import secrets
-import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
 from noack.errors import CallerError, PeerError
+from noack.io.held import held
 from noack.io.private import make_private, private_folder, require_name, require_private
 from noack.mistakes import brief
 from noack.scenario import Scenario
@@ -52,12 +51,14 @@ class Ticket(NamedTuple):
     scenario: Scenario
     """Resolved."""
 
+    def fields(self) -> dict[str, Any]:
+        """The ticket as what JSON can hold."""
+        scenario = self.scenario.model_dump(mode="json")
+        return self._asdict() | {"key": self.key.hex(), "scenario": scenario}
+
     def dumps(self) -> str:
         """The ticket as one line of JSON."""
-        fields = self._asdict()
-        return json.dumps(
-            fields | {"key": self.key.hex(), "scenario": self.scenario.model_dump(mode="json")}
-        )
+        return json.dumps(self.fields())
 
 
 def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
@@ -95,38 +96,25 @@ def ticket_path(session: str) -> Path:
     return private_folder() / f"{session}.json"
 
 
-def _in_use(path: Path) -> bool:
-    """Whether the coordinator of the ticket that lies here still listens."""
-    try:
-        host, _, port = loads(path.read_text()).endpoint.removeprefix("tcp/").rpartition(":")
-        with socket.create_connection((host, int(port)), timeout=1):
-            return True
-    except (OSError, ValueError, CallerError):
-        return False
-
-
 @contextmanager
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
     """Keep the ticket in its file, readable by its owner only, while the context lasts.
 
+    The file is locked: of several who publish at once under one name, one succeeds.
+
     Raises:
-        CallerError: the folder is not the user's own.
+        CallerError: the folder is not the user's own, or another run is open in the session.
     """
     path = ticket_path(session)
     make_private(path.parent)
-    if _in_use(path):
-        raise CallerError(f"session {session!r}: another run is open in it; choose --session NAME")
-    scratch = path.with_suffix(f".{os.getpid()}")
-    descriptor = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(ticket.dumps())
-    scratch.replace(path)
-    try:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(path, ticket.fields()))
+        except FileExistsError:
+            raise CallerError(
+                f"session {session!r}: another run is open in it; choose --session NAME"
+            ) from None
         yield path
-    finally:
-        with contextlib.suppress(OSError):
-            if loads(path.read_text()).run_id == ticket.run_id:
-                path.unlink()
 
 
 def wait_for_ticket(
