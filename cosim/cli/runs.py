@@ -30,7 +30,7 @@ from noack.scenario_file import load
 from noack.topology import ROLES
 
 if TYPE_CHECKING:
-    from cosim.launch import Ending
+    from cosim.ending import Ending
 
 
 @command(RUNS, [

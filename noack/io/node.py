@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar, cast
 
 from noack.changes import Change, Changeable
 from noack.clock import NS_PER_S, RunClock
-from noack.errors import CallerError, PeerError
+from noack.errors import CallerError, NoackError, PeerError, one_line
 from noack.io.address import Address
 from noack.io.loop import Channel, run_loop
 from noack.io.messages import Admission, Announced, Begin, Kept, Missing, Said, heard
@@ -248,7 +248,7 @@ class Node:
                     behind_s = behind_ns / NS_PER_S
                     self._ended = f"too slow: {behind_s:g} s behind; try a lower speed or rate"
             except BaseException as error:
-                self._ended = f"an error of its own: {error!r}"
+                self.fail(error)
                 raise
             finally:
                 telemetry.flush()
@@ -263,6 +263,11 @@ class Node:
                 }
                 channel.close()
                 self._hand_over(telemetry)
+
+    def fail(self, error: BaseException) -> None:
+        """End with an error, which the run is then told of."""
+        known = isinstance(error, NoackError)
+        self._ended = one_line(error) if known else f"an error of its own: {error!r}"
 
     @property
     def ended(self) -> str:

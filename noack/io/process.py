@@ -40,6 +40,9 @@ def run_process(
                 try:
                     node.knock()
                     body(node)
+                except Exception as error:
+                    node.fail(error)
+                    raise
                 finally:
                     plane.leave(node.ended)
         except NoackError as error:
