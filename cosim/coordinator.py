@@ -126,8 +126,10 @@ class Coordinator:
             for role in list(self._members):
                 if self.finished(role):  # another may come in its stead
                     member = self._members.pop(role)
-                    if member.query is not None:  # it only seemed to be gone
-                        self.plane.refuse(member.query, f"{role} was taken for gone")
+                    if member.left is None:  # or itself, if it was only held up
+                        self._candidates[role, member.instance] = _Member(member.instance, 0)
+                    if member.query is not None:
+                        self.plane.dismiss(member.query)
         while (query := self._knocks.try_recv()) is not None:
             self._answer(query, self._admit)
         while (query := self._joins.try_recv()) is not None:

@@ -20,6 +20,7 @@ from cosim.ending import Ending, EndingFile
 from cosim.environment import write_environment
 from cosim.room import require_room
 from cosim.run_dir import new_run_dir, point_to_latest, under_way, write_scenario
+from cosim.start_limit import DEFAULT_S, StartLimit
 from noack.errors import CallerError, ExitStatus, MachineError, NeverStartedError
 from noack.io import open_runs
 from noack.io.node import HORIZON
@@ -40,7 +41,6 @@ _MODULES = {
     "controller": "controller_node",
 }
 _POLL_S = 0.01
-_START_PATIENCE_S = 30.0
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder puts the rows in order, of which a long run has many."""
@@ -169,13 +169,16 @@ class _Run:
         scenario = self._ticket.scenario
         verdict: tuple[ExitStatus, str] | None = None
         told: tuple[str, ...] = ()
-        by_hand = any(role not in self._spawn for role in ROLES)
-        patience_s = float("inf") if by_hand else time.monotonic() + _START_PATIENCE_S
+        limit = StartLimit(self._start_within_s())
+        patience_s = float("inf")
+        before_s = time.monotonic()
         started = False
         while not self._over(coordinator, stopping=verdict is not None):
             coordinator.poll()
             now_s = time.monotonic()
             if coordinator.epoch_ns is None:
+                limit.wait(now_s - before_s, os.getloadavg()[0])
+                before_s = now_s
                 missing = tuple(r for r in coordinator.missing() if r not in self._spawn)
                 if missing != told and verdict is None:
                     told = missing
@@ -188,8 +191,8 @@ class _Run:
             self._give_account(coordinator)
             if verdict is None:
                 verdict = self._stopped(signals) or self._trouble(coordinator)
-                if verdict is None and now_s > patience_s:
-                    verdict = (ExitStatus.FAILED, _overdue(coordinator))
+                if verdict is None and (now_s > patience_s or limit.is_reached):
+                    verdict = (ExitStatus.FAILED, _overdue(coordinator, limit))
                 if verdict is not None:
                     store(*verdict)
                     coordinator.stop(verdict[1])
@@ -332,6 +335,13 @@ class _Run:
             return 0.0 if role in self._spawn else REJOIN_BY_HAND_S
         return given_s
 
+    def _start_within_s(self) -> float:
+        given_s = self._ticket.scenario.start_within_s
+        if given_s is None:
+            by_hand = any(role not in self._spawn for role in ROLES)
+            return float("inf") if by_hand else DEFAULT_S
+        return given_s
+
     def _never_back(self) -> tuple[ExitStatus, str] | None:
         for lost in self._lost.values():
             return lost.status, f"{lost.why}; no other came before the end"
@@ -373,9 +383,9 @@ def longest_s(run_s: float) -> float:
     return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S
 
 
-def _overdue(coordinator: Coordinator) -> str:
+def _overdue(coordinator: Coordinator, limit: StartLimit) -> str:
     if coordinator.epoch_ns is None:
-        return f"{', '.join(coordinator.missing())} did not come to the start"
+        return f"{', '.join(coordinator.missing())} {limit.explain()}"
     here = [role for role in ROLES if not coordinator.finished(role)]
     # The recorder stays until the last of the others has left.
     held = [role for role in here if role != RECORDER] or here

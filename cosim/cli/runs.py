@@ -23,7 +23,7 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
-from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, latest_run
+from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, chosen_run
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
 from noack.scenario_file import load
@@ -127,7 +127,7 @@ def view(
     """Open a recording in the rerun viewer."""
     from cosim.viewer.live import view_recording
 
-    path = recording or latest_run(runs)
+    path = chosen_run(recording, runs)
     path = path / RECORDING_FILE if path.is_dir() else path
     if json:
         print_json({"recording": str(path), "exists": path.is_file()})
@@ -149,7 +149,7 @@ def summary(
     from cosim.conclude import reopen
     from cosim.tables import print_outcome
 
-    outcome = reopen(run_dir or latest_run(runs))
+    outcome = reopen(chosen_run(run_dir, runs))
     if json:
         print_json(outcome.summary)
     else:
@@ -173,7 +173,7 @@ def replay(
     from cosim.replay import replay as replay_record
     from cosim.replay.table import print_replay
 
-    path = run_dir or latest_run(runs)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("replaying"):
         found = replay_record(load_record(path))
     changed = changed_since(path)
@@ -199,7 +199,7 @@ def compare(
     from cosim.progress import PatientConsole
     from cosim.record import load_record
 
-    path = run_dir or latest_run(runs)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
         fidelity = compare_record(load_record(path))
     if json:
@@ -221,7 +221,7 @@ def report(
     """Write a run's report anew, one page with all figures, and print where it is."""
     from cosim.conclude import report_anew
 
-    path = report_anew(run_dir or latest_run(runs))
+    path = report_anew(chosen_run(run_dir, runs))
     if json:
         print_json({"report": str(path)})
     else:

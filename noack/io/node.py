@@ -111,6 +111,7 @@ class Node:
         """Ask to be let in; learn whether the run has begun, and another has gone before.
 
         Raises:
+            NoAnswerError: no answer came within ten seconds.
             PeerError: this process is not let in.
         """
         admission = self._ask("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
@@ -285,10 +286,11 @@ class Node:
                 self._ended = signal.Signals(self._signals.received).name
             elif (reason := self.plane.stop_requested()) is not None:
                 self._ended = reason
-            elif self.ticket.launched and _lifeline_cut():
-                self._ended = LAUNCHER_GONE
+            elif self.ticket.launched:
+                self._ended = LAUNCHER_GONE if lifeline_cut() else None
             elif self._joining and self.plane.coordinator_gone(for_s=_COORDINATOR_AWAY_S):
-                # Once the loop runs, it goes on without the control plane.
+                # Once the loop runs, it goes on without the control plane. A launched process
+                # has its lifeline: on a busy machine a coordinator may only seem to be gone.
                 self._ended = "the run's coordinator is gone"
         return self._ended
 
@@ -342,7 +344,7 @@ class Node:
         writer.close()
 
 
-def _lifeline_cut() -> bool:
+def lifeline_cut() -> bool:
     """Whether the launcher has closed our standard input, which it does only by ending."""
     readable, _, _ = select.select([sys.stdin.fileno()], (), (), 0)
     return bool(readable) and os.read(sys.stdin.fileno(), 1) == b""
