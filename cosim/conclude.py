@@ -2,20 +2,30 @@
 
 import json
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cosim.claims.evaluate import as_json
 from cosim.claims.parts import RunClaims
+from cosim.ending import Ending
 from cosim.fidelity import fidelity_for_summary
-from cosim.launch import Ending
 from cosim.linearisation import linearisation
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
-from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
+from cosim.run_dir import (
+    ENDING_FILE,
+    RECORD,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    SPOOL,
+    SUMMARY_FILE,
+    concluded,
+)
 from cosim.shown import can_be_shown
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus, MachineError, why
@@ -35,7 +45,7 @@ class Outcome:
 def conclude(ending: Ending, *, report: bool = True) -> Outcome:
     """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
     run_dir = ending.run_dir
-    with concluded(run_dir):
+    with _told_with(ending), concluded(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
             record = finish_record(run_dir)
             from cosim.viewer.opened import write_view
@@ -58,6 +68,17 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
     end = summary["exit"]
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+
+
+@contextmanager
+def _told_with(ending: Ending) -> Iterator[None]:
+    """Let an error that keeps the record from being finished say how the run ended, too."""
+    try:
+        yield
+    except MachineError as error:
+        if ending.status == ExitStatus.OK:
+            raise
+        raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
 
 
 def _write_summary(run_dir: Path, summary: Summary) -> None:
@@ -118,7 +139,7 @@ def reopen(run_dir: Path) -> Outcome:
     """
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    summary = _read_summary(run_dir)
+    summary = _read(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
     # It is of an earlier version or damaged; or a process woke up after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
@@ -127,14 +148,13 @@ def reopen(run_dir: Path) -> Outcome:
 
 
 def _ending(run_dir: Path, summary: Summary) -> Ending:
-    """How a run ended, as its summary has it."""
-    try:
-        status, reason = ExitStatus(summary["exit"]["status"]), str(summary["exit"]["reason"])
-        return Ending(run_dir, 0, status, reason, summary["startup_s"])
-    except (LookupError, TypeError, ValueError):
+    """How a run ended, as its summary has it, or else as its launcher stored it."""
+    for said in (summary, _read(run_dir / ENDING_FILE)):
+        with suppress(LookupError, TypeError, ValueError):
+            status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
+            return Ending(run_dir, 0, status, reason, said["startup_s"])
         summary.clear()  # without an end, nothing of it can be trusted
-        reason = "the launcher did not live to see the end"
-        return Ending(run_dir, 0, ExitStatus.FAILED, reason)
+    return Ending(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 @np.errstate(all="ignore")
@@ -160,10 +180,10 @@ def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaim
     return write_report(record, summary, run_dir, envelopes)
 
 
-def _read_summary(run_dir: Path) -> Summary:
-    """The run's summary; empty if there is none, or a damaged one, which is then written anew."""
+def _read(path: Path) -> dict[str, Any]:
+    """What a JSON file of the run holds; nothing if there is none, or a damaged one."""
     try:
-        found = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
+        found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

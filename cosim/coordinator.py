@@ -35,6 +35,9 @@ _MILLISECOND_NS = 1_000_000
 _LEAVE_GRACE_S = 0.3
 """A process says that it leaves; its word may come a little after its liveliness token vanishes."""
 
+_EXIT_GRACE_S = 5.0
+"""By then a process has ended that says that it ends."""
+
 
 @dataclass
 class _Member:
@@ -49,6 +52,8 @@ class _Member:
     """Whether it has passed the barrier."""
     vanished_s: float | None = None
     left: str | None = None
+    left_s: float = 0.0
+    """Reading of the monotonic clock when it said so."""
 
     def gone(self) -> str | None:
         """Why it is gone; None if it is not, as far as anybody knows."""
@@ -90,6 +95,7 @@ class Coordinator:
         self._candidates: dict[tuple[str, str], _Member] = {}
         self._members: dict[str, _Member] = {}
         self._before: dict[str, str] = {}
+        self._last_words: dict[str, str] = {}
         self._stopped: str | None = None
 
     @property
@@ -108,8 +114,10 @@ class Coordinator:
     def poll(self) -> None:
         """Handle whatever has arrived; call often."""
         while (leave := self._leaves.try_recv()) is not None:
+            reason = leave.payload.to_bytes().decode(errors="replace")
+            self._last_words[_whose(leave.key_expr)[0]] = reason
             if (member := self._member(leave.key_expr)) is not None:
-                member.left = leave.payload.to_bytes().decode(errors="replace")
+                member.left, member.left_s = reason, time.monotonic()
         while (life := self._lives.try_recv()) is not None:
             if (member := self._member(life.key_expr)) is not None:
                 gone = life.kind == zenoh.SampleKind.DELETE
@@ -118,8 +126,10 @@ class Coordinator:
             for role in list(self._members):
                 if self.finished(role):  # another may come in its stead
                     member = self._members.pop(role)
-                    if member.query is not None:  # it only seemed to be gone
-                        self.plane.refuse(member.query, f"{role} was taken for gone")
+                    if member.left is None:  # or itself, if it was only held up
+                        self._candidates[role, member.instance] = _Member(member.instance, 0)
+                    if member.query is not None:
+                        self.plane.dismiss(member.query)
         while (query := self._knocks.try_recv()) is not None:
             self._answer(query, self._admit)
         while (query := self._joins.try_recv()) is not None:
@@ -159,6 +169,21 @@ class Coordinator:
         member = self._members.get(role)
         return member is not None and (member.left is not None or member.gone() is not None)
 
+    def is_leaving(self, role: str) -> bool:
+        """Whether a process said a moment ago that it ends, so that it may not have ended yet."""
+        member = self._members.get(role)
+        said = member is not None and member.left is not None
+        return said and member is not None and time.monotonic() - member.left_s < _EXIT_GRACE_S
+
+    def last_words(self, role: str) -> str | None:
+        """Why a process that has ended did so, as it said itself; None if it said nothing."""
+        deadline_s = time.monotonic() + _LEAVE_GRACE_S
+        while role not in self._last_words and time.monotonic() < deadline_s:
+            time.sleep(0.01)
+            self.poll()
+        words = self._last_words.get(role)
+        return None if words == HORIZON else words
+
     def incarnation(self, role: str) -> int | None:
         """Number of the process of a role that is in the loop now; None while none is."""
         member = self._members.get(role)
@@ -174,6 +199,7 @@ class Coordinator:
             dead: it cannot come back by itself.
         """
         self._before[role] = after
+        self._last_words.pop(role, None)
         if dead:
             self._members[role].left = after
 

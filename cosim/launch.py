@@ -16,9 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from cosim.coordinator import Coordinator
+from cosim.ending import Ending, EndingFile
 from cosim.environment import write_environment
 from cosim.room import require_room
 from cosim.run_dir import new_run_dir, point_to_latest, under_way, write_scenario
+from cosim.start_limit import DEFAULT_S, StartLimit
 from noack.errors import CallerError, ExitStatus, MachineError, NeverStartedError
 from noack.io import open_runs
 from noack.io.node import HORIZON
@@ -40,23 +42,10 @@ _MODULES = {
     "controller": "controller_node",
 }
 _POLL_S = 0.01
-_START_PATIENCE_S = 30.0
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
 """After the horizon: the recorder puts the rows in order, of which a long run has many."""
 REJOIN_BY_HAND_S = 60.0
-
-
-@dataclass(frozen=True)
-class Ending:
-    """How a run ended."""
-
-    run_dir: Path
-    run_id: int
-    status: ExitStatus
-    reason: str
-    startup_s: float | None = None
-    """Wall time from the launch to simulated time 0; None if nobody saw it."""
 
 
 @dataclass(frozen=True)
@@ -108,16 +97,18 @@ def launch(
     run = _Run(ticket, run_dir, spawn, watcher or Watcher())
     with Signals().handled() as signals, contextlib.ExitStack() as stack:
         stack.enter_context(under_way(run_dir))
+        ending = stack.enter_context(EndingFile(run_dir))
         coordinator = Coordinator(ticket)
         stack.callback(coordinator.close)
         if session is not None:
             stack.enter_context(published(ticket._replace(launched=False), session))
         _publish(stack, ticket, session)
         stack.enter_context(run.children(live=live))
-        status, reason = run.watch(coordinator, signals)
-    if coordinator.epoch_ns is None:
-        raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
-    startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
+        status, reason = run.watch(coordinator, signals, ending.store)
+        if coordinator.epoch_ns is None:
+            raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
+        startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
+        ending.store(status, reason, startup_s)
     return Ending(run_dir, ticket.run_id, status, reason, startup_s)
 
 
@@ -163,18 +154,32 @@ class _Run:
             for child in self._children.values():
                 _end(child)
 
-    def watch(self, coordinator: Coordinator, signals: Signals) -> tuple[ExitStatus, str]:
-        """Follow the run to its end; return its exit status and why it ended."""
+    def watch(
+        self,
+        coordinator: Coordinator,
+        signals: Signals,
+        store: Callable[[ExitStatus, str], None],
+    ) -> tuple[ExitStatus, str]:
+        """Follow the run to its end; return its exit status and why it ended.
+
+        Args:
+            coordinator: of the run.
+            signals: what ends it.
+            store: is told why the run ends early, before its processes end.
+        """
         scenario = self._ticket.scenario
         verdict: tuple[ExitStatus, str] | None = None
         told: tuple[str, ...] = ()
-        by_hand = any(role not in self._spawn for role in ROLES)
-        patience_s = float("inf") if by_hand else time.monotonic() + _START_PATIENCE_S
+        limit = StartLimit(self._start_within_s())
+        patience_s = float("inf")
+        before_s = time.monotonic()
         started = False
         while not self._over(coordinator, stopping=verdict is not None):
             coordinator.poll()
             now_s = time.monotonic()
             if coordinator.epoch_ns is None:
+                limit.wait(now_s - before_s, os.getloadavg()[0])
+                before_s = now_s
                 missing = tuple(r for r in coordinator.missing() if r not in self._spawn)
                 if missing != told and verdict is None:
                     told = missing
@@ -187,9 +192,10 @@ class _Run:
             self._give_account(coordinator)
             if verdict is None:
                 verdict = self._stopped(signals) or self._trouble(coordinator)
-                if verdict is None and now_s > patience_s:
-                    verdict = (ExitStatus.FAILED, _overdue(coordinator))
+                if verdict is None and (now_s > patience_s or limit.is_reached):
+                    verdict = (ExitStatus.FAILED, _overdue(coordinator, limit))
                 if verdict is not None:
+                    store(*verdict)
                     coordinator.stop(verdict[1])
                     patience_s = now_s + _STOP_PATIENCE_S
             elif now_s > patience_s:
@@ -270,7 +276,7 @@ class _Run:
             if coordinator.incarnation(role) is not None:
                 del self._lost[role]
                 self._tell(self._watcher.back, role, coordinator.now_ns() * 1e-9)
-            elif (again := self._exited(role)) is not None:
+            elif (again := self._exited(role, coordinator)) is not None:
                 return again[0], f"{lost.why}; started anew, {again[1]}"
             elif time.monotonic() > lost.until_s:
                 return lost.status, f"{lost.why}; no other came within {lost.within_s:g} s"
@@ -297,18 +303,31 @@ class _Run:
 
     def _casualties(self, coordinator: Coordinator) -> dict[str, tuple[ExitStatus, str]]:
         """Who is gone that is not waited for, and why."""
-        gone = dict(coordinator.gone())
+        # The exit status of a process of ours says more than that it leaves.
+        gone = {
+            role: why
+            for role, why in coordinator.gone().items()
+            if not (self._is_running(role) and coordinator.is_leaving(role))
+        }
         if self._over_its_record(coordinator):
             gone.pop(RECORDER, None)
         found = {role: (ExitStatus.FAILED, why) for role, why in gone.items()}
-        found |= {role: how for role in self._children if (how := self._exited(role)) is not None}
+        found |= {
+            role: how
+            for role in self._children
+            if (how := self._exited(role, coordinator)) is not None
+        }
         return {role: how for role, how in found.items() if role not in self._lost}
 
     def _over_its_record(self, coordinator: Coordinator) -> bool:
         """Whether the recorder may be busy with a long record's end, and not hear its peers."""
-        recorder = self._children.get(RECORDER)
         over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
-        return over and recorder is not None and recorder.poll() is None
+        return over and self._is_running(RECORDER)
+
+    def _is_running(self, role: str) -> bool:
+        """Whether a process of ours has not ended."""
+        child = self._children.get(role)
+        return child is not None and child.poll() is None
 
     def _rejoin_within_s(self, role: str) -> float:
         given_s = self._ticket.scenario.recovery.rejoin_within_s
@@ -316,35 +335,47 @@ class _Run:
             return 0.0 if role in self._spawn else REJOIN_BY_HAND_S
         return given_s
 
+    def _start_within_s(self) -> float:
+        given_s = self._ticket.scenario.start_within_s
+        if given_s is None:
+            by_hand = any(role not in self._spawn for role in ROLES)
+            return float("inf") if by_hand else DEFAULT_S
+        return given_s
+
     def _never_back(self) -> tuple[ExitStatus, str] | None:
         for lost in self._lost.values():
             return lost.status, f"{lost.why}; no other came before the end"
         return None
 
-    def _exited(self, role: str) -> tuple[ExitStatus, str] | None:
+    def _exited(self, role: str, coordinator: Coordinator) -> tuple[ExitStatus, str] | None:
         """How a process of ours failed; None if it did not."""
         child = self._children.get(role)
         code = None if child is None else child.poll()
-        return None if not code else self._died(role, code)
+        return None if not code else self._died(role, code, coordinator)
 
     def _gave_up(self, role: str) -> bool:
         """Whether a process of ours ended itself, and said why."""
         child = self._children.get(role)
         return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
 
-    def _died(self, role: str, code: int) -> tuple[ExitStatus, str]:
+    def _died(self, role: str, code: int, coordinator: Coordinator) -> tuple[ExitStatus, str]:
         if code < 0:
             return ExitStatus.FAILED, f"{role} died: killed by {_name(-code)}"
         if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
             return ExitStatus.FAILED, f"{role} ended early: {_name(code - 128)}"
+        known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
+        lines, own = self._logged(role), f"noack {role}: "
+        # Libraries log there, too; and when the disk is full, nobody does.
+        said = next((one.removeprefix(own) for one in lines[::-1] if one.startswith(own)), None)
+        why = said or coordinator.last_words(role) or "".join(lines[-1:]) or f"exit status {code}"
+        return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
+
+    def _logged(self, role: str) -> list[str]:
         log = self._run_dir / "logs" / f"{role}.log"
         try:
-            lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            return log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         except OSError:  # somebody took the run's folder away
-            lines = []
-        said = lines[-1].removeprefix(f"noack {role}: ") if lines else f"exit status {code}"
-        known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
-        return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {said}"
+            return []
 
 
 def longest_s(run_s: float) -> float:
@@ -352,9 +383,9 @@ def longest_s(run_s: float) -> float:
     return run_s * (1 + _OVERTIME_SHARE) + _OVERTIME_S
 
 
-def _overdue(coordinator: Coordinator) -> str:
+def _overdue(coordinator: Coordinator, limit: StartLimit) -> str:
     if coordinator.epoch_ns is None:
-        return f"{', '.join(coordinator.missing())} did not come to the start"
+        return f"{', '.join(coordinator.missing())} {limit.explain()}"
     here = [role for role in ROLES if not coordinator.finished(role)]
     # The recorder stays until the last of the others has left.
     held = [role for role in here if role != RECORDER] or here

@@ -198,8 +198,8 @@ def finish_record(run_dir: Path) -> RunRecord:
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
-            f"{folder}: the record cannot be written: {why(error)}; all of it is kept in {spool}, "
-            f"and `noack summary {run_dir}` finishes it"
+            f"{folder}: the record cannot be written: {why(error)}; what was recorded is kept "
+            f"in {spool}, and `noack summary {run_dir}` finishes it"
         ) from None
     return record
 

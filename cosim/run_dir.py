@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
@@ -22,6 +23,7 @@ SCENARIO_FILE = "scenario.toml"
 ENVIRONMENT_FILE = "environment.json"
 REPORTS_FILE = "reports.json"
 RECORDING_FILE = "recording.rrd"
+ENDING_FILE = "ending.json"
 SUMMARY_FILE = "summary.json"
 REPORT_FILE = "report.html"
 SPOOL = "spool"
@@ -90,27 +92,52 @@ def _with_file(scenario: Scenario, file: str) -> Scenario:
 
 
 def point_to_latest(run_dir: Path) -> None:
-    """Let ``latest`` beside the run directory lead to it."""
+    """Let ``latest`` beside the run directory lead to it; if it cannot, warn."""
+    latest = run_dir.parent / LATEST
     scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
     try:  # a convenience, not worth a run
         scratch.unlink(missing_ok=True)
         scratch.symlink_to(run_dir.name)
-        scratch.replace(run_dir.parent / LATEST)
-    except OSError:
+        scratch.replace(latest)
+    except OSError as error:
         with contextlib.suppress(OSError):
             scratch.unlink(missing_ok=True)
+        print(
+            f"noack: warning: {latest} cannot be replaced: {why(error)}; this run is in {run_dir}",
+            file=sys.stderr,
+        )
 
 
 def latest_run(runs: Path) -> Path:
     """Return the newest run directory below ``runs``.
 
     Raises:
-        CallerError: there is none.
+        CallerError: there is none, or the link or the directory is another user's: to open a run
+            may execute the code of its plant.
     """
     link = runs / LATEST
     if not link.is_symlink() or not link.is_dir():
         raise CallerError(f"{runs}: no run yet; `noack demo` makes one")
-    return link.resolve()
+    run_dir = link.resolve()
+    if {link.lstat().st_uid, run_dir.stat().st_uid} != {os.geteuid()}:
+        raise CallerError(
+            f"{link}: the link, or the run that it leads to, is another user's; "
+            "name the run directory, or a folder of your own by --runs"
+        )
+    return run_dir
+
+
+def chosen_run(run_dir: Path | None, runs: Path) -> Path:
+    """Return the run directory that was named, or the newest below ``runs`` if none was.
+
+    Raises:
+        CallerError: as :func:`latest_run`, which follows a ``latest`` that was named, too.
+    """
+    if run_dir is None:
+        return latest_run(runs)
+    if run_dir.name == LATEST and run_dir.is_symlink():
+        return latest_run(run_dir.parent)
+    return run_dir
 
 
 @contextmanager

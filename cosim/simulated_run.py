@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 from typing import Protocol
 
+from cosim.ending import Ending, EndingFile
 from cosim.environment import write_environment
-from cosim.launch import Ending
 from cosim.record import RunRecord, write_record
 from cosim.run_dir import REPORTS_FILE, new_run_dir, point_to_latest, under_way, write_scenario
 from cosim.virtual import Progress, simulate
@@ -52,7 +52,7 @@ def simulate_run(
     run_dir = new_run_dir(runs, resolved.name)
     run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
     try:
-        with under_way(run_dir):
+        with under_way(run_dir), EndingFile(run_dir) as ending:
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)
@@ -63,6 +63,7 @@ def simulate_run(
                 from cosim.viewer.opened import write_view  # imports rerun
 
                 write_view(record, run_dir, run_id)
+            ending.store(ExitStatus.OK, HORIZON)
     except BaseException as error:
         shutil.rmtree(run_dir, ignore_errors=True)
         if isinstance(error, OSError):

@@ -39,6 +39,10 @@ class PeerError(NoackError):
     """Another process failed: it died, never came, or broke the protocol."""
 
 
+class NoAnswerError(PeerError):
+    """Another process could not be reached, or did not answer in time."""
+
+
 class MachineError(NoackError):
     """The operating system refused: a port is taken, the disk is full, a file cannot be read."""
 

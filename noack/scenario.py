@@ -50,6 +50,9 @@ class Scenario(Section):
     """Simulated length of the run."""
     speed: Annotated[FiniteFloat, Field(gt=0, le=1000)] = 1.0
     """Simulated time per wall time."""
+    start_within_s: Annotated[FiniteFloat, Field(gt=0, le=86_400)] | None = None
+    """The run ends if its processes are not ready within this wall time, which grows with the
+    system's load, up to 20 times. By default 30, and unlimited if people start processes."""
     model: Model
     plant: Plant
     trigger: AnyTrigger

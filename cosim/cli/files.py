@@ -128,6 +128,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
 def _in_force(resolved: Scenario) -> Iterator[str]:
     """Say what holds of keys that have no value, and whose default depends on others."""
     from cosim.launch import REJOIN_BY_HAND_S
+    from cosim.start_limit import DEFAULT_S
 
     watchdog, timeout_s = resolved.plant.watchdog, resolved.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
@@ -139,6 +140,8 @@ def _in_force(resolved: Scenario) -> Iterator[str]:
             "recovery.rejoin_within_s: 0, who dies ends the run; "
             f"{REJOIN_BY_HAND_S:g} for processes that people start"
         )
+    if resolved.start_within_s is None:
+        yield f"start_within_s: {DEFAULT_S:g}, longer under load; unlimited if people start some"
 
 
 @command(FILES, [

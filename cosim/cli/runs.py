@@ -25,14 +25,14 @@ from cosim.cli.app import (
     find_scenario,
     print_json,
 )
-from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, latest_run
+from cosim.run_dir import DEFAULT_RUNS, RECORDING_FILE, chosen_run
 from noack.errors import ExitStatus
 from noack.scenario import Scenario
 from noack.scenario_file import load
 from noack.topology import ROLES
 
 if TYPE_CHECKING:
-    from cosim.launch import Ending
+    from cosim.ending import Ending
 
 
 @command(RUNS, [
@@ -134,7 +134,7 @@ def view(
     """Open a recording in the rerun viewer."""
     from cosim.viewer.live import view_recording
 
-    path = recording or latest_run(runs)
+    path = chosen_run(recording, runs)
     path = path / RECORDING_FILE if path.is_dir() else path
     if json:
         print_json({"recording": str(path), "exists": path.is_file()})
@@ -158,7 +158,7 @@ def summary(
     from cosim.conclude import reopen
     from cosim.run_verdict import print_outcome
 
-    outcome = reopen(run_dir or latest_run(runs))
+    outcome = reopen(chosen_run(run_dir, runs))
     if json:
         print_json(outcome.summary)
     else:
@@ -182,7 +182,7 @@ def replay(
     from cosim.replay import replay as replay_record
     from cosim.replay.table import print_replay
 
-    path = run_dir or latest_run(runs)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("replaying"):
         found = replay_record(load_record(path))
     changed = changed_since(path)
@@ -208,7 +208,7 @@ def fidelity(
     from cosim.progress import PatientConsole
     from cosim.record import load_record
 
-    path = run_dir or latest_run(runs)
+    path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
         found = fidelity_of(load_record(path))
     if json:
@@ -230,7 +230,7 @@ def report(
     """Write a run's report anew, one page with all figures, and print where it is."""
     from cosim.conclude import report_anew
 
-    path = report_anew(run_dir or latest_run(runs))
+    path = report_anew(chosen_run(run_dir, runs))
     if json:
         print_json({"report": str(path)})
     else:

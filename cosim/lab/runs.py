@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from cosim.lab.scenarios import Source, load
 from cosim.lab.shown import as_html, as_text
-from cosim.run_dir import RECORD, SCENARIO_FILE
+from cosim.run_dir import RECORD, SCENARIO_FILE, chosen_run
 from noack.errors import CallerError, ExitStatus
 from noack.scenario import Scenario
 
@@ -286,11 +286,12 @@ def open_run(directory: Folder = "runs/latest") -> Run:
         directory: a run directory. ``runs/latest`` leads to the newest below ``runs``.
 
     Raises:
-        NoackError: it is no run directory, its record is damaged, or the run is still under way.
+        NoackError: it is no run directory, ``latest`` is another user's, its record is damaged, or
+            the run is still under way.
     """
     from cosim.conclude import reopen
 
-    path = Path(directory)
+    path = chosen_run(Path(directory), Path(directory).parent)
     if not (path / SCENARIO_FILE).is_file():
         raise CallerError(f"{path}: not a run directory (no {SCENARIO_FILE})")
     outcome = reopen(path.resolve())

@@ -100,7 +100,7 @@ class RecordingServer:
         if t_ns is None:
             window = start_rerun(arguments, start_new_session=True)
         else:
-            output = tempfile.TemporaryFile()
+            output = tempfile.TemporaryFile()  # noqa: SIM115 - the thread closes it
             window = start_rerun(arguments, output=output, start_new_session=True)
             move = partial(move_window_to, t_ns, window, output)
             threading.Thread(target=move, daemon=True).start()

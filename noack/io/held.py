@@ -8,6 +8,7 @@ by whoever finds it.
 import fcntl
 import json
 import os
+import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,7 +32,7 @@ def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
     """Keep a file while the context lasts.
 
     Args:
-        kind: folder of the runtime directory that the file lies in.
+        kind: folder of the runtime directory that the file lies in; "" for that directory itself.
         name: of the file, without suffix.
         content: what it says, as JSON.
 
@@ -39,8 +40,8 @@ def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
         CallerError: the folder cannot be made, or is not the user's own.
         FileExistsError: one that runs has a file of this name.
     """
-    with open_private(kind, create=True) as folder:
-        scratch, name = f"{name}.{os.getpid()}", name + _SUFFIX
+    with open_private(*_inside(kind), create=True) as folder:
+        scratch, name = f"{name}.{secrets.token_hex(8)}", name + _SUFFIX
         with os.fdopen(folder.create(scratch), "w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             json.dump(content, file)
@@ -62,11 +63,15 @@ def running(kind: str) -> list[Held]:
         CallerError: the folder, or a file in it, is not the user's own.
     """
     try:
-        with open_private(kind) as folder:
+        with open_private(*_inside(kind)) as folder:
             names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
             return [file for name in names if (file := _alive(folder, name)) is not None]
     except FileNotFoundError:
         return []
+
+
+def _inside(kind: str) -> tuple[str, ...]:
+    return (kind,) if kind else ()
 
 
 def _put(folder: PrivateFolder, scratch: str, name: str) -> None:

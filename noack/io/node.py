@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar, cast
 
 from noack.changes import Change, Changeable
 from noack.clock import NS_PER_S, RunClock
-from noack.errors import CallerError, PeerError
+from noack.errors import CallerError, NoackError, PeerError, one_line
 from noack.io.address import Address
 from noack.io.loop import Channel, run_loop
 from noack.io.messages import Admission, Announced, Begin, Kept, Missing, Said, heard
@@ -111,6 +111,7 @@ class Node:
         """Ask to be let in; learn whether the run has begun, and another has gone before.
 
         Raises:
+            NoAnswerError: no answer came within ten seconds.
             PeerError: this process is not let in.
         """
         admission = self._ask("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
@@ -248,7 +249,7 @@ class Node:
                     behind_s = behind_ns / NS_PER_S
                     self._ended = f"too slow: {behind_s:g} s behind; try a lower speed or rate"
             except BaseException as error:
-                self._ended = f"an error of its own: {error!r}"
+                self.fail(error)
                 raise
             finally:
                 telemetry.flush()
@@ -263,6 +264,11 @@ class Node:
                 }
                 channel.close()
                 self._hand_over(telemetry)
+
+    def fail(self, error: BaseException) -> None:
+        """End with an error, which the run is then told of."""
+        known = isinstance(error, NoackError)
+        self._ended = one_line(error) if known else f"an error of its own: {error!r}"
 
     @property
     def ended(self) -> str:
@@ -280,10 +286,11 @@ class Node:
                 self._ended = signal.Signals(self._signals.received).name
             elif (reason := self.plane.stop_requested()) is not None:
                 self._ended = reason
-            elif self.ticket.launched and _lifeline_cut():
-                self._ended = LAUNCHER_GONE
+            elif self.ticket.launched:
+                self._ended = LAUNCHER_GONE if lifeline_cut() else None
             elif self._joining and self.plane.coordinator_gone(for_s=_COORDINATOR_AWAY_S):
-                # Once the loop runs, it goes on without the control plane.
+                # Once the loop runs, it goes on without the control plane. A launched process
+                # has its lifeline: on a busy machine a coordinator may only seem to be gone.
                 self._ended = "the run's coordinator is gone"
         return self._ended
 
@@ -337,7 +344,7 @@ class Node:
         writer.close()
 
 
-def _lifeline_cut() -> bool:
+def lifeline_cut() -> bool:
     """Whether the launcher has closed our standard input, which it does only by ending."""
     readable, _, _ = select.select([sys.stdin.fileno()], (), (), 0)
     return bool(readable) and os.read(sys.stdin.fileno(), 1) == b""

@@ -16,11 +16,15 @@ import zenoh
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.errors import PeerError
+from noack.errors import NoAnswerError, PeerError
 from noack.io.star import Secret, cause_of, open_star
 from noack.io.ticket import Ticket
 from noack.scenario import MOST_CHANGES
 from noack.topology import COORDINATOR
+
+_ASK_AGAIN_S = 5.0
+_POLL_S = 0.01
+"""Twenty runs that wait at their start are a hundred processes that look so often."""
 
 
 def secret_of(ticket: Ticket) -> Secret:
@@ -38,7 +42,7 @@ class Plane:
         listen: this is the coordinator.
 
     Raises:
-        PeerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
+        NoAnswerError: the coordinator cannot be reached, or the endpoint cannot be listened on.
     """
 
     def __init__(self, ticket: Ticket, role: str, *, listen: bool = False) -> None:
@@ -50,7 +54,7 @@ class Plane:
             self.session = open_star(endpoint, secret_of(ticket), listen=listen)
         except zenoh.ZError as error:
             verb = "listen on" if listen else "reach the run's coordinator at"
-            raise PeerError(f"cannot {verb} {endpoint}: {cause_of(error)}") from None
+            raise NoAnswerError(f"cannot {verb} {endpoint}: {cause_of(error)}") from None
         self._token = self.session.liveliness().declare_token(
             self.key("alive", role, self.instance)
         )
@@ -166,6 +170,11 @@ class Plane:
         query.reply_err(why)
         query.drop()  # type: ignore[no-untyped-call]
 
+    @staticmethod
+    def dismiss(query: zenoh.Query) -> None:
+        """Leave a request without an answer; whoever still waits for one asks again."""
+        query.drop()  # type: ignore[no-untyped-call]
+
     def request(
         self,
         what: str,
@@ -176,29 +185,36 @@ class Plane:
     ) -> bytes:
         """Ask the queryable ``what/ROLE`` and return its answer.
 
-        An answer may take as long as ``timeout_s``; a queryable that does not exist yet is asked
-        again.
+        An answer may take as long as ``timeout_s``. It is asked for again when the queryable does
+        not exist yet, and every five seconds: when a connection was interrupted, question or answer
+        may be lost. So who answers must take a question twice.
 
         Raises:
-            PeerError: no answer came, or it was an error.
+            NoAnswerError: no answer came.
+            PeerError: the answer was an error.
         """
         deadline_s = time.monotonic() + timeout_s
         payload = json.dumps(content)
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
+            wait_s = min(left_s, _ASK_AGAIN_S)
             replies = self.session.get(
-                self.key(what, self.role), FifoChannel(4), payload=payload, timeout=left_s
+                self.key(what, self.role),
+                FifoChannel(4),
+                payload=payload,
+                timeout=wait_s + _ASK_AGAIN_S,  # zenoh's own would come as an error's answer
             )
-            while not give_up() and time.monotonic() < deadline_s:
+            again_s = time.monotonic() + wait_s
+            while not give_up() and time.monotonic() < again_s:
                 try:
                     reply = replies.try_recv()
                 except zenoh.ZError:  # the query has ended without an answer
                     break
                 if reply is None:
-                    time.sleep(0.002)
+                    time.sleep(_POLL_S)
                     continue
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 if reply.err is not None:
                     raise PeerError(reply.err.payload.to_bytes().decode(errors="replace"))
             time.sleep(0.02)
-        raise PeerError(f"no answer to {what!r} within {timeout_s:g} s")
+        raise NoAnswerError(f"no answer to {what!r} within {timeout_s:g} s")

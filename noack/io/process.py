@@ -6,10 +6,11 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 
-from noack.errors import ExitStatus, NoackError
+from noack.errors import ExitStatus, NoackError, NoAnswerError
 from noack.io.command_line import Parser, failed
-from noack.io.node import HORIZON, Node
+from noack.io.node import HORIZON, Node, lifeline_cut
 from noack.io.plane import Plane
 from noack.io.signals import Signals
 from noack.io.ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
@@ -34,14 +35,16 @@ def run_process(
     """
     with Signals().handled() as signals:
         try:
-            ticket = _admission(role, session, signals)
-            with Plane(ticket, role) as plane:
-                node = Node(role, ticket, plane, signals)
+            ticket = _ticket(role, session, signals)
+            node = _admitted(role, ticket, signals)
+            with node.plane:
                 try:
-                    node.knock()
                     body(node)
+                except Exception as error:
+                    node.fail(error)
+                    raise
                 finally:
-                    plane.leave(node.ended)
+                    node.plane.leave(node.ended)
         except NoackError as error:
             if signals.received is None:
                 return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
@@ -87,7 +90,7 @@ def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespac
     return run_process(role, body_and_report, options.session, as_json=options.json)
 
 
-def _admission(role: str, session: str, signals: Signals) -> Ticket:
+def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     if os.environ.pop(TICKET_ON_STDIN, None):
         return loads(sys.stdin.buffer.readline().decode())
     ticket = wait_for_ticket(
@@ -101,3 +104,26 @@ def _admission(role: str, session: str, signals: Signals) -> Ticket:
     )
     print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
     return ticket
+
+
+def _admitted(role: str, ticket: Ticket, signals: Signals) -> Node:
+    """Connect to a run and ask to be let in.
+
+    A launched process tries again as long as its launcher waits. On a busy machine a connection may
+    not come about in time, or without what zenoh should have told of the coordinator; then nothing
+    is ever answered over it.
+
+    Raises:
+        PeerError: this process is not let in, or there is no answer.
+    """
+    while True:
+        try:
+            with ExitStack() as stack:
+                plane = stack.enter_context(Plane(ticket, role))
+                node = Node(role, ticket, plane, signals)
+                node.knock()
+                stack.pop_all()
+                return node
+        except NoAnswerError:
+            if not ticket.launched or signals.received or lifeline_cut():
+                raise

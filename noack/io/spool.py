@@ -6,7 +6,6 @@ rows may come twice, from two writers; row numbers tell.
 """
 
 import contextlib
-import errno
 import os
 import struct
 from collections.abc import Iterable, Iterator
@@ -24,13 +23,17 @@ class SpoolWriter:
     Args:
         folder: the spool's directory; it is created.
         writer: names this writer's files.
+
+    Raises:
+        MachineError: the folder cannot be made.
     """
 
     def __init__(self, folder: Path, writer: str) -> None:
         self._folder = folder
         self._writer = writer
         self._files: dict[str, BinaryIO] = {}
-        folder.mkdir(parents=True, exist_ok=True)
+        with self._named():
+            folder.mkdir(parents=True, exist_ok=True)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system.
@@ -38,15 +41,8 @@ class SpoolWriter:
         Raises:
             MachineError: the disk is full or the folder cannot be written.
         """
-        try:
-            file = self._open(table)
-            chunk = _CHUNK.pack(first, len(payload)) + payload
-            written = file.write(chunk)
-            if written != len(chunk):  # what a full disk leaves must not be read as rows later
-                file.truncate(file.tell() - written)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise self._unwritable(error) from None
+        with self._named():
+            _write_whole(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
         """Open the files of tables before there is anything to write.
@@ -54,14 +50,19 @@ class SpoolWriter:
         Raises:
             MachineError: the folder cannot be written.
         """
-        try:
+        with self._named():
             for table in tables:
                 self._open(table)
-        except OSError as error:
-            raise self._unwritable(error) from None
 
-    def _unwritable(self, error: OSError) -> MachineError:
-        return MachineError(f"{self._folder}: the record cannot be written: {why(error)}")
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Say why the system refuses, and where."""
+        try:
+            yield
+        except OSError as error:
+            raise MachineError(
+                f"{self._folder}: the record cannot be written: {why(error)}"
+            ) from None
 
     def _open(self, table: str) -> BinaryIO:
         file = self._files.get(table)
@@ -75,6 +76,21 @@ class SpoolWriter:
         for file in self._files.values():
             file.close()
         self._files.clear()
+
+
+def _write_whole(file: BinaryIO, chunk: bytes) -> None:
+    """Write a chunk whole or not at all: the rest of one must not be read as rows later.
+
+    Raises:
+        OSError: the system does not take all of it; the error says why.
+    """
+    written = 0
+    try:
+        while written < len(chunk):
+            written += file.write(chunk[written:])
+    except OSError:
+        file.truncate(file.tell() - written)
+        raise
 
 
 def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:

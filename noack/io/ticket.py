@@ -7,19 +7,18 @@ a file that only its owner can read, in the user's runtime directory.
 
 import contextlib
 import json
-import os
 import secrets
-import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from pydantic import Field, ValidationError
 
 from noack.errors import CallerError, PeerError
-from noack.io.private import PrivateFolder, open_private, private_folder, require_name
+from noack.io.held import held
+from noack.io.private import open_private, private_folder, require_name
 from noack.mistakes import brief
 from noack.scenario import Scenario
 from noack.section import Section, Seed
@@ -52,12 +51,14 @@ class Ticket(NamedTuple):
     scenario: Scenario
     """Resolved."""
 
+    def fields(self) -> dict[str, Any]:
+        """The ticket as what JSON can hold."""
+        scenario = self.scenario.model_dump(mode="json")
+        return self._asdict() | {"key": self.key.hex(), "scenario": scenario}
+
     def dumps(self) -> str:
         """The ticket as one line of JSON."""
-        fields = self._asdict()
-        return json.dumps(
-            fields | {"key": self.key.hex(), "scenario": self.scenario.model_dump(mode="json")}
-        )
+        return json.dumps(self.fields())
 
 
 def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
@@ -95,39 +96,24 @@ def ticket_path(session: str) -> Path:
     return private_folder() / f"{session}.json"
 
 
-def _in_use(folder: PrivateFolder, name: str) -> bool:
-    """Whether the coordinator of the ticket that lies here still listens."""
-    try:
-        host, _, port = loads(folder.read_text(name)).endpoint.removeprefix("tcp/").rpartition(":")
-        with socket.create_connection((host, int(port)), timeout=1):
-            return True
-    except (OSError, ValueError, CallerError):
-        return False
-
-
 @contextmanager
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
     """Keep the ticket in its file, readable by its owner only, while the context lasts.
 
+    The file is locked: of several who publish at once under one name, one succeeds.
+
     Raises:
-        CallerError: the folder is not the user's own.
+        CallerError: the folder is not the user's own, or another run is open in the session.
     """
     path = ticket_path(session)
-    with open_private(create=True) as folder:
-        if _in_use(folder, path.name):
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held("", session, ticket.fields()))
+        except FileExistsError:
             raise CallerError(
                 f"session {session!r}: another run is open in it; choose --session NAME"
-            )
-        scratch = f"{session}.{os.getpid()}"
-        with os.fdopen(folder.create(scratch), "w") as file:
-            file.write(ticket.dumps())
-        folder.replace(scratch, path.name)
-        try:
-            yield path
-        finally:
-            with contextlib.suppress(OSError, CallerError):
-                if loads(folder.read_text(path.name)).run_id == ticket.run_id:
-                    folder.remove(path.name)
+            ) from None
+        yield path
 
 
 def wait_for_ticket(

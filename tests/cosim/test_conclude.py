@@ -10,12 +10,13 @@ from rich.console import Console
 
 import cosim.conclude
 from cosim.conclude import reopen
+from cosim.ending import EndingFile
 from cosim.environment import write_environment
 from cosim.record import write_record
 from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
 from cosim.run_verdict import print_outcome
 from cosim.virtual import simulate
-from noack.errors import CallerError
+from noack.errors import CallerError, ExitStatus
 from noack.records import PLANT_STEP
 from noack.resolve import resolve
 from noack.scenario_file import dumps, validate
@@ -104,6 +105,27 @@ def test_a_summary_that_does_not_know_the_end_is_written_anew(run_dir: Path, end
     whole = reopen(run_dir)
     (run_dir / SUMMARY_FILE).write_text(json.dumps(whole.summary | {"exit": end}))
     assert reopen(run_dir).summary == whole.summary
+
+
+def test_what_the_launcher_stored_is_how_the_run_ended(run_dir: Path) -> None:
+    """A blank file is of a launcher that ended before the run."""
+    with EndingFile(run_dir) as file:
+        assert (reopen(run_dir).status, reopen(run_dir).reason) == (1, "the launcher ended early")
+        (run_dir / SUMMARY_FILE).unlink()
+        file.store(ExitStatus.FAILED, "x" * 10_000)
+        file.store(ExitStatus.TERMINATED, "stopped by SIGTERM", 1.5)
+    outcome = reopen(run_dir)
+    assert (outcome.status, outcome.reason) == (143, "stopped by SIGTERM")
+    assert outcome.summary["startup_s"] == 1.5
+    (run_dir / SUMMARY_FILE).write_text("damaged")
+    assert reopen(run_dir).reason == "stopped by SIGTERM"
+
+
+def test_an_error_of_the_launcher_is_stored_as_the_end(run_dir: Path) -> None:
+    with pytest.raises(CallerError), EndingFile(run_dir):
+        raise CallerError("the port is taken")
+    outcome = reopen(run_dir)
+    assert (outcome.status, outcome.reason) == (2, "the port is taken")
 
 
 @pytest.mark.parametrize("new", ["claims", "conditions", "fidelity", "replay", "kind"])

@@ -46,6 +46,12 @@ class Barrier:
     def incarnation(self, role: str) -> None:
         return None
 
+    def is_leaving(self, role: str) -> bool:
+        return False
+
+    def last_words(self, role: str) -> str | None:
+        return "the disk is full"
+
     def expect(self, role: str, after: str, *, dead: bool) -> None:
         self.expected.append(role)
 
@@ -87,6 +93,44 @@ def test_who_says_why_it_cannot_go_on_is_not(
 ) -> None:
     """Another would fail as it did, and be started anew until the end of the run."""
     assert Run(content, tmp_path, code).verdict() == (code, "sensor: no room")
+
+
+@pytest.mark.parametrize(
+    ("log", "why"),
+    [
+        ("noack sensor: no room\nERROR of a library\n", "no room"),
+        ("ERROR of a library\n", "the disk is full"),
+        ("", "the disk is full"),
+        (None, "the disk is full"),
+    ],
+)
+def test_why_a_process_ended_is_what_it_said_itself(
+    content: dict[str, Any], tmp_path: Path, log: str | None, why: str
+) -> None:
+    """On a full disk it cannot log it."""
+    run = Run(content, tmp_path, 1)
+    path = tmp_path / "logs" / "sensor.log"
+    path.unlink()
+    if log is not None:
+        path.write_text(log)
+    assert run.verdict() == (ExitStatus.FAILED, f"sensor: {why}")
+
+
+def test_a_process_that_says_that_it_ends_is_judged_by_its_exit_status(
+    content: dict[str, Any], tmp_path: Path
+) -> None:
+    class Leaving(Barrier):
+        def is_leaving(self, role: str) -> bool:
+            return role == "sensor"
+
+        def gone(self) -> dict[str, str]:
+            return {"sensor": "sensor ended early: no room"}
+
+    run = Run(content, tmp_path, 0)
+    run._children["sensor"] = cast(Any, Child())
+    assert run._trouble(cast(Any, Leaving(0.5))) is None
+    run._children["sensor"] = cast(Any, Child(2))
+    assert run._trouble(cast(Any, Leaving(0.5))) == (ExitStatus.CALLER, "sensor: no room")
 
 
 def test_after_the_horizon_there_is_nothing_to_take_up(
@@ -143,5 +187,6 @@ def test_an_account_that_comes_with_the_end_is_told(
     told: list[Any] = []
     run = Run(content, tmp_path, 0)
     run._watcher = Watcher(progress=told.append)
-    assert run.watch(cast(Any, Ending(1.0)), Signals())[0] is ExitStatus.OK
+    found = run.watch(cast(Any, Ending(1.0)), Signals(), lambda status, reason: None)
+    assert found[0] is ExitStatus.OK
     assert told == [{"void": ["late"]}]

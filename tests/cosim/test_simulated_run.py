@@ -42,7 +42,7 @@ def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
     run_dir = runs / "latest"
     assert {path.name for path in run_dir.iterdir()} == {
         "scenario.toml", "environment.json", "record", "recording.rrd", "reports.json",
-        "summary.json", "report.html", "logs", ".lock",
+        "summary.json", "report.html", "ending.json", "logs", ".lock",
     }  # fmt: skip
     assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
     assert {path.name for path in (run_dir / "record").iterdir()} == {

@@ -64,6 +64,7 @@ class FakePlane:
     """What the recorder and the coordinator use of the plane, and of its session."""
 
     def __init__(self) -> None:
+        self.is_closed = False
         self.session = self
         self.instance = "fake"
         self.answers: list[Any] = []
@@ -71,6 +72,12 @@ class FakePlane:
         self.kept: dict[str, Any] = {}
         """What each process was told last that is on disk."""
         self._channels: dict[str, _Channel] = {}
+
+    def __enter__(self) -> "FakePlane":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.is_closed = True
 
     def key(self, *parts: str) -> str:
         return "/".join(parts)
@@ -95,6 +102,9 @@ class FakePlane:
 
     def refuse(self, query: Query, reason: str) -> None:
         query.reply_err(reason)
+
+    def dismiss(self, query: Query) -> None:
+        query.drop()
 
     def announce(self, content: Any) -> None:
         self.announced.append(json.loads(json.dumps(content)))

@@ -73,7 +73,7 @@ def test_the_loop_outlives_the_coordinator(start: Start, by_hand: ByHand, tmp_pa
     assert recording.left_behind() == []
     outcome = reopen(run_dir)
     assert outcome.status == 1
-    assert outcome.reason == "the launcher did not live to see the end"
+    assert outcome.reason == "the launcher ended early"
     assert outcome.summary["reached_s"] == 12.0
     assert outcome.summary["missing_samples"] == 0
     replay = outcome.summary["replay"]

@@ -95,16 +95,18 @@ def test_a_disk_that_fills_up(
     stdout, stderr = running.process.communicate(timeout=PATIENCE_S)
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
     assert running.process.returncode == 1
-    assert len(lines) == 1, stderr
-    assert str(run_dir / "record") in lines[0]
-    assert "No space left on device" in lines[0]
-    assert f"kept in {run_dir / 'spool'}" in lines[0]
+    reason = f"recorder: {run_dir / 'spool'}: the record cannot be written: No space left on device"
+    assert lines[0] == f"noack: the run failed: {reason}"
+    assert lines[1].startswith(f"noack: {run_dir / 'record'}: the record cannot be written: No spa")
+    assert f"kept in {run_dir / 'spool'}" in lines[1]
+    assert len(lines) == 2, stderr
     assert "No space left on device" in stdout  # as JSON
     assert running.left_behind() == []
     spooled = {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()}
 
-    with pytest.raises(MachineError, match=f"^{run_dir}.*: No space left on device;[^\n]*$"):
+    with pytest.raises(MachineError) as refused:
         reopen(run_dir)
+    assert str(refused.value).splitlines() == [line.removeprefix("noack: ") for line in lines]
     assert {path.name: path.stat().st_size for path in (run_dir / "spool").iterdir()} == spooled
 
     small.empty()
@@ -119,16 +121,20 @@ def test_a_disk_that_fills_up(
     assert not (run_dir / "spool").exists()
     assert (run_dir / "report.html").stat().st_size > 100_000
 
-    missing = json.loads((run_dir / "summary.json").read_text())["missing_samples"]
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["exit"] == {"status": 1, "reason": reason}
+    assert reason in (run_dir / "report.html").read_text()
+    missing = summary["missing_samples"]
     # Full again, before the summary is written; and before the report is.
     for path in (run_dir / "summary.json", run_dir / "report.html"):
         path.unlink()
     small.fill()
-    line = f"^{run_dir / 'summary.json'}: cannot be written: No space left on device;[^\n]*$"
+    line = f"\n{run_dir / 'summary.json'}: cannot be written: No space left on device;[^\n]*$"
     with pytest.raises(MachineError, match=line):
         reopen(run_dir)
     small.fill(but_bytes=1 << 16)
-    assert reopen(run_dir).summary["missing_samples"] == missing
+    again = reopen(run_dir)
+    assert (again.reason, again.summary["missing_samples"]) == (reason, missing)
     warning = capsys.readouterr().err
     assert warning.startswith(f"noack: warning: no report.html: {run_dir}")
     assert warning.endswith("No space left on device\n")
@@ -155,12 +161,17 @@ def test_a_folder_that_becomes_read_only(start: Start, small: Disk) -> None:
         _, stderr = running.process.communicate(timeout=PATIENCE_S)
         assert running.process.returncode == 1
         lines = [line for line in stderr.splitlines() if line.startswith("noack")]
-        assert len(lines) == 1, stderr
-        assert f"{run_dir}: the run cannot be written: Read-only file system" in lines[0]
+        why = f"{run_dir / 'reports.json'}: cannot be written: Read-only file system"
+        assert lines == [
+            f"noack: the run failed: recorder: {why}",
+            f"noack: {run_dir}: the run cannot be written: Read-only file system",
+        ]
         assert running.left_behind() == []
     finally:
         subprocess.run(["umount", "--lazy", str(small.path)], check=True)
     assert noack("summary", str(run_dir)).returncode == 0
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["exit"] == {"status": 1, "reason": f"recorder: {why}"}
     steps = load_record(run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(16 * RATE_HZ + 1))
 
@@ -173,6 +184,6 @@ def test_a_folder_that_is_removed(start: Start) -> None:
     _, stderr = running.process.communicate(timeout=PATIENCE_S)
     assert running.process.returncode == 1
     lines = [line for line in stderr.splitlines() if line.startswith("noack")]
-    assert len(lines) == 1, stderr
-    assert f"{run_dir}: the run cannot be written: No such file or directory" in lines[0]
+    assert lines[0].startswith(f"noack: the run failed: recorder: {run_dir}"), stderr
+    assert lines[1:] == [f"noack: {run_dir}: the run cannot be written: No such file or directory"]
     assert running.left_behind() == []

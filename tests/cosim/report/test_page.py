@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cosim import conclude as concluding
 from cosim.cli import app
-from cosim.launch import Ending
+from cosim.ending import Ending
 from cosim.record import RunRecord
 from cosim.replay.result import difference
 from cosim.report import write
@@ -377,7 +377,7 @@ def test_the_command_writes_the_report_anew(dead_run: Path) -> None:
     path = dead_run / REPORT_FILE
     assert json.loads(ran.stdout) == {"report": str(path)}
     page = Page(path.read_text(encoding="utf-8"))
-    assert "the launcher did not live to see the end" in page.text
+    assert "the launcher ended early" in page.text
     path.unlink()
     ran = CliRunner().invoke(app, ["report", str(dead_run)])
     assert ran.stdout.strip() == str(path)

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from cosim.conclude import Outcome, reopen
+from cosim.ending import Ending
 from cosim.environment import changed_since, environment
-from cosim.launch import Ending
 from cosim.record import finish_record, load_record, write_record
 from cosim.replay import replay
 from cosim.run_dir import ENVIRONMENT_FILE, RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE

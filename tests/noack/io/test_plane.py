@@ -1,24 +1,28 @@
 """The control plane's door: who has the run's key comes in, over loopback, and nobody else."""
 
 import hashlib
+import json
 import re
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import psutil
 import pytest
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-import noack
+import noack.io.plane
+import noack.io.process
 from cosim.coordinator import Coordinator
-from noack.errors import PeerError
+from noack.errors import NoAnswerError, PeerError
 from noack.io.messages import Admission, Begin, Missing, heard
 from noack.io.node import Node
 from noack.io.plane import Plane, secret_of
+from noack.io.process import _admitted
 from noack.io.signals import Signals
 from noack.io.star import Secret, open_star, star_config
 from noack.io.ticket import Ticket, new_ticket
@@ -26,6 +30,7 @@ from noack.io.udp import free_tcp_port
 from noack.resolve import resolve
 from noack.scenario_file import validate
 from noack.topology import COORDINATOR, LOOP_ROLES
+from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for
 
 HELLO = '{"pid": 1, "instance": "evil", "address": ["127.0.0.1", 9]}'
@@ -240,6 +245,58 @@ def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticke
         told = heard(Begin, plant.request("ask", {}, timeout_s=30))
     assert told["epoch_ns"] == 7
     assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+
+
+def test_a_question_whose_answer_was_lost_is_asked_again(
+    coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noack.io.plane, "_ASK_AGAIN_S", 0.2)
+    queries = coordinator.plane.session.declare_queryable(
+        coordinator.plane.key("ask", "*"), FifoChannel(4)
+    )
+    kept = []
+
+    def serve() -> None:
+        kept.append(queries.recv())
+        Plane.answer(queries.recv(), "heard")
+
+    threading.Thread(target=serve, daemon=True).start()
+    with Plane(ticket, "plant") as plant:
+        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "heard"
+    kept.clear()
+
+
+@pytest.mark.parametrize("launched", [True, False])
+def test_a_launched_process_connects_anew_until_it_is_let_in(
+    ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
+) -> None:
+    """A connection over which nothing is answered stays so; a person is told of it instead."""
+    tries: list[FakePlane] = []
+
+    class Silent(FakePlane):
+        def __init__(self, _ticket: Ticket, role: str) -> None:
+            super().__init__()
+            tries.append(self)
+            if len(tries) == 1:
+                raise NoAnswerError("cannot reach the run's coordinator")
+
+        def request(self, what: str, *_: object, **__: object) -> bytes:
+            if len(tries) < 3:
+                raise NoAnswerError(f"no answer to {what!r}")
+            address = after = None
+            return json.dumps({
+                "incarnation": 0, "admitted_ns": 0, "from_ns": 0, "address": address, "after": after
+            }).encode()  # fmt: skip
+
+    monkeypatch.setattr(noack.io.process, "Plane", Silent)
+    monkeypatch.setattr(noack.io.process, "lifeline_cut", lambda: False)
+    asking = partial(_admitted, "plant", ticket._replace(launched=launched), Signals())
+    if launched:
+        assert asking().plane is cast(Any, tries[2])
+        assert [one.is_closed for one in tries] == [False, True, False]
+    else:
+        with pytest.raises(NoAnswerError, match="cannot reach"):
+            asking()
 
 
 def meet(plane: Plane) -> None:

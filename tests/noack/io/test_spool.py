@@ -100,7 +100,7 @@ def test_a_disk_that_fills_up_is_told_by_the_batch_it_cuts_short(tmp_path: Path)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # as if the disk had 34 bytes left
     try:
-        with pytest.raises(MachineError, match="the record cannot be written"):
+        with pytest.raises(MachineError, match=r"the record cannot be written: File too large$"):
             writer.append("step", 100, bytes(100))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -142,3 +142,9 @@ def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> No
     path.unlink()
     assert list(tail.read()) == [("plant_step", 3, b"de")]
     tail.close()
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "spool").write_text("")
+    with pytest.raises(MachineError, match=r"spool: the record cannot be written: File exists$"):
+        SpoolWriter(tmp_path / "spool", "recorder")

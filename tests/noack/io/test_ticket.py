@@ -1,13 +1,16 @@
-"""Tickets: what is one, and that what is none keeps the key to itself."""
+"""Tickets: what is one, that what is none keeps the key to itself, and one a session."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import pytest
 
 from noack.errors import CallerError
-from noack.io.ticket import loads, new_ticket
+from noack.io.ticket import loads, new_ticket, published, ticket_path
 from noack.resolve import resolve
 from noack.scenario_file import validate
 
@@ -53,3 +56,32 @@ def test_neither_is_other_text(text: str) -> None:
     with pytest.raises(CallerError) as caught:
         loads(text)
     assert KEY[:8] not in str(caught.value)
+
+
+@pytest.mark.parametrize("left_behind", [False, True])
+def test_of_many_who_open_a_session_at_once_one_succeeds(
+    fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    ticket, at_once = loads(json.dumps(fields)), 8
+    together = Barrier(at_once)
+    if left_behind:  # by one that was killed
+        with published(ticket, "lab") as path:
+            text = path.read_text()
+        path.write_text(text)
+
+    def opened(number: int, stack: ExitStack) -> str:
+        together.wait()
+        try:
+            stack.enter_context(published(ticket._replace(run_id=number), "lab"))
+        except CallerError as error:
+            return str(error)
+        return ""
+
+    with ExitStack() as stack, ThreadPoolExecutor(at_once) as pool:
+        errors = list(pool.map(lambda number: opened(number, stack), range(at_once)))
+        winner = errors.index("")
+        refusal = "session 'lab': another run is open in it; choose --session NAME"
+        assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
+        assert loads(ticket_path("lab").read_text()).run_id == winner
+    assert list(ticket_path("lab").parent.iterdir()) == []
