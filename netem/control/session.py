@@ -29,6 +29,7 @@ class Session(NamedTuple):
 
 _SESSION = TypeAdapter(Session)
 _KIND = "netem"
+_STARTING = "netem_starting"
 
 
 def _path_of(name: str) -> Path:
@@ -58,10 +59,32 @@ def published(session: Session) -> Iterator[Path]:
         try:
             stack.enter_context(held.held(path, session._asdict()))
         except FileExistsError:
-            raise CallerError(
-                f"--control {session.name}: an emulator of this name runs; choose another name"
-            ) from None
+            raise _in_use(session.name) from None
         yield path
+
+
+@contextmanager
+def starting(name: str | None) -> Iterator[None]:
+    """Let others see that an emulator starts, which may take long; None: nobody can reach it.
+
+    Raises:
+        CallerError: the name is unfit or in use, or the folder is not the user's own.
+    """
+    with ExitStack() as stack:
+        if name is not None:
+            file = _path_of(name).name
+            path = held.make_folder(_STARTING) / file
+            try:
+                stack.enter_context(held.held(path, {}))
+            except FileExistsError:
+                raise _in_use(name) from None
+            if name in running():
+                raise _in_use(name)
+        yield
+
+
+def _in_use(name: str) -> CallerError:
+    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
 
 
 def running() -> list[str]:
@@ -78,9 +101,15 @@ def find(name: str | None) -> Session:
 
     Raises:
         CallerError: there is no such emulator, or there are several to choose from.
-        PeerError: its session file cannot be read.
+        PeerError: it is still starting, or its session file cannot be read.
     """
     names = running()
+    begun = [path.stem for path in held.running(_STARTING)]
+    if name not in names and (name in begun or (name is None and begun and not names)):
+        raise PeerError(
+            f"emulator {name or begun[0]!r} is starting; its first start compiles for some time, "
+            "and it says `ready` on its standard output when it can be reached"
+        )
     if not names:
         raise CallerError(
             ("no emulator" if name is None else f"no emulator {name!r}")
