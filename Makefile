@@ -96,7 +96,7 @@ netem: setup ## The network: loses packets, at most M - 1 in a row
 
 ##@ Work on noack
 .PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
-setup: $(VENV)/.installed ## Make the environment in .venv (the other targets do it by themselves)
+setup: $(VENV)/.installed $(if $(filter setup,$(MAKECMDGOALS)),$(VENV)/.compiled) ## Make the environment in .venv (the other targets do it by themselves)
 
 setup-dev: $(VENV)/.installed-dev
 
@@ -167,6 +167,12 @@ $(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@echo "installing pinned dependencies ..."
 	@$(PIP) -r requirements.lock
 	@$(EDITABLE)
+	@touch $@
+
+# For `make setup` alone: a run of the loop needs none of it, and the first start would compile it, too.
+COMPILED := netem/*.py netem/rules/*.py netem/engine/*.py netem/engine/pump/*.py netem/capture/*.py
+$(VENV)/.compiled: $(VENV)/.installed $(wildcard $(COMPILED))
+	@$(BIN)/noack netem --compile
 	@touch $@
 
 $(VENV)/.installed-dev: requirements-dev.lock $(VENV)/.installed

@@ -64,7 +64,8 @@ def totals_of(stdout: str) -> Totals:
         MeasurementError: it is not what was expected.
     """
     try:
-        forward = json.loads(stdout)["links"][0]["forward"]
+        _, _, totals = stdout.partition("\n")  # the first line says that it is ready
+        forward = json.loads(totals)["links"][0]["forward"]
         return Totals(
             arrived=forward["arrived"],
             forwarded=forward["forwarded"],

@@ -19,6 +19,7 @@ Source: draft-ietf-opsawg-pcapng.
 import platform
 import struct
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 
@@ -33,13 +34,14 @@ from netem.capture.packets import (
     blocks_bytes,
     put_blocks,
 )
+from netem.compiling import announced
 from netem.events import EVENT
-from netem.say import say
-from noack.io.code_cache import is_kept, while_compiling
+from noack.io.code_cache import is_kept
 
 SNAP_BYTES = 262_144
 """Payload bytes captured of a datagram unless told otherwise: all."""
 
+_COMPILING_S = 10.0
 _LINKTYPE_RAW = 101
 _SECTION, _INTERFACE, _STATISTICS = 0x0A0D0D0A, 1, 5
 _HARDWARE, _OS, _APPLICATION = 2, 3, 4
@@ -76,9 +78,9 @@ class Section:
         self._start_ns = 0
         self._end_ns = 0
         self._out = np.empty(0, np.uint8)
-        if not is_kept(FOLDER, put_blocks):
-            say(while_compiling("the capture", kept=FOLDER is not None))
-        self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
+        kept = is_kept(FOLDER, put_blocks)
+        with nullcontext() if kept else announced("the capture", FOLDER, _COMPILING_S):
+            self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
 
     def header(self) -> bytes:
         """Return the section header and the interfaces' descriptions."""

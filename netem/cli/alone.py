@@ -25,6 +25,9 @@ def alone(arguments: Sequence[str]) -> ExitStatus:
     parser = command_line.parser()
     relaying.add_options(parser)
     options = command_line.parsed(parser, arguments)
+    if options.compile:
+        relaying.compile_all()
+        return ExitStatus.OK
     specs = command_line.specs_of(options)
     if options.explain:
         explain(specs, as_json=options.json, as_file=options.links is None)

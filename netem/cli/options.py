@@ -53,6 +53,11 @@ while one runs with --control NAME (each has --help):
   noack netem set [NAME] WORDS    what it does from now on
   noack netem watch [NAME]        live
 
+When it is ready, it prints a line on standard output: ready: listening on 127.0.0.1:9000
+
+exit status: 0 it ended as asked; 1 something failed; 2 the command line or a file is wrong;
+3 there were unintended losses (a full buffer or queue), so that the guarantee does not hold
+
 examples:
   noack netem --listen :9000 --to :9001 loss 5% mansd 4
   noack netem --listen :9000 --to :9001 delay 10ms 2ms distribution normal --back delay 10ms

@@ -1,15 +1,20 @@
 """Runs a relay, with all that watches it at its side."""
 
 import argparse
+import json
+import os
+import sys
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from netem.control import attach
+from netem.control.session import starting
 from netem.control.statistics import Statistics, statistics
 from netem.engine.api import DIRECTIONS, Direction, LinkSpec, Relay, Tap
-from netem.engine.start import open_relay
+from netem.engine.start import compiled_engine_is_missing, open_relay
 from netem.fates.recorder import FateRecorder
 from netem.fates.replay import read_fates
 from netem.say import say
@@ -40,6 +45,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="ask for SCHED_FIFO, locked memory, no deep idle states, each where permitted; and "
         "stay awake for the last 50 µs before a delayed datagram is due",
     )  # fmt: skip
+    group.add_argument(
+        "--compile", action="store_true",
+        help="compile for this machine what the first start would, and end",
+    )  # fmt: skip
     group = parser.add_argument_group("what it records")
     group.add_argument(
         "--capture", metavar="FILE.pcapng",
@@ -54,6 +63,20 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "cap is kept, unless mansd says another, whenever they come",
     )  # fmt: skip
     attach.add_options(parser)
+
+
+def compile_all() -> None:
+    """Compile what the fast engine and captures need, and say how long it took."""
+    if missing := compiled_engine_is_missing():
+        say(f"nothing is compiled here: the batched engine {missing}")
+        return
+    began_s = time.monotonic()
+    from netem.capture.pcapng import Section
+    from netem.engine.batched import load
+
+    load()
+    Section(())
+    say(f"all is compiled ({time.monotonic() - began_s:.1f} s)")
 
 
 def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
@@ -73,16 +96,19 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
     if options.replay_fates is not None:
         specs = _replaying(specs, options.replay_fates)
     with ExitStack() as last, ExitStack() as stack:
-        taps = _taps(specs, options, stack)
-        opened = open_relay(
-            specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
-        )
-        stack.callback(opened.close)
-        # Until all files are complete.
-        signals = last.enter_context(Signals().handled())
-        side = stack.enter_context(attach.attached(opened, side_options))
+        with starting(side_options.name):
+            taps = _taps(specs, options, stack)
+            opened = open_relay(
+                specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
+            )
+            stack.callback(opened.close)
+            # Until all files are complete.
+            signals = last.enter_context(Signals().handled())
+            side = stack.enter_context(attach.attached(opened, side_options))
         stack.enter_context(_in_realtime(options.realtime))
         _say_ready(opened)
+        if options.capture != "-" and not side_options.takes_output:
+            _print_ready(opened, as_json=options.json)
         opened.run(lambda: side.left or signals.received is not None, side.housekeeping)
         return statistics(side.look())
 
@@ -156,6 +182,21 @@ def _say_ready(opened: Relay) -> None:
         name = f" ({spec.name})" if len(opened.specs) > 1 else ""
         where = f"{text_of(addresses[spec.name])} → {text_of(spec.to)}{name}"
         say(f"{where}, Ctrl-C ends")
+
+
+def _print_ready(opened: Relay, *, as_json: bool) -> None:
+    """On standard output, for programs that wait for this line."""
+    addresses = opened.addresses()
+    line = f"ready: listening on {', '.join(map(text_of, addresses.values()))}"
+    if as_json:
+        links = [
+            {"name": spec.name, "listen": text_of(addresses[spec.name]), "to": text_of(spec.to)}
+            for spec in opened.specs
+        ]
+        line = json.dumps({"ready": links})
+    if sys.stdout is not None:
+        with suppress(OSError, ValueError):  # nobody reads it; the emulator goes on
+            os.write(sys.stdout.fileno(), f"{line}\n".encode())
 
 
 @contextmanager

@@ -37,6 +37,11 @@ class Options(NamedTuple):
     view: bool = False
     """Show it in the terminal."""
 
+    @property
+    def takes_output(self) -> bool:
+        """Whether the standard output is a view's, or of lines of statistics."""
+        return self.view or (self.stats_s is not None and self.stats_file is None)
+
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options on watching a relay to a command line."""

@@ -29,6 +29,7 @@ class Session(NamedTuple):
 
 _SESSION = TypeAdapter(Session)
 _KIND = "netem"
+_STARTING = "netem_starting"
 
 
 @contextmanager
@@ -43,10 +44,31 @@ def published(session: Session) -> Iterator[Path]:
         try:
             path = stack.enter_context(held.held(_KIND, session.name, session._asdict()))
         except FileExistsError:
-            raise CallerError(
-                f"--control {session.name}: an emulator of this name runs; choose another name"
-            ) from None
+            raise _in_use(session.name) from None
         yield path
+
+
+@contextmanager
+def starting(name: str | None) -> Iterator[None]:
+    """Let others see that an emulator starts, which may take long; None: nobody can reach it.
+
+    Raises:
+        CallerError: the name is unfit or in use, or the folder is not the user's own.
+    """
+    with ExitStack() as stack:
+        if name is not None:
+            require_name(name, "emulator")
+            try:
+                stack.enter_context(held.held(_STARTING, name, {}))
+            except FileExistsError:
+                raise _in_use(name) from None
+            if name in running():
+                raise _in_use(name)
+        yield
+
+
+def _in_use(name: str) -> CallerError:
+    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
 
 
 def running() -> list[str]:
@@ -63,9 +85,15 @@ def find(name: str | None) -> Session:
 
     Raises:
         CallerError: there is no such emulator, or there are several to choose from.
-        PeerError: its session file cannot be read.
+        PeerError: it is still starting, or its session file cannot be read.
     """
     files = _files()
+    begun = [file.path.stem for file in held.running(_STARTING)]
+    if name not in files and (name in begun or (name is None and begun and not files)):
+        raise PeerError(
+            f"emulator {name or begun[0]!r} is starting; its first start compiles for some time, "
+            "and it says `ready` on its standard output when it can be reached"
+        )
     if not files:
         raise CallerError(
             ("no emulator" if name is None else f"no emulator {name!r}")

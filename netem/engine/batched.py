@@ -3,11 +3,12 @@
 import ctypes
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from functools import cache
 
 import numpy as np
 
+from netem.compiling import announced
 from netem.engine.api import (
     DIRECTIONS,
     Address,
@@ -19,9 +20,10 @@ from netem.engine.api import (
     Tap,
 )
 from netem.engine.clients import Clients
+from netem.engine.compiled import folder
 from netem.engine.directions import Way
 from netem.engine.epoll import Epoll
-from netem.engine.functions import functions
+from netem.engine.functions import are_kept, functions
 from netem.engine.losses import Losses
 from netem.engine.memory import PumpMemory
 from netem.engine.names import name_of
@@ -44,6 +46,7 @@ from noack.io.udp import LOOPBACK, drops_of
 
 _PERIOD_NS = 20_000_000
 _RARELY_NS = 250_000_000
+_COMPILING_S = 15.0
 _LONG_AGO_NS = -(2**62)
 _REPORTED_FLOWS = 16
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30
@@ -309,5 +312,6 @@ def load() -> None:
     """Load or compile all that is compiled, once; what came to an open port would wait for it."""
     nothing = LinkSettings()
     spec = LinkSpec("none", (LOOPBACK, 0), (LOOPBACK, 9), nothing, nothing)
-    with closing(BatchedRelay([spec])) as relay:
+    told = nullcontext() if are_kept() else announced("the relay", folder(), _COMPILING_S)
+    with told, closing(BatchedRelay([spec])) as relay:
         relay.call_all()

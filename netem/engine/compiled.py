@@ -124,9 +124,9 @@ def is_kept(function: Callable[..., Any]) -> bool:
     return code_cache.is_kept(_prepare(), function)
 
 
-def keeps() -> bool:
-    """Whether what is compiled is kept for the next run."""
-    return _prepare() is not None
+def folder() -> Path | None:
+    """Where what is compiled is kept for the next run, if it is."""
+    return _prepare()
 
 
 @cache

@@ -4,12 +4,12 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from netem.engine.compiled import compile_rule, is_kept, keeps
+from netem.engine.compiled import compile_rule, is_kept
 from netem.engine.pump.clients import insert, remove
 from netem.engine.pump.pump import run_pump
 from netem.rules.change import carry
-from netem.say import say
-from noack.io.code_cache import while_compiling
+
+_SOURCES: Any = (run_pump, insert, remove, carry)
 
 
 class Functions(NamedTuple):
@@ -23,8 +23,10 @@ class Functions(NamedTuple):
 
 @cache
 def functions() -> Functions:
-    """Return them; say so if they have to be compiled, which takes a while."""
-    sources: Any = (run_pump, insert, remove, carry)
-    if not all(map(is_kept, sources)):
-        say(while_compiling("the relay", keeps()))
-    return Functions(*map(compile_rule, sources))
+    """Return them; each is compiled, or loaded, when it is first called."""
+    return Functions(*map(compile_rule, _SOURCES))
+
+
+def are_kept() -> bool:
+    """Whether all have been compiled before, for this machine."""
+    return all(map(is_kept, _SOURCES))

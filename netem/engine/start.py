@@ -36,7 +36,7 @@ def open_relay(
         CallerError: a socket cannot be bound, a link makes no sense, or the engine is not to be had
             here.
     """
-    missing = _missing()
+    missing = compiled_engine_is_missing()
     if engine == "batched" and missing:
         raise CallerError(f"the batched engine {missing}; use the plain one")
     if engine == "plain" or missing:
@@ -47,7 +47,7 @@ def open_relay(
     return BatchedRelay(specs, segment, taps, spin_ns)
 
 
-def _missing() -> str:
+def compiled_engine_is_missing() -> str:
     """Why there is no fast engine; empty if there is."""
     if (
         sys.platform != "linux"

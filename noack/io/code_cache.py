@@ -91,10 +91,11 @@ def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
     return folder is not None and any(folder.rglob(f"*.{function.__name__}-*.nbi"))
 
 
-def while_compiling(what: str, kept: bool) -> str:
+def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
     """What a waiting person should know about what takes so long."""
     once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
-    return f"compiling {what} for this machine, {once} ..."
+    time = " ..." if about_s is None else f"; this takes about {about_s:.0f} s"
+    return f"compiling {what} for this machine, {once}{time}"
 
 
 def _forget_old(folder: Path, name: str) -> None:

@@ -279,7 +279,7 @@ def test_totals_that_are_not_there_are_an_error() -> None:
         "arrived": 9, "forwarded": 8, "longest_run": 1, "unintended": {"lost_in_kernel": 0},
     }  # fmt: skip
     text = json.dumps({"links": [{"forward": forward}], "more": 1})
-    assert totals_of(text) == Totals(9, 8, 1, 0)
+    assert totals_of(f'{{"ready": []}}\n{text}') == Totals(9, 8, 1, 0)
     with pytest.raises(MeasurementError, match="cannot be read"):
         totals_of("{}")
     with pytest.raises(MeasurementError, match="cannot be read"):

@@ -1,6 +1,7 @@
 """The network emulator on its own, as a person runs it."""
 
 import json
+import os
 import re
 import signal
 import socket
@@ -13,6 +14,8 @@ from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+
+from noack.errors import ExitStatus
 
 COMMAND = [sys.executable, "-m", "netem"]
 
@@ -62,8 +65,15 @@ def client(family: int = socket.AF_INET) -> Iterator[socket.socket]:
 
 
 def forward_of(stdout: str) -> Any:
-    (link,) = json.loads(stdout)["links"]
+    (link,) = totals_of(stdout)["links"]
     return link["forward"]
+
+
+def totals_of(stdout: str) -> Any:
+    """What is printed with ``--json`` after the line that says that it is ready."""
+    ready, _, totals = stdout.partition("\n")
+    assert json.loads(ready).keys() == {"ready"}
+    return json.loads(totals)
 
 
 @pytest.mark.parametrize("engine", ["batched", "plain"])
@@ -127,7 +137,7 @@ def test_several_links_come_from_a_file(tmp_path: Path) -> None:
             here.sendto(b"second of the first", ("127.0.0.1", ports[0]))
             assert there.recv(100) == b"second of the first"
             stdout, _ = ended(process)
-    assert [link["name"] for link in json.loads(stdout)["links"]] == ["first", "second"]
+    assert [link["name"] for link in totals_of(stdout)["links"]] == ["first", "second"]
 
 
 def test_fates_are_recorded_and_taken_again(tmp_path: Path) -> None:
@@ -183,3 +193,79 @@ def test_a_taken_port_is_told(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"noack netem: link relay: UDP port {taken} is already taken")
     assert done.stderr.count("\n") == 1
+
+
+def waiting(*arguments: str, **more: Any) -> subprocess.Popen[str]:
+    """An emulator whose standard output is a pipe."""
+    command = [*COMMAND, "--listen", ":0", *arguments]
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **more
+    )
+
+
+@pytest.mark.parametrize("engine", ["batched", "plain"])
+def test_a_script_can_wait_for_it(engine: str) -> None:
+    """For a line through a pipe, after which what it sends is not lost."""
+    with (
+        server() as (there, to),
+        client() as here,
+        waiting("--to", to, "--engine", engine) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            ready = process.stdout.readline()
+            found = re.fullmatch(r"ready: listening on 127\.0\.0\.1:(\d+)\n", ready)
+            assert found, ready
+            here.sendto(b"at once", ("127.0.0.1", int(found[1])))
+            assert there.recv(100) == b"at once"
+            stdout, _ = ended(process)
+        finally:
+            process.kill()
+    assert stdout == ""
+
+
+def test_while_it_compiles_it_is_starting_and_says_how_long(tmp_path: Path) -> None:
+    """An empty cache; show names the state, and the next start knows how long this one took."""
+    environment = os.environ | {
+        "XDG_CACHE_HOME": str(tmp_path / "cache"), "XDG_RUNTIME_DIR": str(tmp_path),
+    }  # fmt: skip
+
+    def show() -> str:
+        done = subprocess.run(
+            [*COMMAND, "show"], env=environment, capture_output=True, text=True, check=False
+        )
+        return done.stdout + done.stderr
+
+    with waiting("--to", ":9", "--control", "lab", env=environment) as process:
+        try:
+            assert process.stderr is not None
+            assert process.stdout is not None
+            said = process.stderr.readline()
+            assert said.startswith("noack netem: compiling the relay for this machine, once; ")
+            assert "this takes about 15 s" in said
+            os.kill(process.pid, signal.SIGSTOP)
+            assert "emulator 'lab' is starting" in show()
+            os.kill(process.pid, signal.SIGCONT)
+            assert process.stdout.readline().startswith("ready: ")
+            assert "noack netem lab" in show()
+            ended(process)
+        finally:
+            process.kill()
+    (record,) = (tmp_path / "cache" / "noack").glob("netem.seconds")
+    assert float(record.read_text()) > 0
+
+
+def test_losses_of_its_own_have_an_exit_status_of_their_own() -> None:
+    """The kernel's buffer overflows while it stands still."""
+    with (
+        client() as here,
+        emulator("--listen", ":0", "--to", ":9", "mansd", "2") as (process, [port]),
+    ):
+        os.kill(process.pid, signal.SIGSTOP)
+        for _ in range(30_000):
+            here.sendto(b"x", ("127.0.0.1", port))
+        os.kill(process.pid, signal.SIGCONT)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=60)
+    assert process.returncode == ExitStatus.UNINTENDED_LOSSES == 3
+    assert "the guarantee does not hold (exit status 3)" in stderr

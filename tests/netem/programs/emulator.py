@@ -46,18 +46,21 @@ class Emulator:
             ],
             cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert self._process.stderr is not None
-        said = self._process.stderr.readline()
-        assert "Ctrl-C ends" in said, said + self._process.communicate()[1]
-        self.host, _, port = said.removeprefix("noack netem: ").split(" → ")[0].rpartition(":")
+        assert self._process.stdout is not None
+        ready = self._process.stdout.readline()
+        assert ready, self._process.communicate()[1]
+        (link,) = json.loads(ready)["ready"]
+        self.host, _, port = link["listen"].rpartition(":")
         self.port = int(port)
 
     def finish(self) -> dict[str, Any]:
         """End it, which has lost nothing by itself; return what it says of its link."""
         link, status, stderr = self.end()
         assert status == 0, stderr
-        # A program may end with something on its way to it.
-        assert all("ICMP port unreachable" in line for line in stderr.splitlines()), stderr
+        for line in stderr.splitlines():
+            # A program may end with something on its way to it.
+            usual = ("compiling", "Ctrl-C ends", "ICMP port unreachable")
+            assert any(words in line for words in usual), stderr
         for direction in ("forward", "back"):
             assert not any(link[direction]["unintended"].values()), link[direction]["unintended"]
         return link
@@ -65,7 +68,7 @@ class Emulator:
     def end(self) -> tuple[dict[str, Any], int, str]:
         """End it; return what it says of its link, its exit status, and its standard error."""
         self._process.send_signal(signal.SIGINT)
-        stdout, stderr = self._process.communicate(timeout=30)
+        stdout, stderr = self._process.communicate(timeout=60)
         (link,) = json.loads(stdout)["links"]
         return dict(link), self._process.returncode, stderr
 
