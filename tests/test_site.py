@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image, ImageStat
 from typer.main import get_command
 
 from cosim.cli import app
@@ -42,6 +43,20 @@ def test_every_public_name_of_the_library_is_on_its_page(site: Path) -> None:
     text = (site / "api.html").read_text()
     for name in set(noack.__all__) - {"__version__"}:
         assert f'id="noack.{name}"' in text
+
+
+def test_pictures_are_as_light_as_the_page(site: Path) -> None:
+    readme = re.findall(r"!\[[^\]]*\]\(([^)]+\.png)\)", (ROOT / "README.md").read_text())
+    pictures = [*(site / "_images").glob("*.png"), *(ROOT / name for name in readme)]
+    assert len(pictures) > len(readme) > 0
+    for path in pictures:
+        with Image.open(path) as picture:
+            (median,) = ImageStat.Stat(picture.convert("L")).median
+        assert median > 230, path.name
+    for path in (site / "_images").glob("*.svg"):
+        background = re.search(r'id="patch_1".*?fill: (#\w+)', path.read_text(), re.DOTALL)
+        assert background is not None, path.name
+        assert background[1] in ("#fefefe", "#ffffff"), path.name
 
 
 def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
