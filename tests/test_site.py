@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image, ImageStat
 from typer.main import get_command
 
 from cosim.cli import app
@@ -57,6 +58,20 @@ def test_formulas_are_set_by_mathjax_of_the_site_itself(site: Path) -> None:
 def test_what_noack_does_not_do_is_said_and_linked() -> None:
     for page, link in (("README.md", "docs/limits.md"), ("docs/index.md", "limits.md")):
         assert f"]({link})" in (ROOT / page).read_text()
+
+
+def test_pictures_are_as_light_as_the_page(site: Path) -> None:
+    readme = re.findall(r"!\[[^\]]*\]\(([^)]+\.png)\)", (ROOT / "README.md").read_text())
+    pictures = [*(site / "_images").glob("*.png"), *(ROOT / name for name in readme)]
+    assert len(pictures) > len(readme) > 0
+    for path in pictures:
+        with Image.open(path) as picture:
+            (median,) = ImageStat.Stat(picture.convert("L")).median
+        assert median > 230, path.name
+    for path in (site / "_images").glob("*.svg"):
+        background = re.search(r'id="patch_1".*?fill: (#\w+)', path.read_text(), re.DOTALL)
+        assert background is not None, path.name
+        assert background[1] in ("#fefefe", "#ffffff"), path.name
 
 
 def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:

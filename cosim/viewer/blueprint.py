@@ -48,7 +48,6 @@ from cosim.palette import FORCED as FORCED_COLOUR
 from cosim.viewer.colour_key import ColourKey, input_colour
 from cosim.viewer.pictures.network import Diagram
 from cosim.viewer.pictures.picture import TIMELINE, Picture, panel
-from noack.clock import NS_PER_S
 
 ABOUT = "about"
 ERROR = "error/norm"
@@ -61,7 +60,8 @@ DROP = "drop"
 LOG = "log"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
-_TIME_MARGIN = 1.06
+_BEFORE, _AFTER = 0.02, 0.06
+"""Room beside the run on a time axis, as shares of its length."""
 _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
 """Id of rerun's own view that holds what linked views share."""
 
@@ -223,15 +223,14 @@ def _page(names: Sequence[str]) -> rrb.Container:
 
 
 def _common_time_axis(horizon_s: float) -> rrb.View:
-    """Give what all plots show at first: the whole run, and room for the number of the last tick.
+    """Give what all plots show at first: the whole run, with room for marks and tick labels.
 
     The viewer keeps the common range with a view of its own, which is known by its id.
     """
-    end_ns = round(_TIME_MARGIN * horizon_s * NS_PER_S)
-    whole_run = rr.TimeRange(
-        start=rr.TimeRangeBoundary.absolute(nanos=0),
-        end=rr.TimeRangeBoundary.absolute(nanos=end_ns),
+    start, end = (
+        rr.TimeRangeBoundary.absolute(seconds=share * horizon_s) for share in (-_BEFORE, 1 + _AFTER)
     )
+    whole_run = rr.TimeRange(start=start, end=end)
     view = rrb.TimeSeriesView(visible=False, axis_x=rrb.TimeAxis(view_range=whole_run))
     view.id = _GLOBAL_VIEW
     return view

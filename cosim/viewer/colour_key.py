@@ -22,11 +22,11 @@ from cosim.viewer.pictures.picture import Shape, label, lines
 COLOUR_KEY = "key"
 """What all entities of the key are below."""
 
-_WIDE, _HIGH = 18.0, 1.0
+_WIDE, _HIGH = 18.0, 1.2
 _MOST_IN_A_ROW = 6
 _HALF, _THICK = 0.7, 0.16
-_DIAMOND = ((0.0, 0.2), (0.2, 0.0), (0.0, -0.2), (-0.2, 0.0), (0.0, 0.2))
-_CROSS = ((-0.16, 0.16), (0.16, -0.16), (0.0, 0.0), (0.16, 0.16), (-0.16, -0.16))
+_DIAMOND = ((0.0, 0.3), (0.2, 0.1), (0.0, -0.1), (-0.2, 0.1), (0.0, 0.3))
+_CROSS = ((-0.16, 0.26), (0.16, -0.06), (0.0, 0.1), (0.16, 0.26), (-0.16, -0.06))
 _STROKE = ((-_HALF, 0.0), (_HALF, 0.0))
 _Entry = tuple[str, Colour, Sequence[tuple[float, float]]]
 """Name, colour, line of the sample."""
@@ -75,7 +75,7 @@ class ColourKey:
             origin=COLOUR_KEY,
             name="Colours",
             visual_bounds=rrb.VisualBounds2D(
-                x_range=[0.0, _WIDE], y_range=[-0.3, len(self._rows) * _HIGH]
+                x_range=[0.0, _WIDE], y_range=[-0.4, len(self._rows) * _HIGH]
             ),
         )
 
@@ -87,5 +87,5 @@ class ColourKey:
                 x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
                 moved = [(x + dx, y + dy) for dx, dy in sample]
                 found[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
-                found[f"{i}/{j}/name"] = label(name, (x, y - 0.12), colour)
+                found[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
         return found

@@ -3,15 +3,18 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rerun.chunk
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
 from cosim.environment import write_environment
+from cosim.join import join_all
 from cosim.record import RunRecord, load_record
 from cosim.simulated_run import simulate_run
 from cosim.viewer import blueprint
+from cosim.viewer.opening_time import opening_time_ns
 from cosim.virtual import Progress, simulate
 from noack.errors import MachineError
 from noack.records import tables
@@ -123,3 +126,13 @@ def test_an_older_run_directory_is_a_live_runs(runs: Path, tmp_path: Path) -> No
     assert load_record(folder).kind == "live"
     write_environment(folder, "simulated")
     assert load_record(folder).kind == "simulated"
+
+
+def test_the_view_opens_where_the_controller_errs_most(runs: Path) -> None:
+    run_dir = runs / "latest"
+    record = load_record(run_dir)
+    joined = join_all(record)
+    e_c = np.where(joined.since_delivery(record.scenario), joined.e_c_norm, -1.0)
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["sup_e_c_norm"] == e_c.max()
+    assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]

@@ -50,7 +50,7 @@ class Phase:
 
     def bounds(self) -> tuple[float, float, float, float]:
         """Both axes, and room for words on the right."""
-        return -1.25, 2.0, -1.25, 1.25
+        return -1.25, 2.8, -1.5, 1.25
 
     def scenery(self) -> Mapping[str, Shape]:
         """Axes with the values at their ends, three points, and who is who."""
@@ -79,7 +79,7 @@ class Phase:
                 )
             if self.trails:
                 found[f"{who}/trail"] = style(colour, width, order=order - 2)
-        return found | legend(1.5, 1.0, 0.17)
+        return found | legend(1.95, 1.0, 0.3)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
         """The three points, and the piece by which each trail grows."""

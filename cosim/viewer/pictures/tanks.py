@@ -63,7 +63,7 @@ class Tanks:
             found[f"number/{i + 1}"] = label(
                 f"tank {i + 1}", (left + _WIDE / 2, low + _HIGH), STILL
             )
-        return found | legend(-2.6, 4.1, 0.35)
+        return found | legend(-2.6, 4.1, 0.45)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
         """The levels, by what of each the sensor and the controller believe."""

@@ -213,7 +213,8 @@ def test_each_packet_is_seen_to_become_what_it_became() -> None:
 
 def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
     seen = rows_of(sent(Diagram(), PACKETS[:1], delay_s=0.8), [3 * S])
-    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if [8.8, 0.0] in shapes]
+    inside = [float(np.float32(8.8)), 0.0]
+    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if inside in shapes]
     assert min(waiting) == pytest.approx((0.5 + LEG_S) * S, abs=S / 50)
     assert max(waiting) == pytest.approx(1.3 * S, abs=S / 50)
 
@@ -244,5 +245,5 @@ def test_acknowledgements_go_back() -> None:
         shapes[0][0] for t_ns, shapes in sorted(seen["acknowledgement"].items())
         if shapes and t_ns < 1.5 * S
     ]  # fmt: skip
-    assert first > 8.5
-    assert last < 5.5
+    assert first > 10.5
+    assert last < 6.5
