@@ -26,7 +26,7 @@ from noack.machine import INCARNATION, RESTART
 from noack.records import OWNER
 from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
-from noack.scenario_file import load
+from noack.scenario_file import MOST_RECORDED_BYTES, load
 from noack.topology import LOOP_ROLES, RECORDER
 from noack.wire import VERSION, Flow, read_header
 
@@ -153,7 +153,7 @@ def load_record(run_dir: Path) -> RunRecord:
         raise CallerError(
             f"{run_dir}: has no numeric record; `noack summary` finishes a run that was cut short"
         )
-    scenario = load(run_dir / SCENARIO_FILE)
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     rows = {
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables_of(scenario).items()
@@ -184,7 +184,7 @@ def finish_record(run_dir: Path) -> RunRecord:
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
-    scenario = load(run_dir / SCENARIO_FILE)
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     spool, folder = run_dir / SPOOL, run_dir / RECORD
     rows = {
         table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)

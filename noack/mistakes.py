@@ -19,26 +19,29 @@ _PATTERNS = {
     r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
     "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
+_MOST_LINES = 50
 _REMEDIES = {
     "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",
 }
 
 
 def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
-    """Return one line per mistake.
+    """Return one line per mistake, and one for all beyond the first fifty.
 
     Args:
         error: what the validation raised.
         source: names the file.
         root: the model that the whole file was validated against.
     """
-    mistakes = error.errors()
+    mistakes = error.errors(include_url=False)
     places = [mistake["loc"] for mistake in mistakes]
-    return [
+    shown = [
         printable(f"{source}: {_explain(mistake, root)}")
-        for mistake in mistakes
+        for mistake in mistakes[:_MOST_LINES]
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
     ]
+    more = len(mistakes) - _MOST_LINES
+    return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
 
 
 def brief(error: ValidationError) -> str:

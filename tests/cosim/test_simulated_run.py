@@ -13,7 +13,7 @@ from cosim.record import RunRecord, load_record
 from cosim.simulated_run import simulate_run
 from cosim.viewer import blueprint
 from cosim.virtual import Progress, simulate
-from noack.errors import MachineError
+from noack.errors import CallerError, MachineError
 from noack.records import tables
 from noack.resolve import resolve
 from noack.scenario import Scenario
@@ -123,3 +123,12 @@ def test_an_older_run_directory_is_a_live_runs(runs: Path, tmp_path: Path) -> No
     assert load_record(folder).kind == "live"
     write_environment(folder, "simulated")
     assert load_record(folder).kind == "simulated"
+
+
+def test_recorded_scenario_may_be_larger_than_one_that_a_person_writes(tmp_path: Path) -> None:
+    (tmp_path / "long.txt").write_text("10" * 200_000)
+    trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
+    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path, view=False)
+    assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
+    with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
+        load(ending.run_dir / "scenario.toml")
