@@ -1,6 +1,5 @@
 """The conclusion of a run: its record made whole, its summary written."""
 
-import json
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +14,15 @@ from cosim.launch import Ending
 from cosim.linearisation import linearisation
 from cosim.record import RunRecord, finish_record, load_record
 from cosim.replay import replay
-from cosim.run_dir import RECORD, REPORT_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE, concluded
+from cosim.run_dir import (
+    RECORD,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    SPOOL,
+    SUMMARY_FILE,
+    concluded,
+    read_object,
+)
 from cosim.shown import can_be_shown
 from cosim.summary import Summary, dumps, summarise
 from noack.errors import CallerError, ExitStatus, MachineError, why
@@ -118,7 +125,7 @@ def reopen(run_dir: Path) -> Outcome:
     """
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    summary = _read_summary(run_dir)
+    summary = read_object(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
     # It is of an earlier version or damaged; or a process woke up after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
@@ -158,12 +165,3 @@ def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaim
     except Exception:  # the page is worth having without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)
-
-
-def _read_summary(run_dir: Path) -> Summary:
-    """The run's summary; empty if there is none, or a damaged one, which is then written anew."""
-    try:
-        found = json.loads((run_dir / SUMMARY_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}

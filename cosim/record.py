@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.environment import Kind, kind_of
-from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
+from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, read_object
 from noack.errors import CallerError, MachineError, PeerError, one_line, why
 from noack.io.messages import LogLine, Report, heard
 from noack.io.spool import read_chunks
@@ -316,11 +316,11 @@ def _reports(
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Return the reports of the last process of each role, and those of the ones before."""
     try:
-        said = json.loads((run_dir / REPORTS_FILE).read_text(encoding="utf-8"))
+        said = read_object(run_dir / REPORTS_FILE)
         entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
         entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
     # A dead recorder wrote none, or half of one.
-    except (OSError, ValueError, RecursionError, LookupError, TypeError, AttributeError):
+    except (LookupError, TypeError):
         return {}, []
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []

@@ -70,7 +70,7 @@ def _run_table(summary: Summary) -> Table:
     table.add_column("quantity")
     table.add_column("value", justify="right")
     for row in key_numbers(summary):
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     return table
 
 

@@ -194,7 +194,7 @@ class _Handler(BaseHTTPRequestHandler):
             try:
                 source.request("GET", self.path)
                 answer = source.getresponse()
-            except OSError:
+            except (OSError, UnicodeError, http.client.HTTPException):  # or no path of HTTP
                 self.send_error(404)
                 return
             self.send_response(answer.status)
