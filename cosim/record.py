@@ -1,7 +1,7 @@
 """The numeric record of a run: spool in, Parquet out, structured arrays back.
 
 ``RUN/record/TABLE.parquet`` is the run's truth; ``docs/record.md`` documents the columns. Vectors
-are stored one column per entry (``x_0``, ``x_1``, …) so that any reader of Parquet takes them.
+are stored one column per entry (``x_1``, ``x_2``, …) so that any reader of Parquet takes them.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from noack.io.messages import LogLine, Report, heard
 from noack.io.spool import read_chunks
 from noack.io.telemetry import notices_of
 from noack.machine import INCARNATION, RESTART
-from noack.records import OWNER
+from noack.records import OWNER, entry_names
 from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
 from noack.scenario_file import MOST_RECORDED_BYTES, load
@@ -342,8 +342,8 @@ def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:
     for name in rows.dtype.names or ():
         column = rows[name]
         if column.ndim == 2:
-            for i in range(column.shape[1]):
-                columns[f"{name}_{i}"] = pa.array(np.ascontiguousarray(column[:, i]))
+            for entry, values in zip(entry_names(name, column.shape[1]), column.T, strict=True):
+                columns[entry] = pa.array(np.ascontiguousarray(values))
         elif column.dtype.kind == "V":
             width = column.dtype.itemsize
             raw = pa.py_buffer(np.ascontiguousarray(column).tobytes())
@@ -366,13 +366,13 @@ def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
     """Yield the names of a table's columns in its file, and their types."""
     for name in dtype.names or ():
         field = dtype[name]
-        kind = pa.binary(field.itemsize) if field.kind == "V" else pa.from_numpy_dtype(field.base)
         if field.shape:
-            yield from (
-                (f"{name}_{i}", pa.from_numpy_dtype(field.base)) for i in range(field.shape[0])
-            )
+            kind = pa.from_numpy_dtype(field.base)
+            yield from ((entry, kind) for entry in entry_names(name, field.shape[0]))
+        elif field.kind == "V":
+            yield name, pa.binary(field.itemsize)
         else:
-            yield name, kind
+            yield name, pa.from_numpy_dtype(field)
 
 
 def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
@@ -407,8 +407,8 @@ def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
     for name in dtype.names or ():
         field = dtype[name]
         if field.shape:
-            for i in range(field.shape[0]):
-                rows[name][:, i] = table[f"{name}_{i}"].to_numpy()
+            for i, entry in enumerate(entry_names(name, field.shape[0])):
+                rows[name][:, i] = table[entry].to_numpy()
         elif field.kind == "V":
             raw = b"".join(value or b"" for value in table[name].to_pylist())
             rows[name] = np.frombuffer(raw, field)

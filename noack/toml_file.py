@@ -5,6 +5,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from contextlib import suppress
+from datetime import date, time
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -126,4 +127,14 @@ def _missing(path: Path, model: type[BaseModel]) -> str:
 
 
 def _unfit(value: object) -> None:
-    raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
+    """Say why a value is none that JSON has.
+
+    Raises:
+        TypeError: always.
+    """
+    if isinstance(value, type):
+        written = json.dumps({"kind": "python", "file": "my_plant.py", "name": value.__name__})
+        raise TypeError(f"{value.__name__}: a class is given by its file and its name: {written}")
+    if isinstance(value, date | time):
+        raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
+    raise TypeError(f"a value of type {type(value).__name__} is no value of a setting")

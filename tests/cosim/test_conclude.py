@@ -57,7 +57,7 @@ def test_a_difference_does_not_change_how_the_run_ended(run_dir: Path) -> None:
     assert harmed.status == unharmed.status
     assert harmed.summary["replay"]["bit_exact"] is False
     first = summary_of(run_dir)["replay"]["first_difference"]
-    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 9, "u_0")
+    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 9, "u_1")
 
 
 def test_a_replay_that_crashes_is_no_crash(run_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
