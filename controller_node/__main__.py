@@ -3,9 +3,12 @@
 import sys
 from collections.abc import Sequence
 
-from controller_node.controller import controller_of
-from noack.errors import ExitStatus
-from noack.io import process
+from noack.io.interrupt import quiet_interrupt
+
+with quiet_interrupt():
+    from controller_node.controller import controller_of
+    from noack.errors import ExitStatus
+    from noack.io import process
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

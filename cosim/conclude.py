@@ -1,12 +1,10 @@
 """The conclusion of a run: its record made whole, its summary written."""
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from cosim.run_dir import (
     SPOOL,
     SUMMARY_FILE,
     concluded,
+    read_object,
 )
 from cosim.shown import can_be_shown
 from cosim.summary import Summary, dumps, summarise
@@ -139,7 +138,7 @@ def reopen(run_dir: Path) -> Outcome:
     """
     if not (run_dir / SCENARIO_FILE).is_file():
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
-    summary = _read(run_dir / SUMMARY_FILE)
+    summary = read_object(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
     # It is of an earlier version or damaged; or a process woke up after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
@@ -149,7 +148,7 @@ def reopen(run_dir: Path) -> Outcome:
 
 def _ending(run_dir: Path, summary: Summary) -> Ending:
     """How a run ended, as its summary has it, or else as its launcher stored it."""
-    for said in (summary, _read(run_dir / ENDING_FILE)):
+    for said in (summary, read_object(run_dir / ENDING_FILE)):
         with suppress(LookupError, TypeError, ValueError):
             status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
             return Ending(run_dir, 0, status, reason, said["startup_s"])
@@ -178,12 +177,3 @@ def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaim
     except Exception:  # the page is worth having without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    """What a JSON file of the run holds; nothing if there is none, or a damaged one."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}

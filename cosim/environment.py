@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from cosim.run_dir import ENVIRONMENT_FILE
+from cosim.run_dir import ENVIRONMENT_FILE, read_object
 
 Kind = Literal["live", "simulated"]
 """Whether a run took place between processes, or in virtual time."""
@@ -41,22 +41,13 @@ def write_environment(run_dir: Path, kind: Kind) -> None:
 
 def kind_of(run_dir: Path) -> Kind:
     """Return of which kind a run is: what its environment says, which in old runs is nothing."""
-    environment = read_environment(run_dir)
-    return "simulated" if environment.get("kind") == "simulated" else "live"
-
-
-def read_environment(run_dir: Path) -> dict[str, Any]:
-    """Return what ``environment.json`` says; nothing if it cannot be read."""
-    try:
-        said = json.loads((run_dir / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return said if isinstance(said, dict) else {}
+    said = read_object(run_dir / ENVIRONMENT_FILE)
+    return "simulated" if said.get("kind") == "simulated" else "live"
 
 
 def changed_since(run_dir: Path) -> list[str]:
     """Return what the arithmetic of a run may depend on and is not what it was, in words."""
-    then, now = read_environment(run_dir), environment("live")
+    then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
     said = then.get("packages")
     packages = said if isinstance(said, dict) else {}
     pairs = [

@@ -1,7 +1,7 @@
 """The numeric record of a run: spool in, Parquet out, structured arrays back.
 
 ``RUN/record/TABLE.parquet`` is the run's truth; ``docs/record.md`` documents the columns. Vectors
-are stored one column per entry (``x_0``, ``x_1``, …) so that any reader of Parquet takes them.
+are stored one column per entry (``x_1``, ``x_2``, …) so that any reader of Parquet takes them.
 """
 
 import contextlib
@@ -17,16 +17,16 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.environment import Kind, kind_of
-from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL
+from cosim.run_dir import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, read_object
 from noack.errors import CallerError, MachineError, PeerError, one_line, why
 from noack.io.messages import LogLine, Report, heard
 from noack.io.spool import read_chunks
 from noack.io.telemetry import notices_of
 from noack.machine import INCARNATION, RESTART
-from noack.records import OWNER
+from noack.records import OWNER, entry_names
 from noack.resolve import Loop, loop_of, tables_of
 from noack.scenario import Scenario
-from noack.scenario_file import load
+from noack.scenario_file import MOST_RECORDED_BYTES, load
 from noack.topology import LOOP_ROLES, RECORDER
 from noack.wire import VERSION, Flow, read_header
 
@@ -153,7 +153,7 @@ def load_record(run_dir: Path) -> RunRecord:
         raise CallerError(
             f"{run_dir}: has no numeric record; `noack summary` finishes a run that was cut short"
         )
-    scenario = load(run_dir / SCENARIO_FILE)
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     rows = {
         table: _from_parquet(folder / f"{table}.parquet", dtype)
         for table, dtype in tables_of(scenario).items()
@@ -184,7 +184,7 @@ def finish_record(run_dir: Path) -> RunRecord:
     Raises:
         MachineError: the record cannot be written; the spool is kept.
     """
-    scenario = load(run_dir / SCENARIO_FILE)
+    scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     spool, folder = run_dir / SPOOL, run_dir / RECORD
     rows = {
         table: merge_rows([_recorded(folder, table, dtype), *_spooled(spool, table, dtype)], dtype)
@@ -316,11 +316,11 @@ def _reports(
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Return the reports of the last process of each role, and those of the ones before."""
     try:
-        said = json.loads((run_dir / REPORTS_FILE).read_text(encoding="utf-8"))
+        said = read_object(run_dir / REPORTS_FILE)
         entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
         entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
     # A dead recorder wrote none, or half of one.
-    except (OSError, ValueError, RecursionError, LookupError, TypeError, AttributeError):
+    except (LookupError, TypeError):
         return {}, []
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []
@@ -342,8 +342,8 @@ def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:
     for name in rows.dtype.names or ():
         column = rows[name]
         if column.ndim == 2:
-            for i in range(column.shape[1]):
-                columns[f"{name}_{i}"] = pa.array(np.ascontiguousarray(column[:, i]))
+            for entry, values in zip(entry_names(name, column.shape[1]), column.T, strict=True):
+                columns[entry] = pa.array(np.ascontiguousarray(values))
         elif column.dtype.kind == "V":
             width = column.dtype.itemsize
             raw = pa.py_buffer(np.ascontiguousarray(column).tobytes())
@@ -366,13 +366,13 @@ def _columns(dtype: np.dtype[np.void]) -> Iterator[tuple[str, pa.DataType]]:
     """Yield the names of a table's columns in its file, and their types."""
     for name in dtype.names or ():
         field = dtype[name]
-        kind = pa.binary(field.itemsize) if field.kind == "V" else pa.from_numpy_dtype(field.base)
         if field.shape:
-            yield from (
-                (f"{name}_{i}", pa.from_numpy_dtype(field.base)) for i in range(field.shape[0])
-            )
+            kind = pa.from_numpy_dtype(field.base)
+            yield from ((entry, kind) for entry in entry_names(name, field.shape[0]))
+        elif field.kind == "V":
+            yield name, pa.binary(field.itemsize)
         else:
-            yield name, kind
+            yield name, pa.from_numpy_dtype(field)
 
 
 def read_table(path: Path, dtype: np.dtype[np.void]) -> pa.Table:
@@ -407,8 +407,8 @@ def _from_parquet(path: Path, dtype: np.dtype[np.void]) -> Rows:
     for name in dtype.names or ():
         field = dtype[name]
         if field.shape:
-            for i in range(field.shape[0]):
-                rows[name][:, i] = table[f"{name}_{i}"].to_numpy()
+            for i, entry in enumerate(entry_names(name, field.shape[0])):
+                rows[name][:, i] = table[entry].to_numpy()
         elif field.kind == "V":
             raw = b"".join(value or b"" for value in table[name].to_pylist())
             rows[name] = np.frombuffer(raw, field)

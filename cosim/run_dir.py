@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import json
 import os
 import shutil
 import sys
@@ -9,9 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from noack.errors import CallerError, MachineError, why
+from noack.regular_file import read_regular
 from noack.scenario import Scenario
 from noack.scenario_file import dumps
 from noack.system_files import unchanged
@@ -32,6 +34,7 @@ PLANT = "plant"
 """The folder of the file that the plant is made of, if it is of one."""
 LATEST = "latest"
 _LOCK = ".lock"
+_MOST_JSON_BYTES = 64 * 2**20
 LEAST_FREE_BYTES = 16 * 1024 * 1024
 
 
@@ -89,6 +92,15 @@ def _with_file(scenario: Scenario, file: str) -> Scenario:
     system = scenario.plant.system.model_copy(update={"file": file})
     plant = scenario.plant.model_copy(update={"system": system})
     return scenario.model_copy(update={"plant": plant})
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file of a run; empty if there is none, or a damaged one."""
+    try:
+        found = json.loads(read_regular(path, _MOST_JSON_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def point_to_latest(run_dir: Path) -> None:

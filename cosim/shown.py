@@ -5,9 +5,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-Reals = dict[str, float]
+Name = Annotated[str, Field(pattern=r"^[^\[]*$")]
+"""Text that a table shows as it is: without a bracket, which would begin markup."""
+Reals = dict[Name, float]
 Number = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-Counts = dict[str, Number]
+Counts = dict[Name, Number]
+Matrix = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1)]
 
 
 class _Part(BaseModel):
@@ -25,7 +28,7 @@ class _Assumption(_Part):
 
 class _Violation(_Part):
     t_s: float
-    process: str
+    process: Name
     what: str
 
 
@@ -52,14 +55,14 @@ class _Acknowledgements(_Part):
 
 
 class _Watchdog(_Part):
-    policy: str
+    policy: Name
     trips: Number
     first_s: float | None
     total_s: float
 
 
 class _Estimation(_Part):
-    observer: str | None
+    observer: Name | None
     rms_second_half: float | None
     expected_rms: float | None
     max: float | None
@@ -67,43 +70,72 @@ class _Estimation(_Part):
 
 
 class _Disturbance(_Part):
-    at: str
+    at: Name
     rms: float | None
     max: float | None
 
 
-class _Place(_Part):
-    table: str
+class _Difference(_Part):
+    model_config = ConfigDict(extra="forbid")
+
+    table: Name
     row: Number
-    column: str
+    column: Name
+    recorded: Number | float | str | None
+    recorded_hex: str | None
+    replayed: Number | float | str | None
+    replayed_hex: str | None
+    what: str
+    now_ns: Number
 
 
-class _Replay(_Part):
-    bit_exact: bool | None
-    inputs: Number = 0
+class _BitExact(_Part):
+    bit_exact: Literal[True]
+    inputs: Number
     complete: bool = True
-    first_difference: _Place | None = None
+
+
+class _Differs(_Part):
+    bit_exact: Literal[False]
+    first_difference: _Difference
+    complete: bool = True
+
+
+class _NotReplayed(_Part):
+    bit_exact: None
+    complete: bool = True
 
 
 class _Compared(_Part):
     reason: None
+    explained: bool
     rms_x: float
+    max_x: float
     rms_x_live: float
     explained_relative: float
     events_ideal: Number
     shares: Reals
+    events_live: Number
+    max_event_difference_s: float | None
+    parted_event: Number | None
 
 
 class _NotCompared(_Part):
     reason: str
 
 
-class _Linearisation(_Part):
-    A: list[list[float]] | None
-    eigenvalues: list[list[float]] | None
-    off_A: list[list[float]] | None
-    off_B: list[list[float]] | None
+class _Linearised(_Part):
+    A: Matrix
+    eigenvalues: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=1)
+    ]
+    off_A: Matrix
+    off_B: Matrix
     in_box: bool | None
+
+
+class _NotLinearised(_Part):
+    A: None
 
 
 class _Claim(_Part):
@@ -123,9 +155,16 @@ class _Changed(_Part):
     what: str
 
 
+class _Restart(_Part):
+    process: Name
+    last_s: float | None
+    first_s: float | None
+    what: str | None
+
+
 class _Shown(_Part):
-    kind: Literal["live", "simulated"] = "live"
-    scenario: str
+    kind: Literal["live", "simulated"]
+    scenario: Name
     mode: str
     mansd: Number
     horizon_s: float
@@ -143,7 +182,7 @@ class _Shown(_Part):
     missing_by_table: Counts
     lost_outside_netem: Number
     lost_by_leg: Counts
-    rejected_datagrams: dict[str, Counts]
+    rejected_datagrams: dict[Name, Counts]
     inter_event_min_s: float | None
     inter_event_median_s: float | None
     inter_delivery_median_s: float | None
@@ -152,18 +191,19 @@ class _Shown(_Part):
     sup_e_s_norm: float | None
     sup_e_c_norm: float | None
     identity_residual_relative: float | None
-    lateness_us: dict[str, _Lateness]
+    lateness_us: dict[Name, _Lateness]
     latency_us: _Latency | None
     realtime: dict[str, dict[str, str]]
     acknowledgements: _Acknowledgements | None = None
     watchdog: _Watchdog | None = None
     estimation: _Estimation | None = None
     disturbances: list[_Disturbance] | None = None
-    replay: _Replay | None = None
+    replay: _BitExact | _Differs | _NotReplayed | None = None
     fidelity: _Compared | _NotCompared | None = None
-    linearisation: _Linearisation | None = None
+    linearisation: _Linearised | _NotLinearised | None = None
     claims: list[_Claim] | None = None
     changes: list[_Changed] | None = None
+    restarts: list[_Restart] | None = None
 
 
 def can_be_shown(summary: Mapping[str, Any]) -> bool:

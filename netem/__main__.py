@@ -8,12 +8,15 @@ In a run it joins like every other process. On its own it serves any UDP program
 import sys
 from collections.abc import Sequence
 
-from netem.duplex import network_of
-from netem.relay import Relay
-from noack.errors import ExitStatus, NoackError
-from noack.io.command_line import Parser, failed
-from noack.io.node import Node
-from noack.io.process import add_options, join_run
+from noack.io.interrupt import quiet_interrupt
+
+with quiet_interrupt():
+    from netem.duplex import network_of
+    from netem.relay import Relay
+    from noack.errors import ExitStatus, NoackError
+    from noack.io.command_line import Parser, failed
+    from noack.io.node import Node
+    from noack.io.process import add_options, join_run
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

@@ -1,5 +1,7 @@
 """Vectors and matrices as a scenario file gives them, and what may be wrong with them."""
 
+import json
+from collections.abc import Iterable
 from typing import Annotated
 
 from pydantic import Field, FiniteFloat
@@ -12,6 +14,7 @@ Rows = Annotated[tuple[Row, ...], Field(min_length=1, max_length=MAX_DIMENSION)]
 """A matrix by rows."""
 
 _LARGEST = 1e100
+_LONGEST_SHOWN = 60
 
 
 def shape(rows: tuple[tuple[float, ...], ...], key: str) -> tuple[int, int]:
@@ -40,7 +43,14 @@ def require_shape(
     if found != expected:
         raise ValueError(
             f"{key}: expected {expected[0]} x {expected[1]} ({why}), found {found[0]} x {found[1]}"
+            + (_transposed(rows) if found == expected[::-1] else "")
         )
+
+
+def _transposed(rows: Iterable[Iterable[float]]) -> str:
+    """Suggest the transposed matrix, written out if it is short."""
+    other = json.dumps([list(column) for column in zip(*rows, strict=True)])
+    return "; looks transposed" + (f": try {other}" if len(other) <= _LONGEST_SHOWN else "")
 
 
 def require_length(row: tuple[object, ...] | None, key: str, expected: int, why: str) -> None:

@@ -23,7 +23,6 @@ _GAINS = (GAIN, "K")
 _MOST_ENTRIES = MAX_DIMENSION**2
 _MOST_BYTES = 16 * _MOST_ENTRIES + 65_536
 """Of an array within an archive, its header included."""
-_MOST_FILE_BYTES = 64 * 1024 * 1024
 _NUMBERS = "fiub"
 
 
@@ -151,8 +150,6 @@ def _arrays(file: NamedFile) -> dict[str, Any]:
     if file.path.suffix not in (NPZ, MAT):
         file.wrong(_SUFFIXES)
     content = file.content()
-    if len(content) > _MOST_FILE_BYTES:
-        file.wrong(f"is larger than {_MOST_FILE_BYTES // 2**20} MiB")
     try:
         if file.path.suffix == MAT:
             content = matrices_as_npz(content, _MOST_ENTRIES)

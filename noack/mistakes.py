@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -19,26 +20,35 @@ _PATTERNS = {
     r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
     "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
 }
-_REMEDIES = {
-    "tuple_type": "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]",
+_MOST_LINES = 50
+_MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
+_LISTS = {
+    float: "should be a list of numbers, e.g. [1.0, 0.0]",
+    int: "should be a list of numbers, e.g. [1, 2]",
+    str: 'should be a list of names, e.g. ["a", "b"]',
+    tuple: _MATRIX,
 }
+"""By what an entry of the list is."""
+_PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
 def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
-    """Return one line per mistake.
+    """Return one line per mistake, and one for all beyond the first fifty.
 
     Args:
         error: what the validation raised.
         source: names the file.
         root: the model that the whole file was validated against.
     """
-    mistakes = error.errors()
+    mistakes = error.errors(include_url=False)
     places = [mistake["loc"] for mistake in mistakes]
-    return [
+    shown = [
         printable(f"{source}: {_explain(mistake, root)}")
-        for mistake in mistakes
+        for mistake in mistakes[:_MOST_LINES]
         if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
     ]
+    more = len(mistakes) - _MOST_LINES
+    return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
 
 
 def brief(error: ValidationError) -> str:
@@ -75,8 +85,10 @@ def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
         return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
     if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
         return f"{shown}: {_PATTERNS[mistake['ctx']['pattern']]}"
+    if kind == "tuple_type":
+        return f"{shown}: {_LISTS.get(_entry_of(at), 'should be a list of tables')}"
     message = mistake["msg"].replace("Input should", "should")
-    return f"{shown}: {_REMEDIES.get(kind, message[0].lower() + message[1:])}"
+    return f"{shown}: {message[0].lower() + message[1:]}{_share(value, at)}"
 
 
 class _Place(NamedTuple):
@@ -90,6 +102,8 @@ class _Place(NamedTuple):
     """What a table there may be, by the value of the key that chooses."""
     discriminator: str
     """The key that chooses."""
+    kind: Any
+    """The annotation of the value."""
 
 
 def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
@@ -104,7 +118,7 @@ def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
             continue
         path.append(part)
         kind, section = _within(kind, part)
-    return _Place(path, section, *_choices(kind))
+    return _Place(path, section, *_choices(kind), kind)
 
 
 def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
@@ -115,6 +129,34 @@ def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
         return (None if field is None else field.annotation), section
     entries = [entry for inner in _alternatives(kind) for entry in get_args(inner)]
     return (entries[0] if isinstance(part, int) and entries else None), None
+
+
+def _entry_of(at: _Place) -> Any:
+    """What the entries of the list are that a value should be; of a row, what it is itself."""
+    lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
+    if isinstance(at.path[-1], int) or not lists:
+        return tuple
+    entry = _alternatives(get_args(lists[0])[0])[0]
+    return get_origin(entry) or entry
+
+
+def _share(value: Any, at: _Place) -> str:
+    """Suggest a share where a percentage was given for a number that is at most 1."""
+    field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
+    limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
+    if not any(1 in (getattr(one, "le", None), getattr(one, "lt", None)) for one in limits):
+        return ""
+    percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
+    if percent is not None:
+        value = float(percent[1])
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return f"; {value:g} % is {value / 100:g}" if is_number and 1 < value <= 100 else ""
+
+
+def _metadata(kind: Any) -> list[Any]:
+    """What is said of the alternatives of an annotation, e.g. that they are at most 1."""
+    found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
+    return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
 
 
 def _alternatives(kind: Any) -> list[Any]:

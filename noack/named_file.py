@@ -5,6 +5,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from noack.errors import CallerError
+from noack.regular_file import read_regular
+
+MOST_BYTES = 64 * 2**20
+"""Of a file that is read whole."""
 
 
 class NamedFile:
@@ -36,7 +40,7 @@ class NamedFile:
             CallerError: it cannot be read.
         """
         try:
-            return self.path.read_bytes()
+            return read_regular(self.path, MOST_BYTES)
         except (OSError, ValueError) as error:
             self._unreadable(error)
 
@@ -48,7 +52,7 @@ class NamedFile:
         """
         try:
             if self.path.exists() and not self.path.is_file():
-                self.wrong("is no file")
+                self.wrong("cannot be read: not a regular file")
             with self.path.open("rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
         except (OSError, ValueError) as error:

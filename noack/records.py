@@ -61,6 +61,14 @@ def effective(fates: NDArray[np.int64]) -> NDArray[np.bool_]:
     return np.isin(fates, [fate for fate in Fate if fate.effective])
 
 
+def entry_names(vector: str, entries: int) -> tuple[str, ...]:
+    """Names of a vector's entries, counted from 1: ``x_1``, ``x_2`` and so on.
+
+    They are the columns of the record, and what states and inputs are called that have no names.
+    """
+    return tuple(f"{vector}_{i}" for i in range(1, entries + 1))
+
+
 def tables(
     n: int,
     m: int,

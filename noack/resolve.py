@@ -14,7 +14,7 @@ from noack.linear import Matrix, Vector, discretise, transition
 from noack.models import NAMED_MODELS
 from noack.observability import observer_gain, unseen_mode
 from noack.observers import AnyObserver, Luenberger
-from noack.records import tables
+from noack.records import entry_names, tables
 from noack.rng import stream
 from noack.scenario import Scenario
 from noack.sections.model import Model
@@ -206,8 +206,8 @@ def _explicit_model(model: Model) -> Model:
     n, m = np.array(model.B).shape
     return model.model_copy(
         update={
-            "state_names": model.state_names or tuple(f"x_{i + 1}" for i in range(n)),
-            "input_names": model.input_names or tuple(f"u_{i + 1}" for i in range(m)),
+            "state_names": model.state_names or entry_names("x", n),
+            "input_names": model.input_names or entry_names("u", m),
         }
     )
 

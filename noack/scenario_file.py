@@ -1,7 +1,6 @@
 """Scenario files: TOML in, frozen scenario out, and one clear line for every mistake."""
 
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
@@ -22,17 +21,24 @@ _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
 """Numbers or names in a row, which the TOML writer puts on a line each."""
 
 
-def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
+MOST_RECORDED_BYTES = 2**28
+"""Of the scenario file that a run writes, in which losses and delays of files are numbers."""
+
+
+def load(
+    path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES
+) -> Scenario:
     """Read and validate a scenario file.
 
     Args:
         path: the TOML file.
         overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
+        most_bytes: that the file may have.
 
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
     """
-    content = toml_file.read(path)
+    content = toml_file.read(path, Scenario, most_bytes)
     keys = [_apply(content, override) for override in overrides]
     try:
         return completed(content, path)
@@ -152,11 +158,11 @@ def value_of(text: str, source: str) -> Any:
         CallerError: it is none of TOML; ``source`` names it.
     """
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, tomllib.TOMLDecodeError) and text.lstrip()[:1] not in tuple("{[\"'"):
-            return text
-        raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
+        return toml_file.parsed(f"value = {text}", source)["value"]
+    except CallerError:
+        if text.lstrip()[:1] in tuple("{[\"'") or text.strip().isdecimal():
+            raise
+        return text
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
@@ -169,10 +175,12 @@ def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
         source: names the setting in error messages.
 
     Raises:
-        CallerError: part of the key is a value, not a table.
+        CallerError: part of the key is a value, not a table; or it has too many parts.
     """
     table = content
     *path, last = key.split(".")
+    if len(path) >= toml_file.MOST_LEVELS:
+        raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
     for part in path:
         table = table.setdefault(part, {})
         if not isinstance(table, dict):

@@ -3,9 +3,12 @@
 import sys
 from collections.abc import Sequence
 
-from noack.errors import ExitStatus
-from noack.io import process
-from plant_server.plant import plant_of
+from noack.io.interrupt import quiet_interrupt
+
+with quiet_interrupt():
+    from noack.errors import ExitStatus
+    from noack.io import process
+    from plant_server.plant import plant_of
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:

@@ -314,7 +314,7 @@ def load(path: Path) -> Campaign:
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
-    return toml_file.validated(Campaign, toml_file.read(path), str(path))
+    return toml_file.validated(Campaign, toml_file.read(path, Campaign), str(path))
 
 
 def json_schema() -> dict[str, Any]:

@@ -1,7 +1,14 @@
 """The command line ``noack``, by the panels of its help."""
 
-from cosim.cli import runs, comparison, knobs, theory, campaigns, design, processes, files, doctor  # noqa: I001 - in the order of the help
-from cosim.cli.app import app, find_scenario, main
+from noack.io.interrupt import quiet_interrupt
+
+with quiet_interrupt():
+    # isort: off, in the order of the help
+    from cosim.cli import runs, comparison, knobs, theory
+    from cosim.cli import campaigns, design, processes, files, doctor
+
+    # isort: on
+    from cosim.cli.app import app, find_scenario, main
 
 __all__ = [
     "app",

@@ -2,7 +2,6 @@
 
 import json as json_module
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +21,7 @@ from cosim.cli.app import (
 from cosim.run_dir import DEFAULT_RUNS
 from noack.errors import CallerError, ExitStatus, MachineError
 from noack.linear import Matrix
-from noack.scenario_file import dumps, load
+from noack.scenario_file import dumps, load, value_of
 
 
 @command(CAMPAIGNS, [
@@ -139,8 +138,8 @@ def _matrix(option: str, text: str | None, size: int) -> Matrix:
     if text is None:
         return np.eye(size)
     try:
-        value = np.array(tomllib.loads(f"value = {text}")["value"], dtype=np.float64)
-    except (ValueError, TypeError, RecursionError):
+        value = np.array(value_of(text, option), dtype=np.float64)
+    except (CallerError, ValueError, TypeError):
         value = np.empty(0)
     if value.ndim == 1:
         value = np.diag(value)

@@ -8,7 +8,14 @@ from cosim.crossing import crossing
 from cosim.join import join_all
 from cosim.record import RunRecord
 from noack.clock import NS_PER_S
-from noack.records import CONTROLLER_DELIVERY, NO_SEQUENCE, SENSOR_MEASUREMENT, Fate, effective
+from noack.records import (
+    CONTROLLER_DELIVERY,
+    NO_SEQUENCE,
+    SENSOR_MEASUREMENT,
+    Fate,
+    effective,
+    entry_names,
+)
 
 _NOT_THERE = "none"
 _OVERTAKEN = "overtaken"
@@ -26,7 +33,7 @@ def samples(record: RunRecord) -> pa.Table:
     joined = join_all(record)
     columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(joined.t_ns), "t_ns": joined.t_ns}
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
-        columns |= {f"{name}_{i}": states[:, i] for i in range(states.shape[1])}
+        columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))
     columns |= {
         "e_s_norm": joined.e_s_norm,
         "threshold": joined.threshold,

@@ -92,7 +92,7 @@ class Run:
 
         Returns:
             Its columns as in ``docs/record.md``: times in nanoseconds of simulated time, vectors
-            one column per entry (``x_0``, ``x_1``, …). Before them ``t_s``, ``t_ns`` in seconds.
+            one column per entry (``x_1``, ``x_2``, …). Before them ``t_s``, ``t_ns`` in seconds.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
@@ -110,8 +110,8 @@ class Run:
         """Return plant, sensor and controller side by side, one row per measurement.
 
         Returns:
-            ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_0``, ``x_s_0``,
-            ``x_c_0``, …); ``e_s_norm`` before a reset, its ``threshold``, ``e_c_norm``, all in the
+            ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_1``, ``x_s_1``,
+            ``x_c_1``, …); ``e_s_norm`` before a reset, its ``threshold``, ``e_c_norm``, all in the
             trigger's norm; ``event``, the number of the update that was sent, −1 for none. x_s is
             shown after a reset; x_c is NaN where the controller's record does not reach. x is what
             the sensor takes for the state: with noise or an observer not quite the plant's.

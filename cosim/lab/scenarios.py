@@ -43,7 +43,7 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
     if isinstance(source, Mapping):
         return _completed(_plain(source), settings, Path("scenario"))
     path = find_shipped(str(source), "scenarios")
-    return _completed(toml_file.read(path), settings, path)
+    return _completed(toml_file.read(path, Scenario), settings, path)
 
 
 def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:

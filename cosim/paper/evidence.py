@@ -22,7 +22,7 @@ from cosim.virtual import simulate
 from noack.clock import NS_PER_S
 from noack.linear import Matrix, spectral_abscissa
 from noack.models import lane_following
-from noack.records import SENSOR_MEASUREMENT
+from noack.records import SENSOR_MEASUREMENT, entry_names
 from noack.resolve import Loop, loop_of
 from noack.scenario_file import load
 from noack.theory.printed import Interval, longest_interval_s, theorem_1
@@ -340,8 +340,8 @@ def _loop(
         B=B,
         x0=np.zeros(n) if x0 is None else x0,
         weight=None,
-        state_names=tuple(f"x_{i + 1}" for i in range(n)),
-        input_names=tuple(f"u_{i + 1}" for i in range(B.shape[1])),
+        state_names=entry_names("x", n),
+        input_names=entry_names("u", B.shape[1]),
     )
 
 

@@ -23,6 +23,7 @@ from noack.records import (
     SENSOR_MEASUREMENT,
     SETTINGS,
     UPDATES,
+    entry_names,
 )
 from noack.wire import KEY_BYTES, Encoder, Flow, Header, Message, read_header
 
@@ -108,7 +109,9 @@ class _Received:
     def compare_vectors(self) -> None:
         """Compare sequence number, time and vector of what a machine received."""
         rows, columns, newest = self._rows, vector_columns(self._table, self._rows), -1
-        entries = [f"{column}_{i}" for column in columns for i in range(rows[column].shape[1])]
+        entries = [
+            entry for column in columns for entry in entry_names(column, rows[column].shape[1])
+        ]
         vectors = (
             np.hstack([rows[column] for column in columns]) if columns else np.zeros((len(rows), 0))
         )
@@ -125,8 +128,8 @@ class _Received:
             elif vector.tobytes() != message.vector.tobytes():
                 entry = first_entry(vector, message.vector)
                 if entry is not None:
-                    column = entries[int(entry[0].removeprefix("_"))]
-                    self._differs(row, "was not sent so", column, *entry[1:])
+                    place, *values = entry
+                    self._differs(row, "was not sent so", entries[place], *values)
 
     def compare_heads(self) -> None:
         """Compare what netem keeps of a datagram: its first bytes and its size."""

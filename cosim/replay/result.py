@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from noack.records import entry_names
+
 Value = float | int | str | None
 
 
@@ -20,7 +22,7 @@ class Difference:
 
     table: str
     row: int
-    """Index in the table."""
+    """Index in the table, from 0."""
     column: str
     """As in the Parquet file: ``x_2`` is an entry of a vector. Empty if no single one is."""
     recorded: Value
@@ -60,18 +62,19 @@ def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> D
     now_ns = int(recorded["now_ns"])
     for name in recorded.dtype.names or ():
         if (entry := first_entry(recorded[name], replayed[name])) is not None:
-            column = name + entry[0]
-            return difference(table, row, now_ns, "the row differs", column, *entry[1:])
+            place, *values = entry
+            width = np.size(recorded[name])
+            column = entry_names(name, width)[place] if np.ndim(recorded[name]) else name
+            return difference(table, row, now_ns, "the row differs", column, *values)
     raise ValueError("the rows are equal")
 
 
-def first_entry(recorded: Any, replayed: Any) -> tuple[str, object, object] | None:
-    """Return suffix and values of the first entry in which a column's two values differ."""
-    vector = np.ndim(recorded) == 1
+def first_entry(recorded: Any, replayed: Any) -> tuple[int, object, object] | None:
+    """Return index and values of the first entry in which a column's two values differ."""
     pairs = zip(np.atleast_1d(recorded), np.atleast_1d(replayed), strict=True)
     for i, (one, other) in enumerate(pairs):
         if one.tobytes() != other.tobytes():
-            return f"_{i}" if vector else "", one.item(), other.item()
+            return i, one.item(), other.item()
     return None
 
 

@@ -1,6 +1,5 @@
 """Writes ``report.html`` into a run directory."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -12,7 +11,7 @@ from cosim.record import RunRecord
 from cosim.report.page import Embedded, page
 from cosim.report.run_figures import Envelope, run_figures
 from cosim.report.save import inline
-from cosim.run_dir import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE
+from cosim.run_dir import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
 from noack.errors import MachineError, why
 
 
@@ -47,7 +46,8 @@ def write_report(
     scratch = path.with_suffix(".partial")
     try:
         scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
-        html = page(record.scenario, summary, figures, scenario_toml, _environment(run_dir))
+        environment = read_object(run_dir / ENVIRONMENT_FILE)
+        html = page(record.scenario, summary, figures, scenario_toml, environment)
         scratch.write_text(html, encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
@@ -55,11 +55,3 @@ def write_report(
             scratch.unlink(missing_ok=True)
         raise MachineError(f"{path}: the report cannot be written: {why(error)}") from None
     return path
-
-
-def _environment(run_dir: Path) -> dict[str, Any]:
-    try:
-        said = json.loads((run_dir / ENVIRONMENT_FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return said if isinstance(said, dict) else {}

@@ -84,7 +84,7 @@ harsh = noack.with_settings(scenario, {"network.loss.probability": 0.9, "network
 for case in (scenario, harsh):
     run = noack.simulate(case)
     samples = run.samples()
-    t_s, angle = samples["t_s"].to_numpy(), samples["x_0"].to_numpy()
+    t_s, angle = samples["t_s"].to_numpy(), samples["x_1"].to_numpy()
     settled_s = t_s[np.abs(angle) > 0.01].max()
     print(
         f"M - 1 = {case.network.mansd}: {run.summary['events']} events, "

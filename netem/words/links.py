@@ -116,7 +116,7 @@ def load_links(path: Path) -> tuple[LinkSpec, ...]:
     Raises:
         CallerError: one line per mistake, each with file, key, value and remedy.
     """
-    links = toml_file.validated(LinksFile, toml_file.read(path), str(path)).link
+    links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
     specs = tuple(
         link.spec(path.parent, f"{path}: link.{number}") for number, link in enumerate(links)
     )

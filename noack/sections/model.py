@@ -76,7 +76,9 @@ class Model(Section):
             )
         n = len(self.A)
         require_shape(self.A, "A", (n, n), "the system matrix is square")
-        require_shape(self.B, "B", (n, shape(self.B, "B")[1]), "one row per state")
+        height, width = shape(self.B, "B")
+        m = height if width == n != height else width  # it may be transposed
+        require_shape(self.B, "B", (n, m), "one row per state")
 
     @property
     def dimensions(self) -> tuple[int, int]:

@@ -178,7 +178,7 @@ def outside_box(resolved: Scenario) -> str | None:
         for i, j in np.argwhere(np.abs(true - model) > half + slack):
             apart = abs(true[i, j] - model[i, j])
             return (
-                f"the plant lies outside: {name}[{i + 1},{j + 1}] is {apart:.3g} from the "
+                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {apart:.3g} from the "
                 f"model's, the half-width is {half[i, j]:.3g}"
             )
     return None

@@ -216,7 +216,7 @@ def test_a_plant_outside_its_box_is_named() -> None:
         "plant.B=[[0.0],[1.0]]",
     )  # fmt: skip
     said = outside_box(outside)
-    assert said == ("the plant lies outside: A[2,1] is 2 from the model's, the half-width is 0.3")
+    assert said == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
     claims = [c for c in Claims(simulate(outside)).judge() if c.source == "box certificate"]
     assert claims
     assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}

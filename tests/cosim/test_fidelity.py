@@ -286,8 +286,8 @@ def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Pat
     path = run / "record" / "plant_step.parquet"
     table = pq.read_table(path)
     moved: Callable[[np.ndarray], np.ndarray] = lambda x: x + np.linspace(0, 1, len(x))  # noqa: E731
-    column = pa.array(moved(table["x_3"].to_numpy()))
-    pq.write_table(table.set_column(table.schema.get_field_index("x_3"), "x_3", column), path)
+    column = pa.array(moved(table["x_4"].to_numpy()))
+    pq.write_table(table.set_column(table.schema.get_field_index("x_4"), "x_4", column), path)
     done = noack("fidelity", run)
     assert done.exit_code == 1
     assert "too much" in done.stdout

@@ -171,7 +171,7 @@ def test_check_makes_the_plant_and_says_what_it_is(
          "plant.system.state_variables = [\"a\"]: expected 2 entries"),
         ('{ kind = "python", name = "a b" }', "use an entry point's name, or package.module:Class"),
         ('{ kind = "python", name = "a", sha256 = "' + 64 * "0" + '" }', "give file, too"),
-        ('{ kind = "python", file = ".", name = "a" }', 'plant.system.file = ".": is no file'),
+        ('{ kind = "python", file = ".", name = "a" }', '".": cannot be read: not a regular file'),
     ],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused_when_they_are_loaded(

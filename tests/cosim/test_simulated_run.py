@@ -16,7 +16,7 @@ from cosim.simulated_run import simulate_run
 from cosim.viewer import blueprint
 from cosim.viewer.opening_time import opening_time_ns
 from cosim.virtual import Progress, simulate
-from noack.errors import MachineError
+from noack.errors import CallerError, MachineError
 from noack.records import tables
 from noack.resolve import resolve
 from noack.scenario import Scenario
@@ -136,3 +136,12 @@ def test_the_view_opens_where_the_controller_errs_most(runs: Path) -> None:
     summary = json.loads((run_dir / "summary.json").read_text())
     assert summary["sup_e_c_norm"] == e_c.max()
     assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]
+
+
+def test_recorded_scenario_may_be_larger_than_one_that_a_person_writes(tmp_path: Path) -> None:
+    (tmp_path / "long.txt").write_text("10" * 200_000)
+    trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
+    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path, view=False)
+    assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
+    with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
+        load(ending.run_dir / "scenario.toml")

@@ -522,7 +522,7 @@ def test_a_missing_file_is_told_with_its_neighbours(tmp_path: Path) -> None:
 def test_what_cannot_be_read_as_text_is_told(tmp_path: Path) -> None:
     (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
     for path in (tmp_path, tmp_path / "bytes.toml"):
-        with pytest.raises(CallerError, match=r"^[^\n]*: cannot be read as text: [^\n]*$"):
+        with pytest.raises(CallerError, match=r"^[^\n]*: cannot be read: [^\n]*$"):
             load(path)
 
 

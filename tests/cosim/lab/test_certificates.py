@@ -28,7 +28,7 @@ def test_a_run_keeps_within_its_certificate(scenario: noack.Scenario, simulated:
     certificate = noack.certify(scenario).schedule
     samples = simulated.samples()
     t_s = samples["t_s"].to_numpy()
-    x_norm = np.hypot(samples["x_0"].to_numpy(), samples["x_1"].to_numpy())
+    x_norm = np.hypot(samples["x_1"].to_numpy(), samples["x_2"].to_numpy())
     assert (x_norm <= certificate.state(t_s)).all()
     assert (samples["e_s_norm"].to_numpy() <= certificate.sensor_error(t_s)).all()
 

@@ -1,5 +1,6 @@
 """A run's tables against its record and its summary, and in data frames."""
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import noack
 from cosim.crossing import crossing
 from cosim.join import join_all
 from cosim.record import load_record
+from cosim.replay.result import rows_differ
 
 
 def test_a_table_is_the_file_with_seconds_before_it(simulated: noack.Run) -> None:
@@ -28,8 +30,8 @@ def test_samples_are_the_joined_record(simulated: noack.Run) -> None:
     samples = simulated.samples()
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
         for i in range(2):
-            np.testing.assert_array_equal(samples[f"{name}_{i}"].to_numpy(), states[:, i])
-    e_c = np.hypot(*(samples[f"x_c_{i}"].to_numpy() - samples[f"x_{i}"].to_numpy() for i in (0, 1)))
+            np.testing.assert_array_equal(samples[f"{name}_{i + 1}"].to_numpy(), states[:, i])
+    e_c = np.hypot(*(samples[f"x_c_{i}"].to_numpy() - samples[f"x_{i}"].to_numpy() for i in (1, 2)))
     np.testing.assert_allclose(e_c, samples["e_c_norm"].to_numpy())
     assert (samples["event"].to_numpy() >= 0).sum() == simulated.summary["events"]
 
@@ -70,7 +72,7 @@ def test_a_damaged_table_is_one_line(tmp_path: Path, scenario: noack.Scenario) -
 def test_pandas_takes_every_table(simulated: noack.Run) -> None:
     pytest.importorskip("pandas", reason="pandas is not installed")
     frame = simulated.samples().to_pandas()
-    assert list(frame.columns)[:3] == ["t_s", "t_ns", "x_0"]
+    assert list(frame.columns)[:3] == ["t_s", "t_ns", "x_1"]
     assert frame["t_s"].is_monotonic_increasing
     events = simulated.events().to_pandas()
     assert events.loc[events.fate == "forced", "received"].all()
@@ -80,3 +82,16 @@ def test_polars_takes_every_table(simulated: noack.Run) -> None:
     polars = pytest.importorskip("polars", reason="polars is not installed")
     frame = polars.from_arrow(simulated.table("plant_step"))
     assert frame.columns[0] == "t_s"
+
+
+def test_states_have_one_name_everywhere(simulated: noack.Run) -> None:
+    """Figures, samples, columns of the record and what a replay says count from 1."""
+    names = ("x_1", "x_2")
+    assert simulated.scenario.model.state_names == names
+    assert [axes.get_ylabel().split("\n")[0] for axes in simulated.plot().axes[:2]] == [*names]
+    for columns in (simulated.samples(), simulated.table("plant_step")):
+        assert [name for name in columns.column_names if re.fullmatch("x_[0-9]+", name)] == [*names]
+    rows = simulated._record["plant_step"]
+    other = rows[3].copy()
+    other["x"][0] += 1
+    assert rows_differ("plant_step", 3, rows[3], other).column == "x_1"

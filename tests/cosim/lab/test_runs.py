@@ -132,5 +132,5 @@ def test_a_diverging_run_is_a_run() -> None:
     )  # fmt: skip
     assert not run.ok
     assert "diverged" in run.reason
-    assert not np.isfinite(run.table("plant_step")["x_0"].to_numpy()).all()
+    assert not np.isfinite(run.table("plant_step")["x_1"].to_numpy()).all()
     assert isinstance(run.plot(), Figure)

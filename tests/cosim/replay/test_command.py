@@ -61,20 +61,20 @@ def test_the_last_run_is_replayed(runs: Path) -> None:
 
 def test_a_difference_is_named_and_fails(runs: Path) -> None:
     rewrite(
-        runs / "latest/record/controller_step.parquet", lambda table: nudged(table, "x_c_2", 11)
+        runs / "latest/record/controller_step.parquet", lambda table: nudged(table, "x_c_3", 11)
     )
     done = noack("replay", runs / "latest")
     assert done.exit_code == 1
-    assert "controller_step row 11, x_c_2" in done.stdout
+    assert "controller_step row 11, x_c_3" in done.stdout
     assert "0x1." in done.stdout
     assert "not the machine of the run" not in done.stdout
     as_json = noack("replay", runs / "latest", "--json")
     assert as_json.exit_code == 1
-    assert json.loads(as_json.stdout)["first_difference"]["column"] == "x_c_2"
+    assert json.loads(as_json.stdout)["first_difference"]["column"] == "x_c_3"
 
 
 def test_a_difference_on_another_machine_says_so(runs: Path) -> None:
-    rewrite(runs / "latest/record/plant_step.parquet", lambda table: nudged(table, "x_0", 3))
+    rewrite(runs / "latest/record/plant_step.parquet", lambda table: nudged(table, "x_1", 3))
     path = runs / "latest/environment.json"
     environment = json.loads(path.read_text())
     environment["packages"]["numpy"] = "1.0"
@@ -118,7 +118,7 @@ def spoil(run_dir: Path, how: str) -> None:
     elif how == "no Parquet":
         step.write_bytes(b"PAR1 no more")
     elif how == "no column":
-        rewrite(step, lambda table: table.drop_columns(["x_3"]))
+        rewrite(step, lambda table: table.drop_columns(["x_4"]))
 
 
 @pytest.mark.parametrize("how", ["no scenario", "no record", "no table", "no Parquet", "no column"])

@@ -97,7 +97,7 @@ def test_a_flipped_bit_is_found_and_named(table: str, column: str, data: st.Data
     assert found.bit_exact is False
     assert first is not None
     assert first.table == table
-    name = f"{column}_{byte // 8}" if rows.dtype[column].shape else column
+    name = f"{column}_{byte // 8 + 1}" if rows.dtype[column].shape else column
     if column == "sequence":
         # With another message's number, the rest of the message is what differs; with the next
         # one's, the next row may be the one that repeats it.
@@ -262,12 +262,12 @@ def test_a_run_that_diverged_is_replayed() -> None:
 
 def test_every_bit_of_a_value_is_shown() -> None:
     for value in (0.1, math.nextafter(0.1, 1), -0.0, 5e-324):
-        shown = difference(CONTROLLER_STEP, 0, 0, "", "u_0", value, 0.0)
+        shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", value, 0.0)
         assert shown.recorded_hex is not None
         assert struct.pack("d", float.fromhex(shown.recorded_hex)) == struct.pack("d", value)
         assert shown.recorded_hex in str(shown)
     nans = [struct.unpack("<d", struct.pack("<Q", 0x7FF8 << 48 | i))[0] for i in (0, 1)]
-    shown = difference(CONTROLLER_STEP, 0, 0, "", "u_0", nans[0], nans[1])
+    shown = difference(CONTROLLER_STEP, 0, 0, "", "u_1", nans[0], nans[1])
     assert shown.recorded_hex != shown.replayed_hex
     json.dumps(replay(flipped(PLANT_STEP, 1, "x", 7, 6)).document(), allow_nan=False)
 
@@ -280,7 +280,7 @@ def test_the_document_is_json() -> None:
     document = json.loads(json.dumps(found.document(), allow_nan=False, ensure_ascii=False))
     assert document["bit_exact"] is False
     first = document["first_difference"]
-    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 3, "x_1")
+    assert (first["table"], first["row"], first["column"]) == (PLANT_STEP, 3, "x_2")
     assert first["recorded"] is None
     assert first["recorded_hex"].startswith("nan")
     assert float.fromhex(first["replayed_hex"]) == first["replayed"]
