@@ -45,6 +45,7 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
+        summary["judged_until_s"] = None
         _write_summary(run_dir, summary)
         # Written once more, so that nothing that is found out afterwards can cost a summary.
         claims = RunClaims(record)
@@ -90,6 +91,7 @@ def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summar
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
         found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+        found["judged_until_s"] = claims.judged_until_s
         found |= _lost_by_others(claims, summary)
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)

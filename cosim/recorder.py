@@ -84,7 +84,7 @@ class Recorder:
         self._spool.prepare([*self._types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._feed = None if view is None else ViewFeed(scenario, view)
         self._guard = Guard(scenario)
-        self._told_blind = False
+        self._told_blind = self._judges_no_more = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"), RingChannel(_BATCHES_IN_WAITING)
@@ -130,6 +130,10 @@ class Recorder:
                 alive.discard(instance)
             else:
                 alive.add(instance)
+
+    def judge_no_more(self) -> None:
+        """Leave what follows to the summary: the run is stopped, its processes end one by one."""
+        self._judges_no_more = True
 
     def show(self) -> None:
         """Bring the view and the coordinator up to date."""
@@ -260,6 +264,8 @@ class Recorder:
 
     def _judge(self, guard: Callable[[], list[Departure]]) -> None:
         """Say that claims are void, in the record, the view and the account."""
+        if self._judges_no_more:
+            return
         try:
             departures = guard()
         except Exception as error:  # whatever it is, what is recorded is recorded
@@ -380,6 +386,8 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
     confirmed_s = time.monotonic()
     while not recorder.finished:
         recorder.poll()
+        if node.stopping:
+            recorder.judge_no_more()
         for change, said in node.changes():
             recorder.change(change, said)
         now_s = time.monotonic()
