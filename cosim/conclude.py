@@ -5,6 +5,7 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +51,7 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
         # Written once more, so that nothing that is found out afterwards can cost a summary.
         claims = RunClaims(record)
         summary |= _found_out(record, claims, summary)
+        summary["exit"] = _end(summary)
         _write_summary(run_dir, summary)
         try:
             if report:
@@ -96,6 +98,16 @@ def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summar
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     return found
+
+
+def _end(summary: Summary) -> dict[str, Any]:
+    """How the run ended, whose replay is known: one that cannot be replayed failed."""
+    end: dict[str, Any] = summary["exit"]
+    verdict = summary["replay"]
+    if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
+        return end
+    why = verdict.get("error", "the record has no inputs")
+    return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
 
 
 def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:

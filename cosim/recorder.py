@@ -23,7 +23,7 @@ from cosim.viewer.opened import open_view, write_view
 from cosim.viewer.recording import RunView, ViewError
 from noack.changes import Change, said_of
 from noack.clock import NS_PER_S
-from noack.errors import ExitStatus, PeerError
+from noack.errors import ExitStatus, MachineError, PeerError
 from noack.io.messages import LogLine, heard
 from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
@@ -83,6 +83,8 @@ class Recorder:
         self._spool = SpoolWriter(run_dir / SPOOL, plane.instance if start.again else RECORDER)
         self._spool.prepare([*self._types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._feed = None if view is None else ViewFeed(scenario, view)
+        self.lost: MachineError | None = None
+        """Why what was recorded is not all on disk; known at the end."""
         self._guard = Guard(scenario)
         self._told_blind = self._judges_no_more = False
         session, key = plane.session, plane.key
@@ -165,7 +167,12 @@ class Recorder:
             self._feed.log(notice._asdict())
 
     def confirm(self) -> None:
-        """Tell every process what of it is on disk, so that it need not keep it any longer."""
+        """Tell every process what of it is on disk, so that it need not keep it any longer.
+
+        Raises:
+            MachineError: what was written is on disk no more.
+        """
+        self._spool.require_present()
         newest: dict[str, int] = {}
         for role, _, incarnation in self._got:
             newest[role] = max(newest.get(role, 0), incarnation)
@@ -185,6 +192,10 @@ class Recorder:
         """
         self._judge(self._guard.end)
         self._give_account()
+        try:
+            self._spool.require_present()
+        except MachineError as error:
+            self.lost = error
         self._spool.close()
         write_reports(self._run_dir, self._reports.values())
         record = finish_record(self._run_dir)
@@ -420,6 +431,8 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
         print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
     if recorder.view_is_incomplete:
         write_view(record, run_dir, node.ticket.run_id)
+    if recorder.lost is not None:
+        raise recorder.lost
 
 
 if __name__ == "__main__":

@@ -69,8 +69,8 @@ def _summarise(
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
     diverged = _divergence(record)
-    if diverged is not None and exit_status == ExitStatus.OK:
-        exit_status, reason = ExitStatus.FAILED, diverged.text
+    if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
+        exit_status, reason = ExitStatus.FAILED, why
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
     live = record.kind == "live"
     summary = {
@@ -186,6 +186,17 @@ def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     return dict(heard + Counter((channel.get("acknowledgements") or {}).get("rejected") or {}))
 
 
+def _why_failed(
+    record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None
+) -> str | None:
+    """Why a run failed that ended at its horizon; None if it did not fail."""
+    if diverged is not None:
+        return diverged.text
+    # What a process that was killed had not handed over is not among these; others took its place.
+    lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
+    return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
+
+
 def _divergence(record: RunRecord) -> Divergence | None:
     scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
     steps = record[PLANT_STEP]
@@ -255,8 +266,11 @@ def _or_none(statistic: Any, values: NDArray[np.float64]) -> float | None:
     return float(statistic(values)) if len(values) else None
 
 
-def _missing(record: RunRecord) -> dict[str, int]:
-    """Rows that a process made and the record lacks, by table."""
+def _missing(record: RunRecord) -> Counter[str]:
+    """Rows that a process made and the record lacks, by table.
+
+    Of a process that died without a report, by process, as far as is known.
+    """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
         for life in record.lives(role):

@@ -22,15 +22,21 @@ class SpoolWriter:
     """Appends batches to the spool.
 
     Args:
-        folder: the spool's directory; it is created.
+        folder: the spool's directory; it is created in the run directory.
         writer: names this writer's files.
+
+    Raises:
+        MachineError: the folder cannot be created.
     """
 
     def __init__(self, folder: Path, writer: str) -> None:
         self._folder = folder
         self._writer = writer
         self._files: dict[str, BinaryIO] = {}
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise self._cannot_be_written(error) from None
 
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system.
@@ -46,7 +52,7 @@ class SpoolWriter:
                 file.truncate(file.tell() - written)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
-            raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+            raise self._cannot_be_written(error) from None
 
     def prepare(self, tables: Iterable[str]) -> None:
         """Open the files of tables before there is anything to write.
@@ -58,13 +64,33 @@ class SpoolWriter:
             for table in tables:
                 self._open(table)
         except OSError as error:
-            raise MachineError(f"{self._folder}: the record cannot be written: {error}") from None
+            raise self._cannot_be_written(error) from None
+
+    def require_present(self) -> None:
+        """Check that the files are where they were made; what is written elsewhere is lost.
+
+        Raises:
+            MachineError: one was deleted or moved.
+        """
+        for table, file in self._files.items():
+            path = self._path(table)
+            try:
+                present = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            except FileNotFoundError:
+                present = False
+            if not present:
+                raise MachineError(f"{path}: was deleted or moved during the run; its rows are lost")
+
+    def _cannot_be_written(self, error: OSError) -> MachineError:
+        return MachineError(f"{self._folder}: the record cannot be written: {error}")
+
+    def _path(self, table: str) -> Path:
+        return self._folder / f"{table}.{self._writer}"
 
     def _open(self, table: str) -> BinaryIO:
         file = self._files.get(table)
         if file is None:
-            path = self._folder / f"{table}.{self._writer}"
-            file = self._files[table] = path.open("ab", buffering=0)
+            file = self._files[table] = self._path(table).open("ab", buffering=0)
         return file
 
     def close(self) -> None:
