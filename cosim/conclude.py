@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,10 +55,12 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
         summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
+        summary["judged_until_s"] = None
         _write_summary(run_dir, summary)
         # Written once more, so that nothing that is found out afterwards can cost a summary.
         claims = RunClaims(record)
         summary |= _found_out(record, claims, summary)
+        summary["exit"] = _end(summary)
         _write_summary(run_dir, summary)
         try:
             if report:
@@ -110,10 +113,21 @@ def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summar
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
         found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+        found["judged_until_s"] = claims.judged_until_s
         found |= _lost_by_others(claims, summary)
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     return found
+
+
+def _end(summary: Summary) -> dict[str, Any]:
+    """How the run ended, whose replay is known: one that cannot be replayed failed."""
+    end: dict[str, Any] = summary["exit"]
+    verdict = summary["replay"]
+    if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
+        return end
+    why = verdict.get("error", "the record has no inputs")
+    return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
 
 
 def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:

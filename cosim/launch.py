@@ -41,6 +41,11 @@ _MODULES = {
     "sensor": "sensor_node",
     "controller": "controller_node",
 }
+_STOPPED = {
+    signal.SIGINT: "stopped by the user",
+    signal.SIGTERM: "stopped on request",
+    signal.SIGHUP: "stopped as its terminal was closed",
+}
 _POLL_S = 0.01
 _STOP_PATIENCE_S = 15.0
 _OVERTIME_S, _OVERTIME_SHARE = 20.0, 0.2
@@ -268,7 +273,11 @@ class _Run:
     def _stopped(self, signals: Signals) -> tuple[ExitStatus, str] | None:
         if signals.received is None:
             return None
-        return signals.status, f"stopped by {_name(signals.received)}"
+        name = _name(signals.received)
+        return (
+            signals.status,
+            f"{_STOPPED.get(signal.Signals(signals.received), 'stopped')} ({name})",
+        )
 
     def _trouble(self, coordinator: Coordinator) -> tuple[ExitStatus, str] | None:
         """Why the run must end; None if it need not. Who died may be followed by another."""

@@ -23,7 +23,7 @@ from cosim.viewer.opened import open_view, write_view
 from cosim.viewer.recording import RunView, ViewError
 from noack.changes import Change, said_of
 from noack.clock import NS_PER_S
-from noack.errors import ExitStatus, PeerError
+from noack.errors import ExitStatus, MachineError, PeerError
 from noack.io.messages import LogLine, heard
 from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
@@ -83,8 +83,10 @@ class Recorder:
         self._spool = SpoolWriter(run_dir / SPOOL, plane.instance if start.again else RECORDER)
         self._spool.prepare([*self._types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
         self._feed = None if view is None else ViewFeed(scenario, view)
+        self.lost: MachineError | None = None
+        """Why what was recorded is not all on disk; known at the end."""
         self._guard = Guard(scenario)
-        self._told_blind = False
+        self._told_blind = self._judges_no_more = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
             key("telemetry", "*", "*"), RingChannel(_BATCHES_IN_WAITING)
@@ -131,6 +133,10 @@ class Recorder:
             else:
                 alive.add(instance)
 
+    def judge_no_more(self) -> None:
+        """Leave what follows to the summary: the run is stopped, its processes end one by one."""
+        self._judges_no_more = True
+
     def show(self) -> None:
         """Bring the view and the coordinator up to date."""
         self._judge(self._guard.advance)
@@ -161,7 +167,12 @@ class Recorder:
             self._feed.log(notice._asdict())
 
     def confirm(self) -> None:
-        """Tell every process what of it is on disk, so that it need not keep it any longer."""
+        """Tell every process what of it is on disk, so that it need not keep it any longer.
+
+        Raises:
+            MachineError: what was written is on disk no more.
+        """
+        self._spool.require_present()
         newest: dict[str, int] = {}
         for role, _, incarnation in self._got:
             newest[role] = max(newest.get(role, 0), incarnation)
@@ -181,6 +192,10 @@ class Recorder:
         """
         self._judge(self._guard.end)
         self._give_account()
+        try:
+            self._spool.require_present()
+        except MachineError as error:
+            self.lost = error
         self._spool.close()
         write_reports(self._run_dir, self._reports.values())
         record = finish_record(self._run_dir)
@@ -260,6 +275,8 @@ class Recorder:
 
     def _judge(self, guard: Callable[[], list[Departure]]) -> None:
         """Say that claims are void, in the record, the view and the account."""
+        if self._judges_no_more:
+            return
         try:
             departures = guard()
         except Exception as error:  # whatever it is, what is recorded is recorded
@@ -380,6 +397,8 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
     confirmed_s = time.monotonic()
     while not recorder.finished:
         recorder.poll()
+        if node.stopping:
+            recorder.judge_no_more()
         for change, said in node.changes():
             recorder.change(change, said)
         now_s = time.monotonic()
@@ -412,6 +431,8 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
         print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
     if recorder.view_is_incomplete:
         write_view(record, run_dir, node.ticket.run_id)
+    if recorder.lost is not None:
+        raise recorder.lost
 
 
 if __name__ == "__main__":

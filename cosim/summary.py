@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.changes import NEVER_NS, changes_of
 from cosim.crossing import Crossing, crossing
+from cosim.divergence import Divergence, divergence
 from cosim.estimation import disturbance_summary, estimation_summary, true_states
 from cosim.join import Joined, identity_residual, join_all
 from cosim.record import Life, Rows, RunRecord
@@ -67,9 +68,9 @@ def _summarise(
     residual = residual[~np.isnan(residual)]
     states = record[PLANT_STEP]["x"]
     missing, lost = _missing(record), _lost(record)
-    diverged_at_s = _diverged_at_s(record[PLANT_STEP])
-    if diverged_at_s is not None and exit_status == ExitStatus.OK:
-        exit_status, reason = ExitStatus.FAILED, _why_diverged(record, diverged_at_s)
+    diverged = _divergence(record)
+    if exit_status == ExitStatus.OK and (why := _why_failed(record, missing, diverged)):
+        exit_status, reason = ExitStatus.FAILED, why
     reception_s = np.diff(record[CONTROLLER_DELIVERY]["t_ns"]) * 1e-9
     common = joined.since_delivery(scenario)
     common_s, e_c_norm = joined.t_ns[common] * 1e-9, joined.e_c_norm[common]
@@ -126,7 +127,7 @@ def _summarise(
         "watchdog": _watchdog(record),
         "estimation": estimation_summary(record, _or_none(np.max, _true_e_c(record, joined))),
         "disturbances": disturbance_summary(record),
-        "diverged_at_s": diverged_at_s,
+        "diverged_at_s": None if diverged is None else diverged.at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }
     if scenario.is_acknowledged:
@@ -188,16 +189,26 @@ def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     return dict(heard + Counter((channel.get("acknowledgements") or {}).get("rejected") or {}))
 
 
-def _why_diverged(record: RunRecord, at_s: float) -> str:
+def _why_failed(
+    record: RunRecord, missing: Mapping[str, int], diverged: Divergence | None
+) -> str | None:
+    """Why a run failed that ended at its horizon; None if it did not fail."""
+    if diverged is not None:
+        return diverged.text
+    # What a process that was killed had not handed over is not among these; others took its place.
+    lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
+    return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
+
+
+def _divergence(record: RunRecord) -> Divergence | None:
+    scenarios = [record.scenario, *(made.scenario for made in changes_of(record))]
+    steps = record[PLANT_STEP]
+    found = divergence(steps["t_ns"] * 1e-9, steps["x"], scenarios)
     for notice in record.notices:
-        if notice["level"] == FAILED:
-            return f"the plant failed at {at_s:g} s: {notice['text']}"
-    return f"diverged: x is not finite at {at_s:g} s"
-
-
-def _diverged_at_s(steps: Rows) -> float | None:
-    lost = np.flatnonzero(~np.isfinite(steps["x"]).all(axis=1))
-    return float(steps["t_ns"][lost[0]]) * 1e-9 if len(lost) else None
+        if found is not None and notice["level"] == FAILED:
+            text = f"the plant failed at {found.at_s:g} s: {notice['text']}"
+            return found._replace(text=text)
+    return found
 
 
 def _violations(record: RunRecord) -> list[dict[str, Any]]:
@@ -258,8 +269,11 @@ def _or_none(statistic: Any, values: NDArray[np.float64]) -> float | None:
     return float(statistic(values)) if len(values) else None
 
 
-def _missing(record: RunRecord) -> dict[str, int]:
-    """Rows that a process made and the record lacks, by table."""
+def _missing(record: RunRecord) -> Counter[str]:
+    """Rows that a process made and the record lacks, by table.
+
+    Of a process that died without a report, by process, as far as is known.
+    """
     missing: Counter[str] = Counter()
     for role in LOOP_ROLES:
         for life in record.lives(role):

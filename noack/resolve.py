@@ -202,6 +202,7 @@ def _explicit_model(model: Model) -> Model:
             gain=model.gain or _rows(named.K),
             state_names=model.state_names or named.state_names,
             input_names=model.input_names or named.input_names,
+            allow_unstable=model.allow_unstable,
         )
     n, m = np.array(model.B).shape
     return model.model_copy(

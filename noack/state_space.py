@@ -18,7 +18,7 @@ from noack.linear import Matrix
 from noack.matrices import require_shape
 from noack.matrix_files import GAIN, unfit, write_matrices
 from noack.mistakes import brief
-from noack.sections.model import Model
+from noack.sections.model import Model, instability
 
 
 def model_of(
@@ -37,8 +37,8 @@ def model_of(
         input_names: likewise.
 
     Raises:
-        CallerError: the object is no such system; the shapes do not fit; or u = K x is not stable,
-            and u = -K x is.
+        CallerError: the object is no such system; the shapes do not fit; or u = K x does not
+            stabilise it.
     """
     states = state_names or _labels(system, "state_labels")
     inputs = input_names or _labels(system, "input_labels")
@@ -106,19 +106,9 @@ def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
         raise CallerError(f"the system: {error}") from None
     if (why := unfit(C, D, dt, n)) is not None:
         raise CallerError(f"the system: {why}")
-    if gain is not None:
-        _require_sign(found["A"], found["B"], found[GAIN])
+    if gain is not None and (why := instability(found["A"], found["B"], found[GAIN])) is not None:
+        raise CallerError(f"gain: {why}")
     return found
-
-
-def _require_sign(A: Matrix, B: Matrix, K: Matrix) -> None:
-    """Refuse a gain that destabilises, if its opposite stabilises."""
-    growth, opposite = (np.linalg.eigvals(A + sign * B @ K).real.max() for sign in (1, -1))
-    if growth > 0 > opposite:
-        raise CallerError(
-            "gain: the loop is not stable with u = K x, but is with u = -K x; "
-            "give -K (control.lqr and place_poles give the K of u = -K x)"
-        )
 
 
 def _matrix(name: str, value: Any) -> Matrix:

@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from cosim.changes import NEVER_NS, Made, changes_of
+from cosim.claims.common_time import common_end_ns, up_to_common_end
 from cosim.claims.evaluate import Claim, Claims, ClaimVerdict, Envelope, Part
 from cosim.claims.observed import Left
 from cosim.record import Rows, RunRecord
@@ -55,13 +56,23 @@ class RunClaims:
     record: RunRecord
 
     @cached_property
+    def _judged(self) -> RunRecord:
+        return up_to_common_end(self.record)
+
+    @property
+    def judged_until_s(self) -> float | None:
+        """Up to when a run that was stopped is judged; None if it is judged to its end."""
+        end_ns = common_end_ns(self.record)
+        return None if end_ns is None else end_ns / NS_PER_S
+
+    @cached_property
     def _changes(self) -> list[Made]:
-        return [made for made in changes_of(self.record) if made.touches_claims]
+        return [made for made in changes_of(self._judged) if made.touches_claims]
 
     @cached_property
     def parts(self) -> list[Claims | Claim]:
         """The claims of each part; where nothing can be claimed, the word on it."""
-        record, changes = self.record, self._changes
+        record, changes = self._judged, self._changes
         at_0 = setpoint_of(record.scenario)
         if not changes and at_0 is None:
             return [Claims(record)]
@@ -77,13 +88,13 @@ class RunClaims:
     @property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
-        return Claims(self.record).conditions
+        return Claims(self._judged).conditions
 
     @property
     def beyond_mansd(self) -> Left:
         """When more than M − 1 updates in a row had been lost, whoever lost them."""
         if not self._changes:
-            return Claims(self.record).beyond_mansd
+            return Claims(self._judged).beyond_mansd
         found: list[Left] = []
         for one in self.parts:
             if isinstance(one, Claims) and one.part is not None:
@@ -118,7 +129,7 @@ class RunClaims:
                 continue
             if one.part is None:
                 return one.envelopes()
-            if setpoint_of(self.record.scenario) is not None or one.part.from_s > 0:
+            if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
                 # In deviations from another set-point, or with other constants.
                 continue
             found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
@@ -126,7 +137,7 @@ class RunClaims:
 
     def _after(self, made: Made, until_ns: int) -> Claims | Claim:
         """The claims of the run of its own that follows a change."""
-        record, text = self.record, text_of(made.change.settings)
+        record, text = self._judged, text_of(made.change.settings)
         at_s, end_s = made.first_ns / NS_PER_S, until_ns / NS_PER_S
         late_ns = made.everywhere_ns
         deliveries = record[CONTROLLER_DELIVERY]

@@ -4,8 +4,17 @@ from noack.io.interrupt import quiet_interrupt
 
 with quiet_interrupt():
     # isort: off, in the order of the help
-    from cosim.cli import runs, comparison, knobs, theory
-    from cosim.cli import campaigns, design, processes, files, doctor
+    from cosim.cli import (
+        campaigns,
+        comparison,
+        design,
+        doctor,
+        files,
+        knobs,
+        processes,
+        runs,
+        theory,
+    )
 
     # isort: on
     from cosim.cli.app import app, find_scenario, main

@@ -269,7 +269,7 @@ def run_processes(
 
 
 def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
-    from cosim.exact.report import document, print_run, run_continuous
+    from cosim.exact.report import document, print_run, run_continuous, summary
     from cosim.progress import PatientConsole
     from noack.resolve import resolve
 
@@ -281,7 +281,7 @@ def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
         print_json(document(run, resolved))
     else:
         print_run(Console(), run, resolved)
-    return ExitStatus.OK if run.diverged_at_s is None else ExitStatus.FAILED
+    return ExitStatus(summary(run, resolved)["exit"]["status"])
 
 
 def _warn_of_violations(scenario: Scenario) -> None:

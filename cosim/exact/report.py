@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.divergence import Divergence, divergence
 from cosim.exact.fates import network_fates
 from cosim.exact.loop import Samples, continuous_loop_of
 from cosim.exact.run import ContinuousRun, simulate_continuous
@@ -73,7 +74,7 @@ def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
 def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
     """The run's figures, under the names that they have in a run's ``summary.json``."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
-    failed = run.diverged_at_s is not None
+    diverged = _divergence(run, samples, resolved)
     arrived = np.flatnonzero(run.delivered)
     drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
     return {
@@ -92,12 +93,18 @@ def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
         "inter_delivery_median_s": _or_none(np.median, np.diff(run.event_s[run.delivered])),
         "initial_state_norm": float(np.linalg.norm(samples.x[0])),
         "final_state_norm": float(np.linalg.norm(samples.x[-1])),
-        "diverged_at_s": run.diverged_at_s,
+        "diverged_at_s": None if diverged is None else diverged.at_s,
         "exit": {
-            "status": int(ExitStatus.FAILED if failed else ExitStatus.OK),
-            "reason": f"diverged at {run.diverged_at_s:g} s" if failed else "horizon",
+            "status": int(ExitStatus.OK if diverged is None else ExitStatus.FAILED),
+            "reason": "horizon" if diverged is None else diverged.text,
         },
     }
+
+
+def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
+    if run.diverged_at_s is not None:
+        return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
+    return divergence(samples.t_s, samples.x, [resolved])
 
 
 @np.errstate(all="ignore")

@@ -10,7 +10,6 @@ import numpy as np
 
 from cosim.shipped import find_shipped
 from noack import toml_file
-from noack.errors import CallerError
 from noack.linear import spectral_abscissa
 from noack.scenario import Scenario
 from noack.scenario_file import completed, put
@@ -100,11 +99,6 @@ def from_system(
     model = model_of(system, gain, state_names=state_names, input_names=input_names)
     A, B = model.matrices
     decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
-    if not decay_per_s > 0:
-        raise CallerError(
-            f"gain: the model is not stable with u = K x: A + BK grows by {-decay_per_s:.3g} /s; "
-            "give a gain for which all eigenvalues of A + BK have negative real parts"
-        )
     alpha_per_s = _rounded(_ALPHA_SHARE * decay_per_s)
     start = _plain(initial_state)
     norm = (

@@ -172,6 +172,8 @@ class Report(Said):
     """Tells it from another of its role."""
     realtime: dict[str, str] = Field({})
     """Each real-time setting, and whether it was granted."""
+    reached_ns: Nanoseconds | None = None
+    """Simulated time up to which it had done what was due; None if it failed."""
 
 
 class Progress(Said):

@@ -233,6 +233,7 @@ class Node:
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             if self.after is not None:
                 telemetry.notice(Notice(self.start.from_ns, RESTART, f"started anew: {self.after}"))
+            reached_ns: int | None = None
             changeable = cast(Changeable[T], machine) if self.role in CHANGEABLE else None
             try:
                 behind_ns = run_loop(
@@ -245,6 +246,7 @@ class Node:
                     spin_us=settings.spin_us,
                     news=lambda now_ns: self._announce(changeable, now_ns),
                 )
+                reached_ns = self.clock.now_ns() - behind_ns
                 if behind_ns and not self.stopping:
                     behind_s = behind_ns / NS_PER_S
                     self._ended = f"too slow: {behind_s:g} s behind; try a lower speed or rate"
@@ -261,6 +263,7 @@ class Node:
                     "rows": telemetry.totals(),
                     "incarnation": self.start.incarnation,
                     "instance": self.plane.instance,
+                    "reached_ns": reached_ns,
                 }
                 channel.close()
                 self._hand_over(telemetry)

@@ -21,7 +21,7 @@ class SpoolWriter:
     """Appends batches to the spool.
 
     Args:
-        folder: the spool's directory; it is created.
+        folder: the spool's directory; it is created in the run directory.
         writer: names this writer's files.
 
     Raises:
@@ -33,7 +33,7 @@ class SpoolWriter:
         self._writer = writer
         self._files: dict[str, BinaryIO] = {}
         with self._named():
-            folder.mkdir(parents=True, exist_ok=True)
+            folder.mkdir(exist_ok=True)
 
     def append(self, table: str, first: int, payload: bytes) -> None:
         """Write one batch through to the operating system.
@@ -64,11 +64,28 @@ class SpoolWriter:
                 f"{self._folder}: the record cannot be written: {why(error)}"
             ) from None
 
+    def require_present(self) -> None:
+        """Check that the files are where they were made; what is written elsewhere is lost.
+
+        Raises:
+            MachineError: one was deleted or moved.
+        """
+        for table, file in self._files.items():
+            path = self._path(table)
+            try:
+                present = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            except FileNotFoundError:
+                present = False
+            if not present:
+                raise MachineError(f"{path}: was deleted or moved during the run")
+
+    def _path(self, table: str) -> Path:
+        return self._folder / f"{table}.{self._writer}"
+
     def _open(self, table: str) -> BinaryIO:
         file = self._files.get(table)
         if file is None:
-            path = self._folder / f"{table}.{self._writer}"
-            file = self._files[table] = path.open("ab", buffering=0)
+            file = self._files[table] = self._path(table).open("ab", buffering=0)
         return file
 
     def close(self) -> None:

@@ -5,7 +5,7 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.linear import Matrix
+from noack.linear import Matrix, spectral_abscissa
 from noack.matrices import Rows, require_length, require_shape, shape
 from noack.models import MODEL_PARAMETERS, NAMED_MODELS
 from noack.section import Section
@@ -38,6 +38,8 @@ class Model(Section):
     """Names of the n states, for plots."""
     input_names: tuple[str, ...] | None = None
     """Names of the m inputs, for plots."""
+    allow_unstable: bool = False
+    """Accept a gain with which the model's closed loop Â + B̂K is not stable."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -50,7 +52,17 @@ class Model(Section):
         require_shape(self.gain, "gain", (m, n), "one row per input, one column per state")
         require_length(self.state_names, "state_names", n, "one name per state")
         require_length(self.input_names, "input_names", m, "one name per input")
+        self._require_stable()
         return self
+
+    def _require_stable(self) -> None:
+        (A, B), own = self.matrices, self.gain is None  # a named model's own gain
+        K = NAMED_MODELS[self.name or ""](self.parameters).K if own else np.array(self.gain)
+        key = "parameters" if own else "gain"
+        if not np.isfinite(_closed_loop(A, B, K)).all():
+            raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
+        if not self.allow_unstable and (why := instability(A, B, K)) is not None:
+            raise ValueError(f"{key}: {why}; if that is wanted, set model.allow_unstable = true")
 
     def _check_named(self, name: str) -> None:
         if self.A is not None or self.B is not None:
@@ -95,3 +107,33 @@ class Model(Section):
             named = NAMED_MODELS[self.name](self.parameters)
             return named.A, named.B
         return np.array(self.A), np.array(self.B)
+
+
+def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
+    """Why u = K x does not stabilise ẋ = A x + B u, and what would; None if it does.
+
+    Args:
+        A: (n, n), per second.
+        B: (n, m).
+        K: (m, n).
+    """
+    loops = (_closed_loop(A, B, K), _closed_loop(A, B, -K))
+    growth_per_s, opposite_per_s = (
+        spectral_abscissa(loop) if np.isfinite(loop).all() else np.inf for loop in loops
+    )
+    if growth_per_s < 0:
+        return None
+    remedy = (
+        "u = -K x does: give -K (control.lqr, and lqr and place of Matlab, give the K of u = -K x)"
+        if opposite_per_s < 0
+        else "give a gain for which all eigenvalues of A + BK have negative real parts"
+    )
+    return (
+        "u = K x does not stabilise the model: A + BK has an eigenvalue with real part "
+        f"{growth_per_s:.3g} /s; {remedy}"
+    )
+
+
+def _closed_loop(A: Matrix, B: Matrix, K: Matrix) -> Matrix:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(A + B @ K)

@@ -33,7 +33,7 @@ def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
     """A model, and a plant that is a little faster."""
     A, B = np.array(A, dtype=float), np.array(B, dtype=float)
     return {
-        "model": {"A": A.tolist(), "B": B.tolist(), "gain": gain},
+        "model": {"A": A.tolist(), "B": B.tolist(), "gain": gain, "allow_unstable": True},
         "plant__initial_state": [1.0] * len(A),
         "plant__draw": "given",
         "plant__A": (factor * A).tolist(),

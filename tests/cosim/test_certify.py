@@ -145,7 +145,7 @@ def test_the_command_prints_one_document() -> None:
 
 def test_nothing_certified_is_a_failure_that_says_why() -> None:
     """The gain does not stabilise this plant at all."""
-    settings = ["--set", "model.gain=[[1.0, 1.0]]"]
+    settings = ["--set", "model.gain=[[1.0, 1.0]]", "--set", "model.allow_unstable=true"]
     result = CliRunner().invoke(app, ["certify", "unstable_pendulum", *settings])
     assert result.exit_code == 1
     assert "void" in result.stdout
@@ -171,7 +171,8 @@ def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
 
 
 def test_a_gain_of_the_other_sign_is_recognised() -> None:
-    arguments = ["certify", "unstable_pendulum", "--set", "model.gain=[[15.0, 5.0]]"]
+    settings = ["--set", "model.gain=[[15.0, 5.0]]", "--set", "model.allow_unstable=true"]
+    arguments = ["certify", "unstable_pendulum", *settings]
     said = " ".join(CliRunner().invoke(app, arguments).stdout.split())
     assert "the loop's u is +Kx, and −K would stabilise it" in said
 
@@ -183,7 +184,7 @@ def test_a_gain_of_the_other_sign_is_recognised() -> None:
         ["plant.uncertainty_A=[[0.0, 0.0], [1e300, 0.0]]", 'plant.draw="nominal"'],
         ["plant.initial_state=[1e300, 1e300]"],
         ["trigger.beta=1e308", "trigger.floor=0.0"],
-        ["model.gain=[[0.0, -1e7]]"],
+        ["model.gain=[[0.0, -1e7]]", "model.allow_unstable=true"],
     ],
 )
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -28,7 +28,7 @@ def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
     tmp_path: Path, content: dict[str, Any], keys: dict[str, Any]
 ) -> None:
     content["trigger"] = keys
-    content["model"]["gain"] = [[3.0, 3.0]]
+    content["model"] |= {"gain": [[3.0, 3.0]], "allow_unstable": True}
     path = tmp_path / "unstable.toml"
     path.write_text(tomli_w.dumps(content))
     result = CliRunner().invoke(app, ["check", str(path)])

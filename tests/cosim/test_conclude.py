@@ -9,10 +9,10 @@ import pytest
 from rich.console import Console
 
 import cosim.conclude
-from cosim.conclude import reopen
-from cosim.ending import EndingFile
+from cosim.conclude import conclude, reopen
+from cosim.ending import Ending, EndingFile
 from cosim.environment import write_environment
-from cosim.record import write_record
+from cosim.record import RunRecord, write_record
 from cosim.run_dir import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
 from cosim.run_verdict import print_outcome
 from cosim.virtual import simulate
@@ -73,6 +73,49 @@ def test_a_replay_that_crashes_is_no_crash(run_dir: Path, monkeypatch: pytest.Mo
     assert outcome.summary["replay"]["bit_exact"] is None
     assert "a mistake of ours" in summary_of(run_dir)["replay"]["error"]
     assert outcome.summary | {"replay": None} == unharmed.summary | {"replay": None}
+
+
+def ended_well(run_dir: Path) -> Ending:
+    return Ending(run_dir, 0, ExitStatus.OK, "horizon")
+
+
+def test_a_run_that_cannot_be_replayed_fails(
+    run_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert conclude(ended_well(run_dir), report=False).status == ExitStatus.OK
+
+    def crash(record: object) -> None:
+        raise RuntimeError("a mistake of ours")
+
+    monkeypatch.setattr(cosim.conclude, "replay", crash)
+    outcome = conclude(ended_well(run_dir), report=False)
+    assert outcome.status == ExitStatus.FAILED
+    assert outcome.reason == ("the run cannot be replayed: RuntimeError('a mistake of ours')")
+    assert summary_of(run_dir)["exit"] == {"status": 1, "reason": outcome.reason}
+
+
+def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
+    record = cosim.conclude.load_record(run_dir)
+    no_rows = {table: record[table][:0] for table in record.tables}
+    write_record(RunRecord(record.scenario, no_rows, [], {}), run_dir)
+    (run_dir / REPORTS_FILE).unlink()  # of how much there was, nobody knows
+    outcome = conclude(ended_well(run_dir), report=False)
+    assert outcome.status == ExitStatus.FAILED
+    assert outcome.reason == "the run cannot be replayed: the record has no inputs"
+
+
+@pytest.mark.parametrize("cut", [slice(-40, None), slice(100, 140), slice(0, None)])
+def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
+    record = cosim.conclude.load_record(run_dir)
+    rows = {table: record[table] for table in record.tables}
+    lost = len(rows[PLANT_STEP][cut])
+    rows[PLANT_STEP] = np.delete(rows[PLANT_STEP], cut)
+    write_record(RunRecord(record.scenario, rows, [], record.reports), run_dir)
+    outcome = conclude(ended_well(run_dir), report=False)
+    assert outcome.status == ExitStatus.FAILED
+    assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
+    stopped = Ending(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
+    assert conclude(stopped, report=False).status == ExitStatus.INTERRUPTED
 
 
 def test_an_interrupted_replay_leaves_a_summary(

@@ -275,7 +275,10 @@ def test_a_threshold_within_the_noise_is_told_beforehand(observed: dict[str, Any
 
 
 def test_numbers_that_no_riccati_equation_bears_are_told(observed: dict[str, Any]) -> None:
-    observed["model"] = {"A": [[0.0, 1.0], [1e9, 0.0]], "B": [[0.0], [1.0]], "gain": [[1.0, 1.0]]}
+    observed["model"] = {
+        "A": [[0.0, 1.0], [1e9, 0.0]], "B": [[0.0], [1.0]], "gain": [[1.0, 1.0]],
+        "allow_unstable": True,
+    }  # fmt: skip
     observed["plant"]["rate_hz"] = 500.0
     scenario = resolved(observed)
     (found,) = [one for one in assumptions(scenario) if "observer's error" in one.what]

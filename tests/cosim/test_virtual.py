@@ -175,7 +175,7 @@ def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str
 
 def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:
     """ẋ = 2000 x: no number holds e^(2000 t) for long; what is no number is not received."""
-    content["model"] = {"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]]}
+    content["model"] = {"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True}
     content["plant"] = {"initial_state": [1.0]}
     record = simulate(resolve(validate(content, "test")))
     assert not np.isfinite(record[PLANT_STEP]["x"]).all()

@@ -13,6 +13,7 @@ from cosim.progress import progress_line
 from cosim.record import RunRecord, load_record
 from cosim.recorder import Recorder
 from cosim.run_dir import SCENARIO_FILE
+from noack.errors import MachineError
 from noack.io.messages import Progress, heard
 from noack.records import OWNER
 from noack.resolve import resolve
@@ -115,3 +116,28 @@ def test_the_terminal_says_each_cause_once(run: RunRecord, terminal: bool) -> No
             watcher.progress(account | {"void": void})
     assert shown.getvalue().count("one [cause]") == 1
     assert shown.getvalue().count("another") == 1
+
+
+def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    recorder.confirm()
+    (tmp_path / "spool" / "plant_step.recorder").unlink()
+    with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
+        recorder.confirm()
+    record = recorder.finish()  # what is left of it is kept
+    assert not len(record["plant_step"])
+    assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
+    assert "plant_step.recorder: was deleted or moved" in str(recorder.lost)
+
+
+def test_after_the_stop_nothing_more_is_said(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    recorder.judge_no_more()
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    recorder.show()
+    assert recorder.finish().notices == []

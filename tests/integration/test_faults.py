@@ -70,10 +70,15 @@ def test_a_frozen_process_is_named(start: Start) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["SIGINT", "SIGTERM"]
+    ("number", "status", "reason"),
+    [
+        (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
+        (signal.SIGTERM, 143, "stopped on request (SIGTERM)"),
+    ],
+    ids=["SIGINT", "SIGTERM"],
 )
 def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(
-    start: Start, number: signal.Signals, status: int
+    start: Start, number: signal.Signals, status: int, reason: str
 ) -> None:
     running = start(*LONG)
     wait_recording(running)
@@ -86,7 +91,10 @@ def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(
     running.process.send_signal(number)
     finished = running.finish()
     assert finished.status == status
-    assert finished.summary["exit"]["reason"] == f"stopped by {number.name}"
+    assert finished.summary["exit"]["reason"] == reason
+    until_s = finished.summary["judged_until_s"]
+    assert 0 < until_s <= finished.summary["reached_s"] + 0.1
+    assert all((claim["since_s"] or 0.0) <= until_s for claim in finished.summary["claims"])
     assert finished.summary["missing_samples"] == 0
     assert finished.summary["lost_outside_netem"] == 0
     assert set(finished.summary["realtime"]) == {"plant", "sensor", "controller", "netem"}
@@ -132,7 +140,11 @@ def test_a_run_that_diverges_says_when_and_keeps_its_record(tmp_path: Path) -> N
     finished = run_scenario(
         tmp_path,
         *settings(
-            horizon_s=4.0, model__parameters__a11=500.0, plant__rate_hz=100, controller__rate_hz=100
+            horizon_s=4.0,
+            model__parameters__a11=500.0,
+            model__allow_unstable=True,
+            plant__rate_hz=100,
+            controller__rate_hz=100,
         ),
         "--report",
     )

@@ -46,13 +46,13 @@ def test_who_waits_for_one_that_never_comes_may_interrupt(
     stdout, stderr = ended(recording.process)
     assert recording.process.returncode == 130
     (line,) = stderr.splitlines()
-    assert line.startswith("noack: stopped by SIGINT (logs in ")
+    assert line.startswith("noack: stopped by the user (SIGINT) (logs in ")
     assert json.loads(stdout)["exit"]["status"] == 130
     for role, process in processes.items():
         _, stderr = ended(process)
         assert process.returncode == 1
         why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
-        assert why in ("stopped by SIGINT", "the run's coordinator is gone"), stderr
+        assert why in ("stopped by the user (SIGINT)", "the run's coordinator is gone"), stderr
     assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     assert private_files(tmp_path) == []
 

@@ -22,7 +22,7 @@ from tests.integration.conftest import (
     noack_command,
     settings,
 )
-from tests.integration.test_faults import wait_recording
+from tests.integration.test_faults import LONG, wait_recording
 
 Start = Callable[..., Running]
 
@@ -174,6 +174,24 @@ def test_a_folder_that_becomes_read_only(start: Start, small: Disk) -> None:
     assert summary["exit"] == {"status": 1, "reason": f"recorder: {why}"}
     steps = load_record(run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(16 * RATE_HZ + 1))
+
+
+@pytest.mark.parametrize("what", ["", "sensor_measurement.recorder"])
+def test_a_spool_that_is_deleted_ends_the_run(start: Start, what: str) -> None:
+    running = start(*LONG)
+    wait_recording(running)
+    spool = (running.runs / "latest").resolve() / "spool"
+    if what:
+        (spool / what).unlink()
+    else:
+        shutil.rmtree(spool)
+    finished = running.finish()
+    assert finished.status == 1
+    reason = finished.summary["exit"]["reason"]
+    assert reason.startswith(f"recorder: {spool}/")
+    assert reason.endswith(f"{what}: was deleted or moved during the run; its rows are lost")
+    assert finished.summary["missing_samples"] > 0
+    assert running.left_behind() == []
 
 
 def test_a_folder_that_is_removed(start: Start) -> None:

@@ -165,13 +165,13 @@ def test_a_run_goes_on_untouched(
     finished = attacked.finished
     assert attacked.intruder.let_in == 0
     assert finished.status == 130, finished.stderr
-    assert finished.summary["exit"]["reason"] == "stopped by SIGINT"
+    assert finished.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     assert finished.summary["missing_samples"] == 0
     assert finished.summary["lost_outside_netem"] == 0
     assert finished.summary["replay"]["bit_exact"]
     assert finished.summary["replay"]["complete"]
     assert finished.summary["identity_residual_max"] < 1e-11
-    assert set(attacked.ended.values()) == {(1, "stopped by SIGINT")}
+    assert set(attacked.ended.values()) == {(1, "stopped by the user (SIGINT)")}
     steps = load_record(finished.run_dir)["plant_step"]
     assert np.array_equal(steps["sequence"], np.arange(len(steps)))
     secrets = {

@@ -106,7 +106,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
 
 def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
-    assert restarted.summary["exit"]["reason"] == "stopped by SIGINT"
+    assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     restarts = {one["process"]: one for one in restarted.summary["restarts"]}
     assert restarts.keys() == set(RESTARTED)
     for role, one in restarts.items():

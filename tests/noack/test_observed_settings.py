@@ -53,7 +53,7 @@ def test_disturbances(content: dict[str, Any], one: dict[str, Any], line: str) -
 
 def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any]) -> None:
     content["model"] = {
-        "A": [[0.0] * 4] * 4, "B": [[0.0]] * 4, "gain": [[0.0] * 4],
+        "A": [[0.0] * 4] * 4, "B": [[0.0]] * 4, "gain": [[0.0] * 4], "allow_unstable": True,
     }  # fmt: skip
     content["plant"] = {
         "system": {"kind": "cart_pole"}, "initial_state": [0.0] * 4,

@@ -310,6 +310,9 @@ LANE_MISTAKES = [
     ("plant.draw=given", "plant.A: ", 'draw = "given" needs both matrices A and B'),
     ("plant.A=[[1]]", "plant.A = [[1]]: ", 'matrices are for draw = "given", not .*"uniform"'),
     ("model.A=[[1]]", 'model.name = "lane_following": ', "give one or the other"),
+    # A gain that does not stabilise.
+    ("model.parameters.gain=-1.0", 'model.parameters = {"gain": -1.0}: ', "u = -K x does: give -K"),
+    ("model.gain=[[0,0,0,0],[0,0,0,0]]", "model.gain = ", "all eigenvalues of A . BK have neg"),
     # Numbers that the named model cannot use.
     ("model.parameters.look_ahead=0", "model.parameters.look_ahead = 0: ", "zero|0"),
 ]
@@ -339,6 +342,21 @@ DOUBLE_MISTAKES = [
         'model.input_names=["f","g"]',
         'model.input_names = ["f", "g"]: ',
         "expected 1 entries .*, found 2",
+    ),
+    (
+        "model.gain=[[1,1.5]]",
+        "model.gain = [[1, 1.5]]: ",
+        "real part 2 /s; u = -K x does: give -K",
+    ),
+    (
+        "model.gain=[[0,-1.5]]",
+        "model.gain = [[0, -1.5]]: ",
+        "real part 0 /s.*allow_unstable = true",
+    ),
+    (
+        "model={A=[[-1,0],[0,-1]],B=[[1e200],[1]],gain=[[1e200,0]]}",
+        "model.gain = [[1e+200, 0]]: ",
+        "infinite entries; check the units",
     ),
     ("model.parameters.a=1", 'model.parameters = {"a": 1}: ', "only a named model has parameters"),
     ("model={}", "model.A: ", r"missing: A, B, gain"),
@@ -628,6 +646,7 @@ def contents(draw: st.DrawFn) -> Content:
             "A": rows(n, n),
             "B": rows(n, m),
             "gain": rows(m, n, st.floats(-1, 1)),
+            "allow_unstable": True,
             "state_names": [draw(st.text(st.characters(codec="utf-8"))) for _ in range(n)],
         },
         "plant": plant,

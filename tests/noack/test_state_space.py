@@ -51,7 +51,7 @@ def test_a_system_of_python_control_is_a_model_with_its_names() -> None:
 def test_a_gain_of_lqr_is_of_the_opposite_sign_and_refused_as_it_is() -> None:
     control = pytest.importorskip("control")
     gain, _, _ = control.lqr(control_object(), np.eye(2), np.eye(1))
-    with pytest.raises(CallerError, match=r"not stable with u = K x, but is with u = -K x"):
+    with pytest.raises(CallerError, match=r"K x does not stabilise .*; u = -K x does: give -K"):
         model_of(control_object(), gain)
     assert np.allclose(np.array(model_of(control_object(), -gain).gain), -gain)
 

@@ -38,6 +38,7 @@ def scenario_of(
                     "A": rows(system.H - system.B @ system.K),
                     "B": rows(system.B),
                     "gain": rows(system.K),
+                    "allow_unstable": True,
                 },
                 "plant": {
                     "draw": "given",

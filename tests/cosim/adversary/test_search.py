@@ -133,6 +133,7 @@ def test_a_certificate_that_forgets_a_dropout_is_caught() -> None:
 
 def test_a_loop_that_diverges_is_as_bad_as_can_be(content: dict[str, Any]) -> None:
     content |= {"model": {"A": [[3.0]], "B": [[1.0]], "gain": [[1.0]]}, "horizon_s": 80.0}
+    content["model"]["allow_unstable"] = True
     content["plant"] = {"initial_state": [1.0]}
     worst = find_worst(resolve(validate(content, "small")), Objective.STATE)
     assert worst.diverges

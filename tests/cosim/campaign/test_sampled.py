@@ -140,9 +140,10 @@ def test_acknowledgements_that_are_lost_cost_transmissions() -> None:
 
 def test_a_run_that_fails_says_how() -> None:
     growing = "model.gain=[[0, 0, 0, 0], [0, 0, 0, 0]]"
-    (row,) = work(growing, "horizon_s=2000.0", "plant.rate_hz=5.0", "controller.rate_hz=5.0").run(
-        range(1)
-    )
+    (row,) = work(
+        growing, "model.allow_unstable=true",
+        "horizon_s=2000.0", "plant.rate_hz=5.0", "controller.rate_hz=5.0",
+    ).run(range(1))  # fmt: skip
     assert row["status"] == DIVERGED
     assert 0 < row["diverged_at_s"] < 2000
     assert np.isnan(row["cost"])

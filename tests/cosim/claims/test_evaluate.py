@@ -171,7 +171,7 @@ def test_what_happens_after_a_claim_is_void_is_not_judged(run: RunRecord) -> Non
 
 
 def test_without_a_certificate_the_claim_is_void_and_says_why(make: Make) -> None:
-    record = simulate(make(model={"gain": [[0.0, 0.0]]}, horizon_s=1.0))
+    record = simulate(make(model={"gain": [[0.0, 0.0]], "allow_unstable": True}, horizon_s=1.0))
     (claim,) = certified(record).values()
     assert claim.verdict is VOID
     assert "grows" in claim.why
@@ -180,7 +180,8 @@ def test_without_a_certificate_the_claim_is_void_and_says_why(make: Make) -> Non
 def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -> None:
     record = simulate(
         make(
-            horizon_s=1.0, model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]]},
+            horizon_s=1.0,
+            model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True},
             plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
         )
     )  # fmt: skip
@@ -406,7 +407,7 @@ def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
 
 def test_a_state_beyond_floating_point_is_not_held(make: Make) -> None:
     unstable = make(
-        model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]]},
+        model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]], "allow_unstable": True},
         plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,
     )  # fmt: skip
     with np.errstate(all="ignore"):

@@ -311,7 +311,8 @@ def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) ->
     """What is no number is not received: at 400 Hz e^{709} is passed within 0.4 s."""
     record = simulate(
         make(
-            horizon_s=1.0, model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]]},
+            horizon_s=1.0,
+            model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True},
             plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
         )
     )  # fmt: skip

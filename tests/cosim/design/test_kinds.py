@@ -180,13 +180,16 @@ def test_no_figure_is_cut_off_in_80_columns(
     assert max(map(len, table)) <= 80
 
 
+UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["--set", "trigger.floor=3"], "trigger.floor = 3: must be less than the largest β"),
         (["--set", 'mode="zoh"', "--weights", "chosen"], "models that hold do not decay"),
-        (["--set", "model.gain=[[-0.5]]"], "not stable; --gain lqr chooses another"),
-        (["--set", "model.gain=[[-0.5]]", "--weights", "chosen"], "--gain lqr chooses another"),
+        (UNSTABLE, "not stable; --gain lqr chooses another"),
+        ([*UNSTABLE, "--weights", "chosen"], "--gain lqr chooses another"),
         (["--set", 'network.protocol="ack"'], "network.protocol"),
         (["--weights", "given"], "the scenario has no trigger.weight"),
         (["--bound", "error=1", "--bound", "error=2"], "error has one already"),

@@ -74,6 +74,7 @@ def test_a_loop_that_diverges_fails() -> None:
     """A model that knows the unstable loop: no event, and no end of growth."""
     told = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
                  "--set", 'plant.draw="nominal"', "--set", "model.gain=[[20.0, 20.0]]",
+                 "--set", "model.allow_unstable=true",
                  "--set", "horizon_s=1000", "--json")  # fmt: skip
     assert told.exit_code == 1
     summary = json.loads(told.stdout)["summary"]

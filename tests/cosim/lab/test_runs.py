@@ -78,7 +78,7 @@ def test_a_live_run_that_is_interrupted_is_returned() -> None:
         assert any("/10 s" in line for line in process.stderr)
         process.send_signal(signal.SIGINT)
         stdout, _ = process.communicate(timeout=100)
-    assert stdout.split("\n")[0] == "False stopped by SIGINT True"
+    assert stdout.split("\n")[0] == "False stopped by the user (SIGINT) True"
     assert process.returncode == 0
 
 

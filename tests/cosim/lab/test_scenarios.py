@@ -101,7 +101,7 @@ def test_python_controls_system_brings_its_names_and_the_plant_is_another() -> N
     ("gain", "initial_state", "said"),
     [
         ([[15.0, 5.0]], [0.2, 0.0], "give -K"),
-        ([[0.0, 0.0]], [0.2, 0.0], "is not stable with u = K x: A + BK grows by 3.08 /s"),
+        ([[0.0, 0.0]], [0.2, 0.0], "has an eigenvalue with real part 3.08 /s; give a gain"),
         (GAIN, [0.2], "plant.initial_state"),
         (GAIN, "upright", "plant.initial_state"),
     ],

@@ -251,7 +251,8 @@ def test_an_empty_record_is_not_called_exact() -> None:
 
 
 def test_a_run_that_diverged_is_replayed() -> None:
-    settings = [*SHORT, "model.gain=[[900.0,900.0,900.0,900.0],[0.0,0.0,0.0,0.0]]", "mode=zoh"]
+    gain = "model.gain=[[900.0,900.0,900.0,900.0],[0.0,0.0,0.0,0.0]]"
+    settings = [*SHORT, gain, "model.allow_unstable=true", "mode=zoh"]
     path = ROOT / "scenarios" / "lane_following.toml"
     diverged = simulate(resolve(load(path, [*settings, "horizon_s=60.0"])))
     assert not np.isfinite(diverged[PLANT_STEP]["x"]).all()

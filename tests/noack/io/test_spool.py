@@ -1,4 +1,5 @@
 import itertools
+import shutil
 import struct
 from pathlib import Path
 
@@ -28,8 +29,8 @@ def numbers(first: int, end: int) -> bytes:
 
 def test_batches_come_back_as_they_were_written(tmp_path: Path) -> None:
     batches = [(0, b"abc"), (3, b""), (3, bytes(10_000)), (2**64 - 1, b"x")]
-    spool(tmp_path / "new" / "spool", "recorder", "plant_step", *batches)
-    assert list(read_chunks(tmp_path / "new" / "spool", "plant_step")) == batches
+    spool(tmp_path / "spool", "recorder", "plant_step", *batches)
+    assert list(read_chunks(tmp_path / "spool", "plant_step")) == batches
 
 
 def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
@@ -148,3 +149,31 @@ def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
     (tmp_path / "spool").write_text("")
     with pytest.raises(MachineError, match=r"spool: the record cannot be written: File exists$"):
         SpoolWriter(tmp_path / "spool", "recorder")
+
+
+@pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])
+def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str) -> None:
+    folder = tmp_path / "spool"
+    writer = SpoolWriter(folder, "recorder")
+    writer.prepare(["step", "other"])
+    writer.append("step", 0, b"abc")
+    writer.require_present()
+    path = folder / "step.recorder"
+    if what == "folder":
+        shutil.rmtree(folder)
+    elif what == "moved":
+        path.rename(tmp_path / "elsewhere")
+    else:
+        path.unlink()
+        if what == "replaced":
+            path.write_bytes(b"")
+    writer.append("step", 3, b"de")  # the system takes it: nobody will find it
+    with pytest.raises(MachineError, match=r"/step\.recorder: was deleted or moved"):
+        writer.require_present()
+    writer.close()
+
+
+def test_no_spool_is_made_where_the_run_directory_is_gone(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
+        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
+    assert not (tmp_path / "gone").exists()

@@ -312,7 +312,10 @@ def test_there_is_a_box_certificate_where_there_is_a_box() -> None:
 
 def test_a_void_certificate_says_why_and_bounds_nothing() -> None:
     resolved = resolve(
-        load(ROOT / "scenarios/lane_following.toml", ["model.gain=[[0,0,0,0],[0,0,0,0]]"])
+        load(
+            ROOT / "scenarios/lane_following.toml",
+            ["model.gain=[[0,0,0,0],[0,0,0,0]]", "model.allow_unstable=true"],
+        )
     )
     found = certify(resolved, ideal_conditions(resolved))
     assert found.constants is None
