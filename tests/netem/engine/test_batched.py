@@ -164,9 +164,9 @@ def test_first_starts_at_the_same_time_both_say_so_and_later_ones_do_not(
         folder.mkdir(parents=True)
         (folder / "run_pump.nbi").touch()
     os.utime(old, (0, 0))
-    said = [process.communicate(timeout=100)[1] for process in (start(), start())]
+    said = [process.communicate(timeout=400)[1] for process in (start(), start())]
     line = "noack netem: compiling the relay for this machine, once; this takes about 15 s\n"
     assert said == [line, line]
-    assert start().communicate(timeout=100)[1] == ""
+    assert start().communicate(timeout=400)[1] == ""
     assert not old.exists()
     assert young.exists()
