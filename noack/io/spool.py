@@ -79,7 +79,7 @@ class SpoolWriter:
             except FileNotFoundError:
                 present = False
             if not present:
-                raise MachineError(f"{path}: was deleted or moved during the run; its rows are lost")
+                raise MachineError(f"{path}: was deleted or moved during the run")
 
     def _cannot_be_written(self, error: OSError) -> MachineError:
         return MachineError(f"{self._folder}: the record cannot be written: {error}")

@@ -90,9 +90,7 @@ def test_a_run_that_cannot_be_replayed_fails(
     monkeypatch.setattr(cosim.conclude, "replay", crash)
     outcome = conclude(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
-    assert outcome.reason == (
-        "the run cannot be replayed: RuntimeError('a mistake of ours')"
-    )
+    assert outcome.reason == ("the run cannot be replayed: RuntimeError('a mistake of ours')")
     assert summary_of(run_dir)["exit"] == {"status": 1, "reason": outcome.reason}
 
 

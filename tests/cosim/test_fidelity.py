@@ -233,9 +233,7 @@ def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
 
 
 def test_a_loop_whose_events_accumulate_says_so() -> None:
-    unstable = lane(
-        None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20"
-    )
+    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
     with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
         compare(unstable, max_events=200)
 

@@ -138,8 +138,11 @@ def test_a_run_that_diverges_says_when_and_keeps_its_record(tmp_path: Path) -> N
     finished = run_scenario(
         tmp_path,
         *settings(
-            horizon_s=4.0, model__parameters__a11=500.0, model__allow_unstable=True,
-            plant__rate_hz=100, controller__rate_hz=100,
+            horizon_s=4.0,
+            model__parameters__a11=500.0,
+            model__allow_unstable=True,
+            plant__rate_hz=100,
+            controller__rate_hz=100,
         ),
         "--report",
     )

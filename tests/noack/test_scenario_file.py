@@ -344,7 +344,11 @@ DOUBLE_MISTAKES = [
         "expected 1 entries .*, found 2",
     ),
     ("model.gain=[[1,1.5]]", "model.gain = [[1, 1.5]]: ", "real part 2 /s; u = -K x does: give -K"),
-    ("model.gain=[[0,-1.5]]", "model.gain = [[0, -1.5]]: ", "real part 0 /s.*allow_unstable = true"),
+    (
+        "model.gain=[[0,-1.5]]",
+        "model.gain = [[0, -1.5]]: ",
+        "real part 0 /s.*allow_unstable = true",
+    ),
     (
         "model={A=[[-1,0],[0,-1]],B=[[1e200],[1]],gain=[[1e200,0]]}",
         "model.gain = [[1e+200, 0]]: ",
