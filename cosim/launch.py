@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ _MODULES = {
     "sensor": "sensor_node",
     "controller": "controller_node",
 }
-_STOPPED = {
+_STOPPED: Mapping[int, str] = {
     signal.SIGINT: "stopped by the user",
     signal.SIGTERM: "stopped on request",
     signal.SIGHUP: "stopped as its terminal was closed",
@@ -274,10 +274,7 @@ class _Run:
         if signals.received is None:
             return None
         name = _name(signals.received)
-        return (
-            signals.status,
-            f"{_STOPPED.get(signal.Signals(signals.received), 'stopped')} ({name})",
-        )
+        return signals.status, f"{_STOPPED[signals.received]} ({name})"
 
     def _trouble(self, coordinator: Coordinator) -> tuple[ExitStatus, str] | None:
         """Why the run must end; None if it need not. Who died may be followed by another."""

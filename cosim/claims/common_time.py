@@ -35,7 +35,7 @@ def common_end_ns(record: RunRecord) -> int | None:
     if all(report.get("ended") == HORIZON for report in reports):
         return None
     reached_ns = [report.get("reached_ns") for report in reports]
-    known_ns = [one for one in reached_ns if one is not None]
+    known_ns = [int(one) for one in reached_ns if one is not None]
     measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
     if len(known_ns) < len(reports) or not len(measured_ns):
         return None

@@ -60,7 +60,7 @@ class Run:
 
     @property
     def ok(self) -> bool:
-        """Whether the run reached its horizon, and every process its end."""
+        """Whether the run reached its horizon, did not diverge, and all its rows are on record."""
         return self._outcome.status is ExitStatus.OK
 
     @property

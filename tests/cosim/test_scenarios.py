@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
+from cosim.certify import with_weight
+from cosim.claims.evaluate import scheduled_certificates
 from cosim.linearisation import linearisation, said
 from cosim.record import RunRecord
 from cosim.summary import summarise
@@ -259,3 +261,22 @@ def test_of_a_plant_whose_x_is_no_state_the_summary_says_so() -> None:
     assert said(found) == (
         ("the plant, linearised", "none: x does not tell what follows, or not smoothly"),
     )
+
+
+def test_the_f16s_file_says_truly_what_is_not_certified_of_it() -> None:
+    """A certificate at its own schedule would make the file's words untrue."""
+    words = (SCENARIOS / "f16_lateral.toml").read_text().partition("name =")[0]
+    own, box = scheduled_certificates(shipped("f16_lateral"))
+    degree = math.degrees(1)
+    in_degrees = [
+        f"trigger.weight={np.diag([degree] * 4 + [1.0] * 3).tolist()}",
+        f"trigger.beta={0.1 * degree}", f"trigger.floor={0.001 * degree}",
+    ]  # fmt: skip
+    scaled, _ = scheduled_certificates(shipped("f16_lateral", *in_degrees))
+    for one, loop_gain in ((own, "14"), (box, "55.7"), (scaled, "1.11")):
+        assert one.void == f"the loop gain of the errors is {loop_gain}, not below 1"
+        assert f"{loop_gain} for" in words
+    chosen, _ = with_weight(shipped("f16_lateral", "certificate.late_periods=0"), "chosen")
+    assert scheduled_certificates(chosen)[0].constants is not None
+    fast = shipped("f16_lateral", "plant.rate_hz=20000.0", "controller.rate_hz=20000.0")
+    assert all(one.constants is not None for one in scheduled_certificates(fast))
