@@ -172,8 +172,9 @@ class Coordinator:
     def is_leaving(self, role: str) -> bool:
         """Whether a process said a moment ago that it ends, so that it may not have ended yet."""
         member = self._members.get(role)
-        said = member is not None and member.left is not None
-        return said and member is not None and time.monotonic() - member.left_s < _EXIT_GRACE_S
+        if member is None or member.left is None:
+            return False
+        return time.monotonic() - member.left_s < _EXIT_GRACE_S
 
     def last_words(self, role: str) -> str | None:
         """Why a process that has ended did so, as it said itself; None if it said nothing."""

@@ -32,7 +32,7 @@ class Ending:
 class EndingFile:
     """The file in which a run's launcher stores how the run ends.
 
-    As a context it also stores the error that leaves it.
+    As a context it also stores the error that leaves it, unless an end is stored.
 
     Args:
         run_dir: the run's directory.
@@ -42,6 +42,7 @@ class EndingFile:
     """
 
     def __init__(self, run_dir: Path) -> None:
+        self._is_blank = True
         try:
             self._file = (run_dir / ENDING_FILE).open("wb", buffering=0)
             self._file.write(b" " * _ROOM_BYTES)
@@ -57,13 +58,14 @@ class EndingFile:
         error: BaseException | None,
         _traceback: TracebackType | None,
     ) -> None:
-        if isinstance(error, NoackError):
+        if self._is_blank and isinstance(error, NoackError):
             self.store(error.exit_status, str(error))
         self._file.close()
 
     def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
         """Store how the run ended, in the words of its summary."""
         found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        self._is_blank = False
         text = json.dumps(found).encode().ljust(_ROOM_BYTES)
         with contextlib.suppress(OSError):  # the terminal shows it all the same
             self._file.seek(0)

@@ -24,6 +24,7 @@ from cosim.viewer.recording import RunView, ViewError
 from noack.changes import Change, said_of
 from noack.clock import NS_PER_S
 from noack.errors import ExitStatus, MachineError, PeerError
+from noack.io.command_line import print_to_stderr
 from noack.io.messages import LogLine, heard
 from noack.io.node import LAUNCHER_GONE, Node
 from noack.io.plane import Plane
@@ -223,7 +224,7 @@ class Recorder:
             self._keep(role, table, *first_row(header), payload)
         except (PeerError, ValueError) as error:
             if not self._junk:
-                print(f"noack recorder: ignored what is no telemetry: {error}", file=sys.stderr)
+                print_to_stderr(f"noack recorder: ignored what is no telemetry: {error}")
             self._junk += 1
 
     def _keep(self, role: str, table: str, incarnation: int, first: int, payload: bytes) -> None:
@@ -352,7 +353,7 @@ class Recorder:
                 self._got[role, NOTICES, incarnation].add(first, first + 1)
 
     def _give_up_view(self, error: ViewError) -> None:
-        print(f"noack recorder: {error}; the numeric record goes on", file=sys.stderr)
+        print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
         self._feed = None
         self._out_of_order = True
 
@@ -428,7 +429,7 @@ def _record_run(node: Node, live_view: LiveView | None) -> None:
         if view is not None:
             view.close()
     except ViewError as error:
-        print(f"noack recorder: {error}; the numeric record is whole", file=sys.stderr)
+        print_to_stderr(f"noack recorder: {error}; the numeric record is whole")
     if recorder.view_is_incomplete:
         write_view(record, run_dir, node.ticket.run_id)
     if recorder.lost is not None:

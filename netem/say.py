@@ -1,11 +1,8 @@
 """Lines on standard error, for whoever runs the emulator."""
 
-import sys
-from contextlib import suppress
+from noack.io.command_line import print_to_stderr
 
 
 def say(line: str) -> None:
     """Say something; the emulator goes on if nobody can hear it any more."""
-    if sys.stderr is not None:
-        with suppress(OSError, ValueError):  # full, a broken pipe; closed
-            print(f"noack netem: {line}", file=sys.stderr, flush=True)
+    print_to_stderr(f"noack netem: {line}")

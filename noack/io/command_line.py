@@ -35,7 +35,13 @@ def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> Exit
         if as_json and sys.stdout is not None:
             reason = {"status": int(status), "reason": message}
             print(json.dumps({"error": message, "exit": reason}, indent=2), flush=True)
-    with suppress(OSError):
-        for line in message.splitlines():
-            print(f"{who}: {line}", file=sys.stderr)
+    for line in message.splitlines():
+        print_to_stderr(f"{who}: {line}")
     return status
+
+
+def print_to_stderr(line: str) -> None:
+    """Print a line, and go on if it cannot be written: nobody reads, or the log's disk is full."""
+    if sys.stderr is not None:
+        with suppress(OSError, ValueError):  # full, a broken pipe; closed
+            print(line, file=sys.stderr, flush=True)

@@ -20,6 +20,7 @@ from noack.changes import Change, Changeable
 from noack.clock import NS_PER_S, RunClock
 from noack.errors import CallerError, NoackError, PeerError, one_line
 from noack.io.address import Address
+from noack.io.command_line import print_to_stderr
 from noack.io.loop import Channel, run_loop
 from noack.io.messages import Admission, Announced, Begin, Kept, Missing, Said, heard
 from noack.io.plane import Plane
@@ -137,7 +138,7 @@ class Node:
             raise PeerError("the coordinator did not say where everyone receives")
         if not self.ticket.launched:
             verb = f"takes the place of one before ({self.after})" if self.after else "started"
-            print(f"noack {self.role}: {verb}", file=sys.stderr)
+            print_to_stderr(f"noack {self.role}: {verb}")
         return addresses
 
     def _ask(self, what: str, more: dict[str, Any], answer: type[Said], timeout_s: float) -> Any:
@@ -306,7 +307,7 @@ class Node:
             try:
                 found += machine.announce(change, now_ns)
             except CallerError as error:  # the coordinator would not have said so
-                print(f"noack {self.role}: ignored: {error}", file=sys.stderr)
+                print_to_stderr(f"noack {self.role}: ignored: {error}")
         self._looping = True
         return found
 

@@ -1,7 +1,10 @@
 """A recorder that takes another's place knows what that one knew."""
 
+import errno
 import json
+import os
 from collections.abc import Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +13,9 @@ import pytest
 
 from cosim import recorder
 from cosim.recorder import Recorder
-from cosim.run_dir import SCENARIO_FILE
+from cosim.run_dir import SCENARIO_FILE, SPOOL
+from cosim.viewer.recording import ViewError
+from noack.io.spool import read_chunks
 from noack.io.telemetry import NOTICES
 from noack.machine import BEGINNING, INCARNATION, Start
 from noack.records import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
@@ -112,3 +117,18 @@ def test_it_does_not_wait_for_who_has_left(run: Run, monkeypatch: pytest.MonkeyP
     assert not run.recorder.finished
     assert run.goodbye("plant") == {}
     assert run.recorder.finished
+
+
+def test_a_log_on_a_full_disk_costs_no_record(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails first then is the view; to say so must not fail, too."""
+
+    class Full(StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("sys.stderr", Full())
+        run.recorder._give_up_view(ViewError("no space left"))
+        run.say("junk", 0, b"", "plant")
+    run.rows(PLANT_STEP, 3)
+    assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1

@@ -45,7 +45,8 @@ def test_who_only_seemed_to_be_gone_may_join_again(plane: FakePlane, barrier: Co
     assert "sensor" not in barrier.missing()
     lose(plane, barrier)
     assert "sensor" in barrier.missing()
-    assert not first.answered  # it asks again by itself
+    assert first.dismissed  # it asks again by itself
+    assert not first.answered
     second = ask(plane, barrier, "join")
     assert second.error is None
     assert barrier.missing() == tuple(role for role in ROLES if role != "sensor")

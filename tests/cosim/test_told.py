@@ -8,6 +8,7 @@ import pytest
 import noack
 from cosim.coordinator import Coordinator
 from cosim.launch import _overdue
+from cosim.start_limit import StartLimit
 from cosim.tables import key_numbers
 from noack.topology import RECORDER
 
@@ -46,5 +47,5 @@ def test_a_claim_names_the_level_that_its_bound_is_a_multiple_of(beta: float, le
 )
 def test_a_run_that_does_not_end_names_who_did_not(here: tuple[str, ...], named: str) -> None:
     coordinator = SimpleNamespace(epoch_ns=0, finished=lambda role: role not in here)
-    said = _overdue(cast(Coordinator, coordinator))
+    said = _overdue(cast(Coordinator, coordinator), StartLimit(30.0))
     assert said == f"the run did not end at its horizon: no end came from {named}"

@@ -38,6 +38,8 @@ class Query:
     replies: list[str] = field(default_factory=list)
     error: str | None = None
     answered: int = 0
+    dismissed: bool = False
+    """Whether it was left without an answer, which who asks is told of, to ask again."""
 
     @property
     def payload(self) -> Payload | None:
@@ -104,7 +106,7 @@ class FakePlane:
         query.reply_err(reason)
 
     def dismiss(self, query: Query) -> None:
-        query.drop()
+        query.dismissed = True
 
     def announce(self, content: Any) -> None:
         self.announced.append(json.loads(json.dumps(content)))
