@@ -158,7 +158,7 @@ def _broadcasts(axes: Axes, t_s: Reals, dropped: Flags) -> None:
     stems(axes, t_s, interval_s, color=_SENSOR)
     lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 6.5, "markeredgewidth": 1.8}
     shown = marks(axes, t_s[~dropped], interval_s[~dropped], "sent", color=_SENSOR, marker="o")
-    shown += marks(axes, t_s[dropped], interval_s[dropped], "sent, dropped", **lost)
+    shown += marks(axes, t_s[dropped], interval_s[dropped], "sent, lost", **lost)
     axes.set_title("Broadcasting intervals")
     legend(axes, shown)
 
@@ -171,7 +171,7 @@ def _receptions(axes: Axes, t_s: Reals, forced: Flags, dropped_s: Reals) -> None
     free = ~forced
     shown = marks(axes, t_s[free], interval_s[free], "received", color=_CONTROLLER, marker="o")
     shown += marks(axes, t_s[forced], interval_s[forced], "received, forced", **diamond)
-    shown += marks(axes, dropped_s, np.zeros(len(dropped_s)), "dropped", **lost)
+    shown += marks(axes, dropped_s, np.zeros(len(dropped_s)), "lost", **lost)
     axes.set_title("Receiving intervals")
     legend(axes, shown)
 

@@ -77,6 +77,7 @@ Sensor and controller run **{hold}** between updates. The sensor transmits when
 The network ({network.loss.model.replace("_", "-")} loss) drops at most
 M − 1 = {network.mansd} packets in a row. {protocol}
 
+* A finished run opens where ‖e_c‖ is largest. **Colours** names what each colour stands for.
 * **The picture**: the plant, solid, and in outline where the sensor's model (whole line) and the
   controller's (dashes) believe it is. Play the run to see it move.
 * **Packets**: each update on its way; what is lost falls, what was forced through is a diamond.

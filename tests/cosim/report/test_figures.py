@@ -151,8 +151,8 @@ def test_intervals_and_fates_are_drawn_where_they_belong() -> None:
         dropped=dropped, received_s=broadcast_s[~dropped], forced=np.array([True, False, True]),
     )  # fmt: skip
     _, above, below = figure.axes
-    assert labels(above) == ["sent", "sent, dropped"]
-    assert labels(below) == ["received", "received, forced", "dropped"]
+    assert labels(above) == ["sent", "sent, lost"]
+    assert labels(below) == ["received", "received, forced", "lost"]
     found = {
         line.get_marker(): dict(zip(line.get_xdata(), line.get_ydata(), strict=True))
         for axes in (above, below)
