@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
-from noack.wire import Flow, datagram_bytes
+from noack.protocol.wire_format import Flow, datagram_bytes
 
 LOOPBACK = "127.0.0.1"
 _SENDERS = 4

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._report import MeasurementError
-from noack.io.realtime import realtime
+from noack.runtime.real_time_settings import realtime
 
 PING_BYTES = 80
 """As long as a state update with four states."""

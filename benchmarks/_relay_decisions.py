@@ -8,13 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks._relay_load import DATAGRAM_BYTES
-from netem.engine.compiled import compile_rule, compiled_program, compiled_state, set_flow
-from netem.engine.many import admit_many
-from netem.link import Link
-from netem.program import empty_state, program_of, recent_width
-from netem.records import Verdict, dtype_of
-from noack.impairments import Bernoulli, LinkSettings, LossOf
-from noack.records import Fate
+from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.many_decisions import admit_many
+from netem.link_machine import Link
+from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_records import Verdict, dtype_of
+from noack.config.impairments import Bernoulli, LinkSettings, LossOf
+from noack.protocol.record_tables import Fate
 
 LOSS = 0.5
 MANSD = 4

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks._report import MeasurementError
-from noack.clock import RunClock
-from noack.io.loop import run_loop
-from noack.io.realtime import realtime
-from noack.io.udp import bind
-from noack.machine import Notice, Record
+from noack.core.clock import RunClock
+from noack.protocol.machine_interface import Notice, Record
+from noack.runtime.real_time_loop import run_loop
+from noack.runtime.real_time_settings import realtime
+from noack.runtime.udp_sockets import bind
 
 FIFO_PRIORITY = 50
 

@@ -26,15 +26,21 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
-from cosim.batch.api import Population, Setting, run_batch, run_events, setting_of
 from cosim.cli import find_scenario
-from cosim.exact.fates import network_fates
-from cosim.exact.run import ContinuousRun, simulate_continuous
-from noack.linear import Vector
-from noack.resolve import Loop, loop_of, resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.sections.run import Seeds
+from cosim.simulation.batch.batch_interface import (
+    Population,
+    Setting,
+    run_batch,
+    run_events,
+    setting_of,
+)
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.config.sections.run_sections import Seeds
+from noack.core.linear_systems import Vector
 
 Mode = Literal["model", "zoh"]
 Method = Literal["RK45", "DOP853"]

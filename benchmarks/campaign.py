@@ -20,12 +20,12 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import psutil
 
 from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, run, say
-from cosim.campaign.grid import grid
-from cosim.campaign.plan import load
-from cosim.campaign.run import run_campaign
-from cosim.campaign.store import Store
-from cosim.campaign.workers import local
-from cosim.shipped import find_shipped
+from cosim.shipped_files import find_shipped
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.campaign_run import run_campaign
+from cosim.studies.campaign.campaign_workers import local
+from cosim.studies.campaign.chunk_store import Store
 
 NAME = "mb_vs_zoh"
 ROUNDS = 3

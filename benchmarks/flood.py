@@ -22,15 +22,15 @@ import psutil
 
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, MeasurementError, Peer, Row, median, run, say
+from cosim.analysis.run_summary import lateness_us, summarise
 from cosim.cli import find_scenario
-from cosim.launch import Watcher, launch
-from cosim.record import RunRecord, load_record
-from cosim.summary import lateness_us, summarise
-from noack.errors import ExitStatus
-from noack.linear import Vector
-from noack.records import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario_file import load
-from noack.topology import LOOP_ROLES
+from cosim.live.launcher import Watcher, launch
+from cosim.record.run_record import RunRecord, load_record
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus
+from noack.core.linear_systems import Vector
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.topology import LOOP_ROLES
 
 ROUNDS = 1
 HORIZON_S = 8.0

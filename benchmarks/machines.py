@@ -23,15 +23,15 @@ from scipy.linalg import expm
 from benchmarks._report import Benchmark, Peer, Row, median, run, say
 from controller_node.controller import controller_of
 from cosim.cli import find_scenario
-from netem.link import Datagram, update_link_of
-from noack.io.telemetry import TelemetryBuffer
-from noack.linear import Propagator, Vector
-from noack.machine import Record
-from noack.records import PLANT_STEP, tables
-from noack.resolve import Loop, loop_of, resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.wire import Decoder, Encoder, Flow, Message
+from netem.link_machine import Datagram, update_link_of
+from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.linear_systems import Propagator, Vector
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import PLANT_STEP, tables
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
+from noack.runtime.telemetry import TelemetryBuffer
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from benchmarks._report import Benchmark, Goal, Peer, Row, run, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
-from cosim.virtual import simulate
-from noack.clock import NS_PER_S
-from noack.io.realtime import realtime
-from noack.records import PLANT_STEP
-from noack.resolve import resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.wire import Flow, Message
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import PLANT_STEP
+from noack.protocol.wire_format import Flow, Message
+from noack.runtime.real_time_settings import realtime
 from plant_server.plant import Plant, plant_of
 
 STEPS = 7500

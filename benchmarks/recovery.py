@@ -20,14 +20,19 @@ import psutil
 
 from benchmarks._report import Benchmark, MeasurementError, Peer, Row, median, run, say
 from benchmarks._runs import execute
+from cosim.analysis.run_summary import lateness_us
 from cosim.cli import find_scenario
-from cosim.launch import Watcher, launch
-from cosim.record import RunRecord, load_record
-from cosim.summary import lateness_us
-from noack.errors import ExitStatus
-from noack.machine import INCARNATION
-from noack.records import CONTROLLER_DELIVERY, CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.scenario_file import load
+from cosim.live.launcher import Watcher, launch
+from cosim.record.run_record import RunRecord, load_record
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus
+from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
 
 ROUNDS = 3
 HORIZON_S = 9.0
@@ -36,7 +41,7 @@ STILL_S = 0.7
 _QUIET_S = 0.25
 _MODULES = {
     "sensor": "sensor_node", "controller": "controller_node", "netem": "netem",
-    "recorder": "cosim.recorder", "plant": "plant_server",
+    "recorder": "cosim.live.recorder", "plant": "plant_server",
 }  # fmt: skip
 _STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
 

@@ -18,16 +18,16 @@ from scipy.integrate import solve_ivp
 
 from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
 from cosim.cli import find_scenario
-from cosim.exact.fates import network_fates
-from cosim.exact.loop import ContinuousLoop, continuous_loop_of
-from cosim.exact.run import simulate_continuous
-from cosim.virtual import simulate
-from noack.linear import Vector
-from noack.resolve import resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.theory.certify import certify
-from noack.theory.schedule import ideal_conditions
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.linear_systems import Vector
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import certify
 
 ROUNDS = 5
 _RTOL = 1e-10

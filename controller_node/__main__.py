@@ -3,17 +3,17 @@
 import sys
 from collections.abc import Sequence
 
-from noack.io.interrupt import quiet_interrupt
+from noack.runtime.interrupt import quiet_interrupt
 
 with quiet_interrupt():
     from controller_node.controller import controller_of
-    from noack.errors import ExitStatus
-    from noack.io import process
+    from noack.core.errors import ExitStatus
+    from noack.runtime import process_entry
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the controller in the run that a recorder or launcher has opened."""
-    return process.main(
+    return process_entry.main(
         "controller",
         lambda member: member.run_messages(controller_of(member.scenario, member.start)),
         arguments,

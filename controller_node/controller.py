@@ -10,15 +10,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from noack.changes import Change, Schedule
-from noack.errors import CallerError
-from noack.linear import Matrix, Vector
-from noack.machine import BEGINNING, INCARNATION, Notice, Output, Record, Start
-from noack.model_flow import ModelFlow
-from noack.records import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
-from noack.resolve import loop_of, setpoint_of
-from noack.scenario import Scenario
-from noack.wire import NO_VECTOR, Flow, Message
+from noack.config.parameter_changes import Change, Schedule
+from noack.config.resolution import loop_of, setpoint_of
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.model_flow import ModelFlow
+from noack.protocol.machine_interface import BEGINNING, INCARNATION, Notice, Output, Record, Start
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
+from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 
 
 class Controller:

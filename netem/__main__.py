@@ -8,31 +8,31 @@ In a run it joins like every other process. On its own it serves any UDP program
 import sys
 from collections.abc import Sequence
 
-from noack.io.interrupt import quiet_interrupt
+from noack.runtime.interrupt import quiet_interrupt
 
 with quiet_interrupt():
-    from netem.duplex import network_of
-    from netem.relay import Relay
-    from noack.errors import ExitStatus, NoackError
-    from noack.io.command_line import Parser, failed
-    from noack.io.node import Node
-    from noack.io.process import add_options, join_run
+    from netem.duplex_link import network_of
+    from netem.run_relay import Relay
+    from noack.core.errors import ExitStatus, NoackError
+    from noack.runtime.command_line import Parser, failed
+    from noack.runtime.process_entry import add_options, join_run
+    from noack.runtime.process_life import Node
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     """Run the emulator: on its own, or in a run; or a command on one that runs."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in ("show", "set", "watch"):
-        from netem.control import commands
+        from netem.control import emulator_commands
 
-        return commands.main(given)
+        return emulator_commands.main(given)
     joining = Parser(prog="noack netem", add_help=False, allow_abbrev=False)
     add_options(joining)
     try:
         options, more = joining.parse_known_args(given)
         if not more:
             return join_run("netem", _in_a_run, options)
-        from netem.cli.alone import alone
+        from netem.cli.stand_alone import alone
 
         return alone(given)
     except NoackError as error:

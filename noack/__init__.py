@@ -1,14 +1,14 @@
 """What every process agrees on: scenario, wire format, linear systems, records, clock.
 
 To a program or a notebook, ``import noack`` is the laboratory, too: scenarios, runs, certificates
-(``docs/library.md``). Those names lead to :mod:`cosim.lab`, which stands above everything, and are
+(``docs/library.md``). Those names lead to :mod:`cosim.api`, which stands above everything, and are
 looked up when they are first used: a process that imports a module from here loads nothing else.
 """
 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cosim.lab import (
+    from cosim.api import (
         Certificates,
         NoackError,
         Run,
@@ -29,9 +29,9 @@ else:
         """Look up a name of the library (PEP 562)."""
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from cosim import lab
+        from cosim import api
 
-        value = globals()[name] = getattr(lab, name)
+        value = globals()[name] = getattr(api, name)
         return value
 
     def __dir__() -> list[str]:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
-from noack.rng import normals, uniforms
-from noack.scenario import Scenario
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.random_streams import normals, uniforms
 
 _BLOCK = 256
 """Measurements whose noise is computed at once."""

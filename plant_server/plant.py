@@ -14,16 +14,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from noack.linear import Vector
-from noack.machine import FAILED, Notice, Output, Record
-from noack.records import PLANT_ACTUATION, PLANT_STEP
-from noack.resolve import loop_of
-from noack.scenario import Scenario
-from noack.wire import Flow, Message
-from plant_server.disturbance import Disturbance, disturbance_of
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Vector
+from noack.protocol.machine_interface import FAILED, Notice, Output, Record
+from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
+from noack.protocol.wire_format import Flow, Message
+from plant_server.disturbance_signal import Disturbance, disturbance_of
 from plant_server.measurement import Measuring, measuring_of
 from plant_server.system import System, SystemFailedError
-from plant_server.systems.choose import system_of
+from plant_server.systems.system_from_settings import system_of
 from plant_server.watchdog import Fallback, Prediction, Watchdog, hold, zero
 
 

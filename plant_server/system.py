@@ -2,8 +2,8 @@
 
 from typing import Protocol
 
-from noack.errors import NoackError
-from noack.linear import Vector
+from noack.core.errors import NoackError
+from noack.core.linear_systems import Vector
 
 
 class SystemFailedError(NoackError):

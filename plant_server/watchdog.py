@@ -17,11 +17,11 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.clock import NS_PER_S
-from noack.linear import Matrix, Propagator, Vector
-from noack.machine import Notice
-from noack.records import NO_SEQUENCE
-from noack.wire import NO_VECTOR
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, Propagator, Vector
+from noack.protocol.machine_interface import Notice
+from noack.protocol.record_tables import NO_SEQUENCE
+from noack.protocol.wire_format import NO_VECTOR
 
 NEVER_NS = 2**63 - 1
 """A timeout that no run reaches."""

@@ -15,7 +15,7 @@ LONGEST = (
     "tests/integration/test_faults.py",
     "tests/integration/test_restarts.py",
     "tests/integration/test_run.py",
-    "tests/cosim/campaign/test_workers.py",
+    "tests/cosim/studies/campaign/test_workers.py",
     "tests/attacks/test_attacks.py",
     "tests/integration/test_faults_disk.py",
     "tests/integration/test_faults_paused.py",
@@ -23,9 +23,9 @@ LONGEST = (
     "tests/integration/",
     "tests/noack/theory/test_box.py",
     "tests/noack/theory/test_certificate.py",
-    "tests/cosim/campaign/",
-    "tests/cosim/design/",
-    "tests/cosim/viewer/",
+    "tests/cosim/studies/campaign/",
+    "tests/cosim/studies/design/",
+    "tests/cosim/output/viewer/",
     "tests/netem/",
 )
 """Files and folders, by what they take."""

@@ -15,19 +15,19 @@ import pytest
 from pydantic import BaseModel
 from typer.main import get_command
 
-from cosim.campaign.grid import grid
-from cosim.campaign.metrics import METRICS
-from cosim.campaign.plan import Axis, Campaign, Comparison, Figure, Metrics
-from cosim.campaign.plan import load as load_campaign
 from cosim.cli import app
-from netem.words.parser import KEYWORDS
-from noack.disturbances import AnyDisturbance
-from noack.impairments import Impairment, Loss
-from noack.observers import AnyObserver
-from noack.records import tables
-from noack.scenario import Scenario
-from noack.scenario_file import json_schema, load
-from noack.triggers import AnyTrigger
+from cosim.studies.campaign.campaign_file import Axis, Campaign, Comparison, Figure, Metrics
+from cosim.studies.campaign.campaign_file import load as load_campaign
+from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.metrics import METRICS
+from netem.words.words_to_settings import KEYWORDS
+from noack.config.disturbances import AnyDisturbance
+from noack.config.impairments import Impairment, Loss
+from noack.config.observers import AnyObserver
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import json_schema, load
+from noack.config.triggers import AnyTrigger
+from noack.protocol.record_tables import tables
 
 ROOT = Path(__file__).parents[1]
 PAGES = (

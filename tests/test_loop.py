@@ -14,11 +14,13 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from controller_node.controller import Controller
-from cosim.record import RunRecord
-from cosim.virtual import DecidedLink, Network, Shuttle, simulate
-from noack.linear import Matrix, Vector
-from noack.machine import Machine, Notice, Record
-from noack.records import (
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import DecidedLink, Network, Shuttle, simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.machine_interface import Machine, Notice, Record
+from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
@@ -26,13 +28,11 @@ from noack.records import (
     SENSOR_MEASUREMENT,
     tables,
 )
-from noack.resolve import resolve
-from noack.scenario_file import load
-from noack.topology import LEGS
+from noack.protocol.topology import LEGS
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.trigger.decaying import DecayingTrigger
-from noack.wire import Decoder, Encoder, Flow, Message, Rejection
 from plant_server.plant import Plant
-from plant_server.systems.linear import LinearSystem
+from plant_server.systems.linear_plant import LinearSystem
 from plant_server.watchdog import Watchdog
 from sensor_node.sensor import Sensor
 

@@ -20,9 +20,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cosim.viewer.server import RecordingServer
-from noack.errors import CallerError, MachineError, NoackError
-from noack.python_process import python_command
+from cosim.output.viewer.viewer_server import RecordingServer
+from noack.core.errors import CallerError, MachineError, NoackError
+from noack.core.python_process import python_command
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = (

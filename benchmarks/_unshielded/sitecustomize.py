@@ -1,5 +1,5 @@
 """Takes the shield from every process that finds this first on its path; for ``flood``."""
 
-from noack.io import udp
+from noack.runtime import udp_sockets
 
-udp.open_beside = lambda endpoint, peers: ()
+udp_sockets.open_beside = lambda endpoint, peers: ()

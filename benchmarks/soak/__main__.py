@@ -11,8 +11,8 @@ from rich.console import Console
 from benchmarks._report import MeasurementError
 from benchmarks.soak.result import print_result
 from benchmarks.soak.run import PICTURE_FILE, soak
-from noack.errors import NoackError
-from noack.scenario_file import load
+from noack.config.scenario_file import load
+from noack.core.errors import NoackError
 
 KINDS = ("hour", "day")
 _TABLE_WIDTH = 130

@@ -4,9 +4,18 @@ from matplotlib.figure import Figure
 
 from benchmarks.soak.flat import warm_up_s
 from benchmarks.soak.result import Result
-from cosim import palette
-from cosim.report.axes import BELOW_IN, LEFT_IN, RIGHT_IN, WIDTH_IN, finish, head_in, line, place
-from cosim.report.style import printed, styled
+from cosim.output import palette
+from cosim.output.report.axes import (
+    BELOW_IN,
+    LEFT_IN,
+    RIGHT_IN,
+    WIDTH_IN,
+    finish,
+    head_in,
+    line,
+    place,
+)
+from cosim.output.report.figure_style import printed, styled
 
 _HEIGHT_IN, _GAP_IN = 0.95, 0.3
 

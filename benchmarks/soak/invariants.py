@@ -9,9 +9,11 @@ import numpy as np
 
 from benchmarks.soak.legs import InTurn, Leg
 from benchmarks.soak.machines import ControllerTicks, Network, PlantSteps, SensorSteps
-from cosim.join import IdentityResidual, controller_track, initial_track, join
-from cosim.record import Rows
-from noack.records import (
+from cosim.record.align import IdentityResidual, controller_track, initial_track, join
+from cosim.record.run_record import Rows
+from noack.config.resolution import loop_of, tables_of
+from noack.config.scenario import Scenario
+from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,
@@ -22,11 +24,9 @@ from noack.records import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.resolve import loop_of, tables_of
-from noack.scenario import Scenario
-from noack.theory.monitor import ErrorMonitor
-from noack.topology import LOOP_ROLES
-from noack.trigger.choose import policy_of
+from noack.protocol.topology import LOOP_ROLES
+from noack.theory.error_bounds import ErrorMonitor
+from noack.trigger.policy_from_settings import policy_of
 
 _IDENTITY = 1e-9
 """Of (I1), relative to the largest entry of x_s: the margin that a run's claims have."""

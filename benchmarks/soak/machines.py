@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record import Rows, updates_in
-from noack.linear import discretise, transition
-from noack.records import NO_SEQUENCE, effective
-from noack.resolve import loop_of
-from noack.scenario import Scenario
+from cosim.record.run_record import Rows, updates_in
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import discretise, transition
+from noack.protocol.record_tables import NO_SEQUENCE, effective
 
 Reals = NDArray[np.float64]
 

@@ -15,13 +15,13 @@ from benchmarks.soak.figure import memory_figure
 from benchmarks.soak.invariants import Invariants
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
-from cosim.report.save import save
-from cosim.run_dir import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
-from noack.clock import NS_PER_S
-from noack.io.spool import SpoolTail
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.topology import LOOP_ROLES, RECORDER
+from cosim.output.report.figure_files import save
+from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.clock import NS_PER_S
+from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.spool import SpoolTail
 
 RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
 FREE_PORTS = ("--set", "ports={}")

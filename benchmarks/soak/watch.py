@@ -10,7 +10,7 @@ import psutil
 
 LAUNCHER = "launcher"
 MODULES: Mapping[str, str] = {
-    "recorder": "cosim.recorder",
+    "recorder": "cosim.live.recorder",
     "netem": "netem",
     "plant": "plant_server",
     "sensor": "sensor_node",

@@ -1,35 +1,35 @@
 """The command line ``noack``, by the panels of its help."""
 
-from noack.io.interrupt import quiet_interrupt
+from noack.runtime.interrupt import quiet_interrupt
 
 with quiet_interrupt():
     # isort: off, in the order of the help
     from cosim.cli import (
-        campaigns,
-        comparison,
-        design,
-        doctor,
-        files,
-        knobs,
-        processes,
-        runs,
-        theory,
+        campaign_commands,
+        compare_commands,
+        design_command,
+        doctor_command,
+        file_commands,
+        process_commands,
+        run_commands,
+        set_command,
+        theory_commands,
     )
 
     # isort: on
-    from cosim.cli.app import app, find_scenario, main
+    from cosim.cli.command import app, find_scenario, main
 
 __all__ = [
     "app",
-    "campaigns",
-    "comparison",
-    "design",
-    "doctor",
-    "files",
+    "campaign_commands",
+    "compare_commands",
+    "design_command",
+    "doctor_command",
+    "file_commands",
     "find_scenario",
-    "knobs",
     "main",
-    "processes",
-    "runs",
-    "theory",
+    "process_commands",
+    "run_commands",
+    "set_command",
+    "theory_commands",
 ]

@@ -9,8 +9,8 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from noack.errors import ExitStatus, printable, why
-from noack.io.command_line import failed
+from noack.core.errors import ExitStatus, printable, why
+from noack.runtime.command_line import failed
 
 NAME = "noack"
 _COMPLETION = ("install_completion", "show_completion")

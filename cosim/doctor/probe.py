@@ -6,11 +6,11 @@ import sys
 import time
 from collections.abc import Sequence
 
-from noack.clock import NS_PER_S, RunClock
-from noack.io.loop import run_loop
-from noack.io.realtime import realtime
-from noack.io.udp import LOOPBACK
-from noack.machine import Notice, Record
+from noack.core.clock import NS_PER_S, RunClock
+from noack.protocol.machine_interface import Notice, Record
+from noack.runtime.real_time_loop import run_loop
+from noack.runtime.real_time_settings import realtime
+from noack.runtime.udp_sockets import LOOPBACK
 
 _WARM_UP = 20
 """Times that the loop wakes up before it counts: the first ones run code that is still cold."""

@@ -26,7 +26,7 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.capture.packets import (
+from netem.capture.packet_blocks import (
     FOLDER,
     MAX_HEADER_BYTES,
     Bytes,
@@ -34,9 +34,9 @@ from netem.capture.packets import (
     blocks_bytes,
     put_blocks,
 )
-from netem.compiling import announced
-from netem.events import EVENT
-from noack.io.code_cache import is_kept
+from netem.compile_notice import announced
+from netem.relay_events import EVENT
+from noack.runtime.code_cache import is_kept
 
 SNAP_BYTES = 262_144
 """Payload bytes captured of a datagram unless told otherwise: all."""
@@ -110,7 +110,7 @@ class Section:
         """Return the events' packets; they are valid until the next call.
 
         Args:
-            events: shape (n,), of type :data:`netem.events.EVENT`.
+            events: shape (n,), of type :data:`netem.relay_events.EVENT`.
             data: their payloads.
 
         Raises:

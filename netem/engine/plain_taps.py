@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netem.engine.api import Address, Tap
-from netem.engine.plain_way import Departure
-from netem.events import ADDRESS_BYTES, EVENT
-from netem.records import Verdict
+from netem.engine.plain_direction import Departure
+from netem.engine.relay_interface import Address, Tap
+from netem.relay_events import ADDRESS_BYTES, EVENT
+from netem.rule_records import Verdict
 from netem.rules.mansd import NEVER_NS
 
 _MOST = 512

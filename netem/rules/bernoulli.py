@@ -1,7 +1,7 @@
 """Bernoulli losses: each datagram is lost with a probability, independently unless correlated."""
 
-from netem.records import Chance, FlowState, Memory
-from netem.rules.chance import happens
+from netem.rule_records import Chance, FlowState, Memory
+from netem.rules.correlated_chance import happens
 from netem.rules.normal import score
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from netem.records import Darkness
+from netem.rule_records import Darkness
 
 
 def dark(darkness: Darkness, times_ns: Sequence[int], now_ns: int) -> bool:

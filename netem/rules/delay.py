@@ -7,8 +7,8 @@ the jitter as standard deviation; empirical ones are drawn between the observed 
 import math
 from collections.abc import Sequence
 
-from netem.records import FlowState, Memory, Wait
-from netem.rules.chance import latent
+from netem.rule_records import FlowState, Memory, Wait
+from netem.rules.correlated_chance import latent
 from netem.rules.normal import cdf, score
 
 UNIFORM = 0

@@ -4,7 +4,7 @@
 From 4 the chain returns to 1. It starts in 1 and moves before each datagram.
 """
 
-from netem.records import FourStateChain, Memory
+from netem.rule_records import FourStateChain, Memory
 
 
 def lost(chain: FourStateChain, memory: Memory, u: float) -> bool:

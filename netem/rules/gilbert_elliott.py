@@ -7,7 +7,7 @@ state and 1 − h in the bad. In the stationary chain the loss rate is
     (1 − k) r/(p + r) + (1 − h) p/(p + r).
 """
 
-from netem.records import Chain, FlowState, Memory
+from netem.rule_records import Chain, FlowState, Memory
 from netem.rules.normal import score
 
 GOOD = 0

@@ -14,7 +14,7 @@ the newest) is not. Hence two rules:
 
 from collections.abc import MutableSequence, Sequence
 
-from netem.records import FlowState
+from netem.rule_records import FlowState
 
 NEVER_NS = -1
 

@@ -6,7 +6,7 @@ the same however late the emulator itself is.
 
 from collections.abc import MutableSequence
 
-from netem.records import Bottleneck, QueueState
+from netem.rule_records import Bottleneck, QueueState
 
 _NS = 1_000_000_000
 _LATEST_NS = 2**61

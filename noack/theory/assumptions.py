@@ -10,13 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.clock import NS_PER_S
-from noack.estimation import SteadyState, steady_state
-from noack.linear import Matrix, spectral_abscissa
-from noack.resolve import Loop, loop_of
-from noack.scenario import Scenario
-from noack.theory.certificate import Conditions, Constants
-from noack.triggers import (
+from noack.config.resolution import Loop, loop_of
+from noack.config.scenario import Scenario
+from noack.config.state_estimation import SteadyState, steady_state
+from noack.config.triggers import (
     Absolute,
     AnyTrigger,
     Deadline,
@@ -26,6 +23,9 @@ from noack.triggers import (
     Relative,
     SelfTriggered,
 )
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.theory.certificate import Conditions, Constants
 
 
 class Verdict(StrEnum):

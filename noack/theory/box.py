@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.linear import Matrix, Vector
-from noack.theory.decay import logarithmic_norm
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.contraction import logarithmic_norm
 from noack.theory.enclosure import NotDecayingError, Response, factors, response
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 

@@ -4,7 +4,8 @@ A response e^{Gτ}D is computed at the nodes of a grid. Between two nodes, a ste
 F(τ) = C e^{Gτ} D differs from the chord by at most s²/8 · sup‖F''‖ (its integral by s³/12 ·
 sup‖F''‖), and a norm is convex along a chord. sup‖F''‖ over the cell is bounded by Taylor's formula
 from the node, F'' = C G² e^{Gτ} D and its derivatives, the remainder by e^{μ s} with μ the
-logarithmic norm of G, or in coordinates L in which it is −ν < 0 (:mod:`noack.theory.decay`), as it
+logarithmic norm of G, or in coordinates L in which it is −ν < 0 (:mod:`noack.theory.contraction`),
+as it
 suits: ‖C e^{Gs} Y‖ ≤ ‖C L^{−1}‖ ‖L Y‖ e^{−νs}. The same bounds what is beyond the grid. Steps grow
 as fast modes die out, so that a stiff system takes hardly more of them than another.
 
@@ -20,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.linear import Matrix, spectral_abscissa
-from noack.theory.decay import (
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.theory.contraction import (
     EPSILON,
     Decay,
     Stack,

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.linear import Matrix
-from noack.resolve import Loop
+from noack.config.resolution import Loop
+from noack.core.linear_systems import Matrix
 from noack.theory.enclosure import (
     Kernel,
     Response,

@@ -8,7 +8,7 @@ eq:LossEv2 to every drop pattern: x_s jumped by −e_s(t_k⁻) at each event; x_
 
 import numpy as np
 
-from noack.linear import Matrix, Propagator, Vector
+from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
 class MissedJumps:

@@ -11,8 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.linear import Matrix, spectral_abscissa
-from noack.resolve import Loop
+from noack.config.resolution import Loop
+from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Conditions, Level, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains

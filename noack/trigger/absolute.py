@@ -6,9 +6,9 @@ inter-event time is positive for bounded states, as e_s grows from 0 at a bounde
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix
-from noack.trigger.guard import Form, nothing, of_error
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_condition import Form, nothing, of_error
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ then tells the controller something. What the rule keeps below its threshold sta
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix
-from noack.trigger.guards import Guards
-from noack.trigger.policy import Policy
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

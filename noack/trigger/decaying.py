@@ -8,9 +8,9 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 
 import math
 
-from noack.linear import Matrix, Vector, norm
-from noack.trigger.guard import Form, nothing, of_error
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix, Vector, norm
+from noack.trigger.trigger_condition import Form, nothing, of_error
+from noack.trigger.trigger_rule import Guards
 
 
 class DecayingTrigger:

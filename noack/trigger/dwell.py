@@ -6,9 +6,9 @@ threshold may exceed it for as long.
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix
-from noack.trigger.guards import Guards
-from noack.trigger.policy import Policy
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_policy import Policy
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

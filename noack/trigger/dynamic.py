@@ -13,9 +13,9 @@ from functools import cached_property
 
 import numpy as np
 
-from noack.linear import Matrix
-from noack.trigger.guard import Form, Reserve, split
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_condition import Form, Reserve, split
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

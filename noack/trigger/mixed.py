@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from noack.linear import Matrix
-from noack.trigger.guard import Form, of_error, of_state
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_condition import Form, of_error, of_state
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix
-from noack.trigger.guard import Form, nothing
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix
+from noack.trigger.trigger_condition import Form, nothing
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

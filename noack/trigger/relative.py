@@ -3,7 +3,7 @@
 The mixed rule without its constant; see :mod:`noack.trigger.mixed`.
 """
 
-from noack.linear import Matrix
+from noack.core.linear_systems import Matrix
 from noack.trigger.mixed import MixedTrigger
 
 

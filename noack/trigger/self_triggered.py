@@ -12,10 +12,10 @@ Gronwall's.)
 
 from dataclasses import dataclass
 
-from noack.linear import Matrix
-from noack.trigger.forecast import Forecast
-from noack.trigger.guard import Form, nothing
-from noack.trigger.guards import Guards
+from noack.core.linear_systems import Matrix
+from noack.trigger.self_triggered_interval import Forecast
+from noack.trigger.trigger_condition import Form, nothing
+from noack.trigger.trigger_rule import Guards
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,9 @@
 
 import math
 
-from noack.linear import Vector
-from noack.systems import CartPole
-from plant_server.ode import OdeSystem
+from noack.config.plant_systems import CartPole
+from noack.core.linear_systems import Vector
+from plant_server.ode_integrator import OdeSystem
 
 
 def cart_pole(settings: CartPole, x0: Vector) -> OdeSystem:

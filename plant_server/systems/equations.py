@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.io.code_cache import cache_folder, compiler, is_kept, while_compiling
-from noack.linear import Vector
+from noack.core.linear_systems import Vector
+from noack.runtime.code_cache import cache_folder, compiler, is_kept, while_compiling
 
 _LIBRARY = "vehiclemodels"
 _COMPILED = ("std", "mb")

@@ -17,11 +17,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from noack.errors import CallerError
-from noack.linear import Vector
-from noack.system_files import unchanged
-from noack.systems import Fmu
-from plant_server.native import quiet, temporary_folder
+from noack.config.plant_systems import Fmu
+from noack.config.system_files import unchanged
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from plant_server.native_code import quiet, temporary_folder
 from plant_server.system import SystemFailedError
 
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4

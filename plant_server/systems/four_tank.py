@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from noack.linear import Vector
-from noack.systems import FourTank
-from plant_server.ode import OdeSystem
+from noack.config.plant_systems import FourTank
+from noack.core.linear_systems import Vector
+from plant_server.ode_integrator import OdeSystem
 
 
 def four_tank(settings: FourTank, x0: Vector) -> OdeSystem:

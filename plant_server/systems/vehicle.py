@@ -1,8 +1,8 @@
 """A road vehicle: the vehicle models of CommonRoad, steered by a servo, along a lane.
 
 The library's equations and parameters are used as they are. The lane is its x-axis. The lane models
-(:mod:`noack.models`) have the lateral axis point the other way, so that V and Y_g have the opposite
-sign of its lateral velocity and y; yaw, yaw rate and steering angle have the same.
+(:mod:`noack.config.named_models`) have the lateral axis point the other way, so that V and Y_g have
+the opposite sign of its lateral velocity and y; yaw, yaw rate and steering angle have the same.
 """
 
 import math
@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from noack.errors import CallerError
-from noack.linear import Vector
-from noack.systems import Vehicle
-from plant_server.ode import OdeSystem
+from noack.config.plant_systems import Vehicle
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from plant_server.ode_integrator import OdeSystem
 from plant_server.systems.equations import equations, library
 
 _PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}

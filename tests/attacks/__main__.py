@@ -9,8 +9,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from noack.io.udp import SHED
-from noack.topology import LOOP_ROLES, SENDER
+from noack.protocol.topology import LOOP_ROLES, SENDER
+from noack.runtime.udp_sockets import SHED
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER

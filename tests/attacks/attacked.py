@@ -15,12 +15,17 @@ from typing import Any
 
 import psutil
 
-from cosim.record import RunRecord, load_record
-from noack.io.ticket import Ticket, loads
-from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, PLANT_ACTUATION, SENSOR_MEASUREMENT
-from noack.resolve import loop_of
-from noack.topology import LEGS, LOOP_ROLES, SENDER
-from noack.wire import Flow
+from cosim.record.run_record import RunRecord, load_record
+from noack.config.resolution import loop_of
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    PLANT_ACTUATION,
+    SENSOR_MEASUREMENT,
+)
+from noack.protocol.topology import LEGS, LOOP_ROLES, SENDER
+from noack.protocol.wire_format import Flow
+from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
 from tests.attacks.sender import Plan
 

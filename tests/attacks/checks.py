@@ -2,9 +2,14 @@
 
 from collections.abc import Callable, Iterator, Mapping
 
-from noack.io.udp import SHED
-from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, PLANT_ACTUATION, SENSOR_MEASUREMENT
-from noack.topology import LOOP_ROLES, SENDER
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    PLANT_ACTUATION,
+    SENSOR_MEASUREMENT,
+)
+from noack.protocol.topology import LOOP_ROLES, SENDER
+from noack.runtime.udp_sockets import SHED
 from tests.attacks.attacked import Attacked
 
 _TAKEN = {

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.wire import (
+from noack.protocol.wire_format import (
     HEADER_BYTES,
     KEY_BYTES,
     TAG_BYTES,

@@ -14,8 +14,8 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from noack.io.udp import LOOPBACK
-from noack.wire import Flow
+from noack.protocol.wire_format import Flow
+from noack.runtime.udp_sockets import LOOPBACK
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Make, Target
 
 STRANGER, PEER = "stranger", "forged address"

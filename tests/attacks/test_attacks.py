@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from noack.topology import LOOP_ROLES
-from noack.wire import Decoder, Encoder, Flow, Message, Rejection
+from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from tests.attacks.attacked import Attacked, attack, may_forge_addresses
 from tests.attacks.checks import CHECKS
 from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Target

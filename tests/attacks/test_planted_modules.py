@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from cosim.viewer.live import LiveView
+from cosim.output.viewer.live_viewer import LiveView
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("noack", "plant_server", "sensor_node", "controller_node", "netem", "cosim", "tools")
 SHADOWED = ("socket", "logging", "multiprocessing", "http", "pickle", "concurrent", "fcntl")
 POOL = """
-from cosim.pool import processes
+from cosim.studies.process_pool import processes
 if __name__ == "__main__":
     with processes(2) as pool:
         print(pool.submit(pow, 2, 5).result())
@@ -69,4 +69,4 @@ def test_one_function_starts_python() -> None:
         for path in sorted((ROOT / package).rglob("*.py"))
         if re.search(r"\bsys\.executable\b", path.read_text())
     ]
-    assert naming == ["noack/python_process.py"]
+    assert naming == ["noack/core/python_process.py"]

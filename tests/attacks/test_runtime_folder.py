@@ -13,17 +13,17 @@ from typing import Any
 
 import pytest
 
-from cosim.doctor.measure import _runtime_folder
-from netem.control import session
-from noack.errors import CallerError, PeerError
-from noack.io import open_runs
-from noack.io.ticket import Ticket, new_ticket, published, ticket_path, wait_for_ticket
-from noack.resolve import resolve
-from noack.scenario_file import validate
+from cosim.doctor.machine_measures import _runtime_folder
+from netem.control import emulator_session
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError, PeerError
+from noack.runtime import run_registry
+from noack.runtime.join_ticket import Ticket, new_ticket, published, ticket_path, wait_for_ticket
 from tests.attacks.other_user import NOBODY, needs_root
 
 OWN = f"noack-{os.getuid()}"
-EMULATOR = session.Session("lab", "tcp/127.0.0.1:1", "secret")
+EMULATOR = emulator_session.Session("lab", "tcp/127.0.0.1:1", "secret")
 
 _swaps: list[Callable[[str], None]] = []
 """What another user does as this process opens a file; an audit hook stays for ever."""
@@ -66,10 +66,10 @@ def enter(context: Any) -> Callable[[], object]:
 USES: dict[str, Callable[[Ticket], Callable[[], object]]] = {
     "publish a ticket": lambda ticket: enter(lambda: published(ticket, "default")),
     "join a run": lambda _: join,
-    "publish a run": lambda ticket: enter(lambda: open_runs.published(ticket, None)),
-    "find a run": lambda _: open_runs.find,
-    "publish an emulator": lambda _: enter(lambda: session.published(EMULATOR)),
-    "list emulators": lambda _: session.running,
+    "publish a run": lambda ticket: enter(lambda: run_registry.published(ticket, None)),
+    "find a run": lambda _: run_registry.find,
+    "publish an emulator": lambda _: enter(lambda: emulator_session.published(EMULATOR)),
+    "list emulators": lambda _: emulator_session.running,
 }
 
 
@@ -179,6 +179,6 @@ def test_without_a_folder_there_is_no_run(shared: Path) -> None:
     with pytest.raises(PeerError, match="no run to join"):
         join()
     with pytest.raises(CallerError, match="no run goes on"):
-        open_runs.find()
-    assert session.running() == []
+        run_registry.find()
+    assert emulator_session.running() == []
     assert not (shared / OWN).exists()

@@ -12,7 +12,7 @@ from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS, Ticks
 from benchmarks.latency import Sample
 from benchmarks.lateness import Kernel
-from cosim.progress import account_line
+from cosim.live.progress import account_line
 
 NAMES = (
     "demo_run", "flood", "latency", "lateness", "startup", "recovery", "machines", "plants",

@@ -12,12 +12,12 @@ from benchmarks import _flood
 from benchmarks._flood import Flood, flood
 from benchmarks.flood import CASES, Measured, measured, recovery_s, rows_of
 from cosim.cli import find_scenario
-from cosim.record import RunRecord
-from cosim.virtual import simulate
-from noack.records import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
-from noack.resolve import resolve
-from noack.scenario_file import load
-from noack.wire import Decoder, Flow, Rejection
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.wire_format import Decoder, Flow, Rejection
 
 PERIOD_NS = 2_000_000
 

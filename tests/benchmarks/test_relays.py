@@ -15,7 +15,7 @@ from benchmarks._report import Goal, MeasurementError, Row
 from benchmarks._rounds import Comparison, paired
 from benchmarks.relay_delay import Quantiles
 from benchmarks.relay_flows import Costs
-from noack.records import Fate
+from noack.protocol.record_tables import Fate
 
 HALF = Comparison("ours", "theirs", Goal("<=", 0.5))
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from controller_node.controller import Controller, controller_of
-from noack.machine import Notice, Output, Record
-from noack.records import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
-from noack.resolve import resolve
-from noack.scenario_file import validate
-from noack.wire import Flow, Message
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import Notice, Output, Record
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
+from noack.protocol.wire_format import Flow, Message
 
 MS = 1_000_000
 H = np.array([[-0.5, 2.0], [-1.0, 0.3]])

@@ -13,21 +13,21 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
-from cosim.certify import with_weight
-from cosim.claims.evaluate import scheduled_certificates
-from cosim.linearisation import linearisation, said
-from cosim.record import RunRecord
-from cosim.summary import summarise
-from cosim.virtual import simulate
-from noack.linear import Matrix
-from noack.records import PLANT_STEP
-from noack.resolve import Loop, loop_of, resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load
-from noack.systems import FourTank, Quadrotor
-from plant_server.linearise import linearise
+from cosim.analysis.claims.claim_evaluation import scheduled_certificates
+from cosim.analysis.model_comparison import linearisation, said
+from cosim.analysis.run_summary import summarise
+from cosim.output.certificate_report import with_weight
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.plant_systems import FourTank, Quadrotor
+from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.linear_systems import Matrix
+from noack.protocol.record_tables import PLANT_STEP
+from plant_server.plant_linearisation import linearise
 from plant_server.systems.four_tank import four_tank
-from plant_server.systems.quadrotor import quadrotor
+from plant_server.systems.quadrotor_plant import quadrotor
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from types import FrameType
 
-from noack.errors import NoackError
+from noack.core.errors import NoackError
 from tests.fuzz.choices import SEEDS
 
 FOLDER = Path(__file__).parent

@@ -18,7 +18,7 @@ EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
 """Nobody looks at most of these runs; what wants a report says ``--report``."""
 ROLE_MODULES = {
-    "recorder": "cosim.recorder",
+    "recorder": "cosim.live.recorder",
     "netem": "netem",
     "plant": "plant_server",
     "sensor": "sensor_node",

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from cosim.record import RunRecord, load_record
-from cosim.replay import replay
-from noack.records import (
+from cosim.analysis.replay import replay
+from cosim.record.run_record import RunRecord, load_record
+from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -13,7 +13,7 @@ from noack.records import (
     SENSOR_ACKNOWLEDGEMENT,
     SENSOR_MEASUREMENT,
 )
-from noack.wire import Flow, read_header
+from noack.protocol.wire_format import Flow, read_header
 from tests.integration.conftest import Finished, run_scenario, settings
 
 

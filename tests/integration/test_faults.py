@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.conclude import reopen
-from cosim.record import load_record
+from cosim.live.finalize import reopen
+from cosim.record.run_record import load_record
 from tests.integration.conftest import (
     AT_RATE,
     EPHEMERAL,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from cosim.conclude import reopen
-from cosim.record import load_record
-from noack.topology import LOOP_ROLES
+from cosim.live.finalize import reopen
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
 from tests.integration.conftest import (
     AT_RATE,
     PATIENCE_S,

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.conclude import reopen
-from cosim.record import load_record
-from noack.errors import MachineError
+from cosim.live.finalize import reopen
+from cosim.record.run_record import load_record
+from noack.core.errors import MachineError
 from tests.integration.conftest import (
     AT_RATE,
     EPHEMERAL,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import psutil
 
-from cosim.record import load_record
+from cosim.record.run_record import load_record
 from tests.integration.conftest import (
     AT_RATE,
     RATE_HZ,

@@ -10,13 +10,13 @@ import numpy as np
 import psutil
 import pytest
 
-import cosim.launch
-from cosim.record import load_record
-from cosim.run_dir import new_run_dir
-from cosim.shipped import find_shipped
-from noack.errors import MachineError
-from noack.io.spool import SpoolWriter
-from noack.scenario_file import load
+import cosim.live.launcher
+from cosim.record.run_directory import new_run_dir
+from cosim.record.run_record import load_record
+from cosim.shipped_files import find_shipped
+from noack.config.scenario_file import load
+from noack.core.errors import MachineError
+from noack.runtime.spool import SpoolWriter
 from tests.integration.conftest import (
     AT_RATE,
     BARE,
@@ -131,9 +131,9 @@ def test_a_log_that_cannot_be_written_is_named(
         (run_dir / "logs" / "sensor.log").mkdir()
         return run_dir
 
-    monkeypatch.setattr(cosim.launch, "new_run_dir", with_a_folder_in_the_way)
+    monkeypatch.setattr(cosim.live.launcher, "new_run_dir", with_a_folder_in_the_way)
     scenario = load(find_shipped("lane_following", "scenarios"), ["ports={}"])
     before = psutil.Process().children()
     with pytest.raises(MachineError, match=r"^sensor cannot be started: .*logs/sensor\.log"):
-        cosim.launch.launch(scenario, tmp_path)
+        cosim.live.launcher.launch(scenario, tmp_path)
     assert psutil.Process().children() == before

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.record import load_record
+from cosim.record.run_record import load_record
 from tests.integration.conftest import AT_RATE, RATE_HZ, ROLE_MODULES, Running, settings
 from tests.integration.test_faults import wait_recording
 

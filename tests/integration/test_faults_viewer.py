@@ -8,8 +8,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from cosim.record import load_record
-from tests.cosim.viewer.test_viewer import is_left, read
+from cosim.record.run_record import load_record
+from tests.cosim.output.viewer.test_viewer import is_left, read
 from tests.integration.conftest import (
     AT_RATE,
     RATE_HZ,
@@ -47,7 +47,7 @@ def test_a_viewer_in_trouble_is_no_trouble_of_the_runs(
     viewers = [
         child
         for child in running.child("recorder").children(recursive=True)
-        if "cosim.viewer.live" in command_of(child) or is_rerun(child)
+        if "cosim.output.viewer.live_viewer" in command_of(child) or is_rerun(child)
     ]
     (group,) = {os.getpgid(viewer.pid) for viewer in viewers}
     assert len(viewers) == 2  # who serves the recording, and who serves rerun's page

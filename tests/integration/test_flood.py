@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from cosim.record import load_record
-from noack.io.udp import SHED
-from noack.topology import LOOP_ROLES
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.udp_sockets import SHED
 from tests.integration.conftest import Running, settings
 from tests.integration.test_faults import wait_recording
 

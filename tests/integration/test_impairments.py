@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.record import RunRecord, load_record
-from cosim.tables import key_numbers
-from noack.records import CONTROLLER_DELIVERY, NETEM_PACKET, NETEM_RELEASE, Fate
-from noack.wire import read_header
+from cosim.output.run_tables import key_numbers
+from cosim.record.run_record import RunRecord, load_record
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, NETEM_PACKET, NETEM_RELEASE, Fate
+from noack.protocol.wire_format import read_header
 from tests.integration.conftest import (
     PATIENCE_S,
     Finished,

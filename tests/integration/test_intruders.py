@@ -16,11 +16,11 @@ import numpy as np
 import psutil
 import zenoh
 
-from cosim.record import load_record
-from noack.io.plane import secret_of
-from noack.io.star import star_config
-from noack.io.ticket import Ticket, loads
-from noack.topology import LOOP_ROLES
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.control_plane import secret_of
+from noack.runtime.join_ticket import Ticket, loads
+from noack.runtime.zenoh_session import star_config
 from tests.integration.conftest import PATIENCE_S, Finished, Running, settings, wait_for
 
 GARBAGE_BYTES = 10 * 2**20

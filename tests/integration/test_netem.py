@@ -15,7 +15,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from noack.errors import ExitStatus
+from noack.core.errors import ExitStatus
 
 COMMAND = [sys.executable, "-m", "netem"]
 

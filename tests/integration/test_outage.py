@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.linalg import expm
 
-from cosim.record import RunRecord, load_record
-from noack.records import PLANT_ACTUATION, PLANT_STEP
+from cosim.record.run_record import RunRecord, load_record
+from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
 from tests.integration.conftest import Finished, Running, settings, wait_for
 
 Start = Callable[..., Running]

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.claims.evaluate import Claims
-from cosim.join import join_all
-from cosim.record import Rows, load_record
-from noack.io.spool import read_chunks
-from noack.machine import INCARNATION
-from noack.resolve import tables_of
-from noack.scenario_file import load
+from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.record.align import join_all
+from cosim.record.run_record import Rows, load_record
+from noack.config.resolution import tables_of
+from noack.config.scenario_file import load
+from noack.protocol.machine_interface import INCARNATION
+from noack.runtime.spool import read_chunks
 from tests.integration.conftest import (
     AT_RATE,
     Finished,

@@ -10,18 +10,18 @@ import pytest
 import rerun.chunk
 from scipy.linalg import expm
 
-from cosim.claims.evaluate import Claims
-from cosim.join import identity_residual, join_all
-from cosim.record import RunRecord, load_record
-from cosim.replay import replay
-from cosim.viewer import blueprint
-from netem.link import Datagram, update_link_of
-from noack.machine import Record
-from noack.records import Fate, tables
-from noack.resolve import resolve
-from noack.scenario_file import load
-from noack.wire import read_header
-from tests.cosim.viewer.test_viewer import read, series
+from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.replay import replay
+from cosim.output.viewer import blueprint
+from cosim.record.align import identity_residual, join_all
+from cosim.record.run_record import RunRecord, load_record
+from netem.link_machine import Datagram, update_link_of
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import Fate, tables
+from noack.protocol.wire_format import read_header
+from tests.cosim.output.viewer.test_viewer import read, series
 from tests.integration.conftest import Finished, run_scenario, settings
 
 SUMMARY_KEYS = {

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from cosim.changes import changes_of
-from cosim.record import load_record
-from noack.io import open_runs
+from cosim.record.recorded_changes import changes_of
+from cosim.record.run_record import load_record
+from noack.runtime import run_registry
 from tests.integration.conftest import PATIENCE_S, Running, noack_command, settings, wait_for
 
 
@@ -22,7 +22,7 @@ def test_a_run_is_changed_twice_from_another_process(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     running = start(*settings(horizon_s=1000.0))
     running.wait_started()
-    run = open_runs.find()
+    run = run_registry.find()
 
     def said(*words: str) -> dict[str, Any]:
         done = subprocess.run(
@@ -33,14 +33,14 @@ def test_a_run_is_changed_twice_from_another_process(
         assert done.returncode == answer.get("exit", {"status": 0})["status"], done.stderr
         return answer
 
-    wait_for(lambda: open_runs.ask(run, {})["t_s"] > 0)
+    wait_for(lambda: run_registry.ask(run, {})["t_s"] > 0)
     first = said("loss.p", "0.5", "mansd=2")
     second = said("setpoint", "[0.0, 0.0, 0.0, 1.0]")
     assert second["knobs"]["network.mansd"] == 2
     refused = said("loss.p", "1.5")
     assert refused["exit"]["status"] == 2
     assert "should be less than or equal to 1" in refused["error"]
-    wait_for(lambda: open_runs.ask(run, {})["t_s"] > second["from_s"] + 1)
+    wait_for(lambda: run_registry.ask(run, {})["t_s"] > second["from_s"] + 1)
     running.process.send_signal(signal.SIGINT)
     finished = running.finish()
     assert finished.status == 130, finished.stderr

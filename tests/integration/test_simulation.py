@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.record import RunRecord, load_record
-from cosim.virtual import simulate
-from noack.records import (
+from cosim.record.run_record import RunRecord, load_record
+from cosim.simulation.virtual_time import simulate
+from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NETEM_PACKET,

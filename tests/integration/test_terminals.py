@@ -8,8 +8,8 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
-from cosim.record import load_record
-from noack.topology import LOOP_ROLES
+from cosim.record.run_record import load_record
+from noack.protocol.topology import LOOP_ROLES
 from tests.integration.conftest import (
     AT_RATE,
     PATIENCE_S,

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from noack import impairments as imp
+from noack.config import impairments as imp
 
 probabilities = st.floats(0, 1)
 correlations = st.floats(0, 1, exclude_max=True)

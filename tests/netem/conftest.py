@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from netem.engine.compiled import compile_rule, compiled_program, compiled_state, set_flow
-from netem.engine.many import admit_many
-from netem.program import empty_state, program_of, recent_width
-from netem.records import Decision, Verdict, dtype_of
-from netem.rules.link import State
-from noack.impairments import Impairment, LinkSettings
+from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.many_decisions import admit_many
+from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_records import Decision, Verdict, dtype_of
+from netem.rules.link_rules import State
+from noack.config.impairments import Impairment, LinkSettings
 
 MOST = 1_000_000
 

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.many import admit_many
-from netem.program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.records import Decision, Verdict, dtype_of
-from netem.rules.link import State
-from noack.impairments import (
+from netem.engine.many_decisions import admit_many
+from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.rule_records import Decision, Verdict, dtype_of
+from netem.rules.link_rules import State
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.link import Datagram, Link, update_link_of
-from noack.impairments import (
+from netem.link_machine import Datagram, Link, update_link_of
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,
@@ -24,10 +24,16 @@ from noack.impairments import (
     Reorder,
     WorstCase,
 )
-from noack.machine import Notice, Record
-from noack.records import NETEM_PACKET, NETEM_RELEASE, PACKET_HEAD_BYTES, Fate, tables
-from noack.resolve import resolve
-from noack.scenario_file import validate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    PACKET_HEAD_BYTES,
+    Fate,
+    tables,
+)
 
 MS = 1_000_000
 BERNOULLI = Bernoulli(probability=0.6)

@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.link import Datagram, Link
-from netem.program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.records import Decision, FlowState, Verdict
+from netem.link_machine import Datagram, Link
+from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.rule_records import Decision, FlowState, Verdict
 from netem.rules import mansd as rule
-from netem.rules.link import DELIVERED, settle
-from noack.impairments import (
+from netem.rules.link_rules import DELIVERED, settle
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from netem.link import Link
-from netem.records import Decision
+from netem.link_machine import Link
+from netem.rule_records import Decision
 from netem.rules.mansd import NEVER_NS
-from netem.words.parser import settings_of
-from noack.records import Fate
+from netem.words.words_to_settings import settings_of
+from noack.protocol.record_tables import Fate
 
 PAGE = (Path(__file__).parents[2] / "docs/mansd.md").read_text()
 NEVER = "–"

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine.compiled import compile_rule, compiled_program, compiled_state
-from netem.engine.many import admit_many
-from netem.link import Link
-from netem.predict import predict, predicted_loss
-from netem.program import empty_state, program_of, recent_width
-from netem.records import Verdict, dtype_of
+from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state
+from netem.engine.many_decisions import admit_many
+from netem.link_machine import Link
+from netem.loss_prediction import predict, predicted_loss
+from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_records import Verdict, dtype_of
 from netem.rules.mansd import NEVER_NS
-from netem.words.parser import settings_of
-from noack.impairments import LinkSettings
-from noack.records import Fate
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
+from noack.protocol.record_tables import Fate
 
 DECISIONS = 1_000_000
 BATCHES = 200

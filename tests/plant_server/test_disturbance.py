@@ -7,14 +7,14 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-from noack.disturbances import Gaussian, Step, Uniform
-from noack.machine import Record
-from noack.resolve import resolve, tables_of
-from noack.rng import normals
-from noack.scenario import Scenario
-from noack.scenario_file import validate
-from noack.wire import Flow, Message
-from plant_server.disturbance import disturbance_of
+from noack.config.disturbances import Gaussian, Step, Uniform
+from noack.config.resolution import resolve, tables_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.random_streams import normals
+from noack.protocol.machine_interface import Record
+from noack.protocol.wire_format import Flow, Message
+from plant_server.disturbance_signal import disturbance_of
 from plant_server.measurement import Measuring, measuring_of
 from plant_server.plant import Plant, plant_of
 

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.systems import FourTank, Vehicle
+from noack.config.plant_systems import FourTank, Vehicle
 from plant_server.systems import equations as compiled
-from plant_server.systems.choose import prepare
 from plant_server.systems.equations import equations, library
+from plant_server.systems.system_from_settings import prepare
 
 CARS = (1, 2, 3)
 WIDTHS = {"ks": 5, "st": 7, "std": 9, "mb": 29}

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.errors import CallerError
-from noack.system_files import read_system
-from noack.systems import Fmu
-from plant_server.linearise import linearise
-from plant_server.ode import OdeSystem
+from noack.config.plant_systems import Fmu
+from noack.config.system_files import read_system
+from noack.core.errors import CallerError
+from plant_server.ode_integrator import OdeSystem
+from plant_server.plant_linearisation import linearise
 from plant_server.system import SystemFailedError
 from plant_server.systems.fmu import FmuSystem
-from plant_server.systems.linear import LinearSystem
+from plant_server.systems.linear_plant import LinearSystem
 from tests.plant_server.fmus.build import build
 
 pytest.importorskip("fmpy")
@@ -252,7 +252,7 @@ def test_what_is_unpacked_goes_with_the_system_or_its_process(
     assert not folder.exists()
     program = (
         "import sys, tempfile, numpy as np; from plant_server.systems.fmu import FmuSystem; "
-        "from noack.systems import Fmu; tempfile.tempdir = sys.argv[1]; "
+        "from noack.config.plant_systems import Fmu; tempfile.tempdir = sys.argv[1]; "
         "kept = FmuSystem(Fmu.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
     )
     loaded = settings(build(tmp_path, 2)).model_dump_json()

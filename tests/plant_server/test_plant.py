@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from noack.linear import Matrix, Vector
-from noack.machine import Record
-from noack.records import PLANT_ACTUATION, PLANT_STEP, tables
-from noack.resolve import resolve
-from noack.scenario_file import validate
-from noack.wire import Flow, Message
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
+from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import Plant, plant_of
-from plant_server.systems.linear import LinearSystem
+from plant_server.systems.linear_plant import LinearSystem
 from plant_server.watchdog import Watchdog
 
 H_NS = 2_000_000

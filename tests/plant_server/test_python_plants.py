@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.errors import CallerError
-from noack.system_files import read_system
-from noack.systems import Python
+from noack.config.plant_systems import Python
+from noack.config.system_files import read_system
+from noack.core.errors import CallerError
 from plant_server.system import SystemFailedError
-from plant_server.systems.python import PythonSystem
+from plant_server.systems.python_plant import PythonSystem
 
 H_NS = 2_000_000
 X0 = np.array([0.3, 0.0])

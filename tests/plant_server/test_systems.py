@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from noack.systems import CartPole
-from plant_server.linearise import linearise
-from plant_server.ode import OdeSystem
+from noack.config.plant_systems import CartPole
+from plant_server.ode_integrator import OdeSystem
+from plant_server.plant_linearisation import linearise
 from plant_server.systems.cart_pole import cart_pole
 
 H_NS = 2_000_000

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from noack.errors import CallerError
-from noack.models import single_track_lane
-from noack.systems import Vehicle
-from plant_server.linearise import linearise
-from plant_server.ode import OdeSystem
+from noack.config.named_models import single_track_lane
+from noack.config.plant_systems import Vehicle
+from noack.core.errors import CallerError
+from plant_server.ode_integrator import OdeSystem
+from plant_server.plant_linearisation import linearise
 from plant_server.systems.vehicle import vehicle
 
 H_NS = 2_000_000
@@ -173,6 +173,6 @@ def test_what_the_library_does_not_have_is_refused(given: dict[str, Any], said: 
 
 
 def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("noack.systems.find_spec", lambda name: None)
+    monkeypatch.setattr("noack.config.plant_systems.find_spec", lambda name: None)
     with pytest.raises(CallerError, match=r"pip install 'noack\[vehicle\]'"):
         settings().require_installed()

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from noack.machine import Notice, Record
-from noack.records import PLANT_ACTUATION, PLANT_STEP, tables
-from noack.resolve import resolve
-from noack.scenario_file import validate
-from noack.wire import Flow, Message
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
+from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import Plant, plant_of
 from plant_server.watchdog import Watchdog, hold, zero
 

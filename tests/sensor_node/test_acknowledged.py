@@ -6,13 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.linear import transition
-from noack.machine import Output, Record
-from noack.records import NO_SEQUENCE, SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT, tables
+from noack.core.linear_systems import transition
+from noack.protocol.machine_interface import Output, Record
+from noack.protocol.record_tables import (
+    NO_SEQUENCE,
+    SENSOR_ACKNOWLEDGEMENT,
+    SENSOR_MEASUREMENT,
+    tables,
+)
+from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.decaying import DecayingTrigger
-from noack.wire import NO_VECTOR, Flow, Message
-from sensor_node.acknowledged import AcknowledgedSensor
+from sensor_node.acknowledged_sensor import AcknowledgedSensor
 
 MS = 1_000_000
 GRID_NS = 10 * MS

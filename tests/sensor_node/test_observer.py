@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.estimation import EstimationModel, believed_model, steady_state, true_model
-from noack.linear import Matrix, Vector, discretise
-from noack.machine import Notice, Output, Record, Start
-from noack.observability import observer_gain, unseen_mode
-from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT
-from noack.resolve import resolve, tables_of
-from noack.scenario import Scenario
-from noack.scenario_file import validate
-from noack.wire import Flow, Message
-from sensor_node.observer import Following, KalmanObserver, LuenbergerObserver
+from noack.config.observability import observer_gain, unseen_mode
+from noack.config.resolution import resolve, tables_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.config.state_estimation import EstimationModel, believed_model, steady_state, true_model
+from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.protocol.machine_interface import Notice, Output, Record, Start
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import sensor_of
+from sensor_node.state_observer import Following, KalmanObserver, LuenbergerObserver
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.linear import Matrix
-from noack.machine import Output, Record
-from noack.records import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
-from noack.resolve import resolve
-from noack.scenario_file import validate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.linear_systems import Matrix
+from noack.protocol.machine_interface import Output, Record
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, tables
+from noack.protocol.wire_format import Flow, Message
 from noack.trigger.decaying import DecayingTrigger
-from noack.wire import Flow, Message
 from sensor_node.sensor import Sensor, sensor_of
 
 GRID_NS = 10_000_000

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cosim import palette
+from cosim.output import palette
 from tests.integration.conftest import run_scenario, settings
 
 ROOT = Path(__file__).parents[2]

@@ -5,8 +5,8 @@ every ICMP error too, and fails its next call for it once; so the queue is empti
 decided whose an error is.
 """
 
-from netem.engine.pump.layout import HEADER, Memory
-from netem.engine.pump.libc import ECONNREFUSED, MSG_DONTWAIT, address_of, recvmmsg
+from netem.engine.pump.libc_calls import ECONNREFUSED, MSG_DONTWAIT, address_of, recvmmsg
+from netem.engine.pump.pump_layout import HEADER, Memory
 
 _MSG_ERRQUEUE = 0x2000
 _RECVERR = 0 | 11 << 32

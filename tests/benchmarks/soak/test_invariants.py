@@ -8,10 +8,10 @@ import pytest
 
 import benchmarks.soak
 from benchmarks.soak.invariants import Invariants
-from cosim.record import Rows, RunRecord
-from cosim.virtual import simulate
-from noack.resolve import resolve
-from noack.scenario_file import load
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
 
 FOLDER = Path(benchmarks.soak.__file__).parent
 Tables = dict[str, Rows]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.cli.complete import keys, run_directories
-from noack.scenario import Scenario
+from cosim.cli.completion import keys, run_directories
+from noack.config.scenario import Scenario
 
 ROOT = Path(__file__).parents[3]
 

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.cli.program import examples_of
-from netem.cli import options as emulator
-from netem.control.commands import COMMANDS as ERRANDS
-from netem.words.parser import parse
-from noack.errors import NoackError
+from netem.cli import emulator_options as emulator
+from netem.control.emulator_commands import COMMANDS as ERRANDS
+from netem.words.words_to_settings import parse
+from noack.core.errors import NoackError
 
 PROGRAM: Any = get_command(app)
 COMMANDS: dict[str, Any] = dict(PROGRAM.commands)

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from noack.scenario_file import load
+from noack.config.scenario_file import load
 
 ROOT = Path(__file__).parents[3]
 SCENARIOS = sorted(file.stem for file in (ROOT / "scenarios").glob("*.toml"))

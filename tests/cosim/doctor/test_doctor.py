@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from cosim.doctor.facts import wanted_of
-from noack.resolve import resolve
-from noack.scenario_file import load
+from cosim.doctor.machine_facts import wanted_of
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
 
 SHORT = ("--seconds", "0.2", "--set", "ports={}")
 

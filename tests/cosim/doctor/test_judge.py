@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from cosim.doctor.facts import Buffer, Disk, Lateness, Machine, RoundTrips, Wanted
-from cosim.doctor.judge import Finding, Verdict, judge, worst
-from cosim.doctor.measure import lateness
+from cosim.doctor.findings import Finding, Verdict, judge, worst
+from cosim.doctor.machine_facts import Buffer, Disk, Lateness, Machine, RoundTrips, Wanted
+from cosim.doctor.machine_measures import lateness
 
 WANTED = Wanted(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,

@@ -4,8 +4,8 @@ import json
 from typing import Any
 from unittest.mock import patch
 
-from cosim import coordinator
-from noack.topology import ROLES
+from cosim.live import coordinator
+from noack.protocol.topology import ROLES
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.parsers.ticket import _TICKET

@@ -4,9 +4,9 @@ from unittest.mock import patch
 
 import tomli_w
 
-from cosim.campaign.grid import grid
-from cosim.campaign.plan import json_schema, load
-from noack.errors import NoackError
+from cosim.studies.campaign.campaign_file import json_schema, load
+from cosim.studies.campaign.campaign_grid import grid
+from noack.core.errors import NoackError
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, edited, vocabulary
 from tests.fuzz.files import bases, quoted, write_named
@@ -39,7 +39,7 @@ def one_input(data: bytes) -> None:
         shorter = campaign.model_copy()
         # The guarantee of a point is a computation, not part of reading the file.
         with (
-            patch("cosim.campaign.grid.certified_error", return_value=None),
+            patch("cosim.studies.campaign.campaign_grid.certified_error", return_value=None),
             patch.object(type(campaign), "selected", lambda *_: iter(chosen)),
         ):
             try:

@@ -6,14 +6,14 @@ import os
 from typing import Any
 from unittest.mock import patch
 
-from cosim import coordinator
-from noack.changes import Change, Schedule, settings_bytes, settings_of
-from noack.clock import RunClock
-from noack.errors import PeerError
-from noack.io import open_runs
-from noack.io.messages import Announced, Answer, Asked, heard
-from noack.io.private import open_private
-from noack.knobs import SHORT
+from cosim.live import coordinator
+from noack.config.parameter_changes import Change, Schedule, settings_bytes, settings_of
+from noack.config.runtime_parameters import SHORT
+from noack.core.clock import RunClock
+from noack.core.errors import PeerError
+from noack.runtime import run_registry
+from noack.runtime.control_messages import Announced, Answer, Asked, heard
+from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace
@@ -99,7 +99,7 @@ def _found(data: bytes) -> None:
         with path.open() as lock:  # as the launcher has it
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal(str(path)):
-                run = open_runs.find()
+                run = run_registry.find()
                 assert all(isinstance(field, str) for field in run if field is not None)
 
 

@@ -3,9 +3,9 @@
 import json
 from typing import Any
 
-from netem.control.server import Change, ControlServer
-from netem.engine.api import DIRECTIONS
-from noack.impairments import LinkSettings
+from netem.control.control_server import Change, ControlServer
+from netem.engine.relay_interface import DIRECTIONS
+from noack.config.impairments import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, edited, vocabulary
 from tests.fuzz.parsers.words import EXAMPLES, sentence

@@ -6,12 +6,12 @@ from typing import Any
 
 import pyarrow as pa
 
-from netem.engine.api import LinkSpec
-from netem.fates.replay import read_fates
-from netem.fates.trace import METADATA, SCHEMA, description
-from netem.link import Link
-from netem.words.parser import settings_of
-from noack.impairments import LinkSettings
+from netem.engine.relay_interface import LinkSpec
+from netem.fates.fate_replay import read_fates
+from netem.fates.fate_trace import METADATA, SCHEMA, description
+from netem.link_machine import Link
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace

@@ -8,10 +8,10 @@ from unittest.mock import patch
 
 import tomli_w
 
-from netem.words.links import json_schema, load_links
-from netem.words.parser import settings_of
-from netem.words.text import text_of
-from noack.impairments import LinkSettings
+from netem.words.links_file import json_schema, load_links
+from netem.words.settings_to_words import text_of
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import edited, vocabulary
 from tests.fuzz.files import NAMED, quoted, write_named
@@ -66,7 +66,7 @@ def one_input(data: bytes) -> None:
             said["link"][0]["words"] = sentence(choices)
         data = tomli_w.dumps(edited(choices, said, KNOWN)).encode()
     path = write_named(workspace(), "links.toml", data)
-    with refusal(str(path), lines=True), patch("noack.io.address.socket.getaddrinfo", numeric):
+    with refusal(str(path), lines=True), patch("noack.runtime.address.socket.getaddrinfo", numeric):
         for spec in load_links(path):
             for settings in (spec.forward, spec.back):
                 assert LinkSettings.model_validate_json(settings.model_dump_json()) == settings

@@ -4,8 +4,8 @@ import io
 
 import numpy as np
 
-from noack.matrix_files import read_matrices
-from noack.named_file import NamedFile
+from noack.config.matrix_files import read_matrices
+from noack.config.named_file import NamedFile
 from tests.fuzz.harness import refusal, workspace
 
 

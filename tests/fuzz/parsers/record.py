@@ -13,20 +13,28 @@ import numpy as np
 import pyarrow.parquet as pq
 from rich.console import Console
 
-from cosim.conclude import Outcome, reopen
-from cosim.ending import Ending
-from cosim.environment import changed_since, environment
-from cosim.record import finish_record, load_record, write_record
-from cosim.replay import replay
-from cosim.run_dir import ENVIRONMENT_FILE, RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, SUMMARY_FILE
-from cosim.run_verdict import print_outcome
-from cosim.summary import dumps as summary_text
-from cosim.summary import summarise
-from cosim.virtual import simulate
-from noack.io.spool import SpoolWriter
-from noack.io.telemetry import notices_of
-from noack.resolve import resolve
-from noack.scenario_file import dumps, validate
+from cosim.analysis.replay import replay
+from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import dumps as summary_text
+from cosim.analysis.run_summary import summarise
+from cosim.live.finalize import reopen
+from cosim.output.run_verdict import print_outcome
+from cosim.record.environment import changed_since, environment
+from cosim.record.run_directory import (
+    ENVIRONMENT_FILE,
+    RECORD,
+    REPORTS_FILE,
+    SCENARIO_FILE,
+    SPOOL,
+    SUMMARY_FILE,
+)
+from cosim.record.run_ending import Ending
+from cosim.record.run_record import finish_record, load_record, write_record
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import dumps, validate
+from noack.runtime.spool import SpoolWriter
+from noack.runtime.telemetry import notices_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace
@@ -159,7 +167,7 @@ def _show(run_dir: Path) -> None:
         assert isinstance(ending.reason, str)
         return Outcome(run_dir, ending.status, ending.reason, {})
 
-    with patch("cosim.conclude.conclude", conclude):
+    with patch("cosim.live.finalize.conclude", conclude):
         outcome = reopen(run_dir)
     changed_since(run_dir)
     if outcome.summary:

@@ -5,9 +5,9 @@ from typing import Any
 
 import tomli_w
 
-from noack.resolve import resolve
-from noack.scenario import Scenario
-from noack.scenario_file import dumps, json_schema, load, validate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, json_schema, load, validate
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import edited, key, value, vocabulary
 from tests.fuzz.files import bases, quoted, write_named

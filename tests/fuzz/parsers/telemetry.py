@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from cosim.recorder import Recorder
-from cosim.run_dir import SCENARIO_FILE
-from noack.io.telemetry import NOTICES
-from noack.records import OWNER
-from noack.resolve import resolve, tables_of
-from noack.scenario_file import dumps, validate
+from cosim.live.recorder import Recorder
+from cosim.record.run_directory import SCENARIO_FILE
+from noack.config.resolution import resolve, tables_of
+from noack.config.scenario_file import dumps, validate
+from noack.protocol.record_tables import OWNER
+from noack.runtime.telemetry import NOTICES
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import workspace

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from netem.control import session
-from noack.io import ticket
-from noack.io.private import open_private
-from noack.resolve import resolve
-from noack.scenario_file import json_schema, validate
+from netem.control import emulator_session
+from noack.config.resolution import resolve
+from noack.config.scenario_file import json_schema, validate
+from noack.runtime import join_ticket
+from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, edited, vocabulary
 from tests.fuzz.files import bases
 from tests.fuzz.harness import refusal, workspace
 
-_TICKET = ticket.new_ticket(
+_TICKET = join_ticket.new_ticket(
     resolve(validate(bases("scenarios")[0], "base")), "tcp/127.0.0.1:7447", Path("run"),
     launched=True,
 )._replace(run_id=7, key=bytes(32))  # fmt: skip
@@ -37,8 +37,8 @@ def one_input(data: bytes) -> None:
         content = edited(choices, choices.one([TICKET, SESSION]), KNOWN)
         data = json.dumps(content).encode()
     with refusal("not a ticket"):
-        found = ticket.loads(data.decode("utf-8", "replace"))
-        assert ticket.loads(found.dumps()) == found
+        found = join_ticket.loads(data.decode("utf-8", "replace"))
+        assert join_ticket.loads(found.dumps()) == found
         assert len(found.key) == 32
         assert 0 <= found.run_id < 2**64
         assert isinstance(found.endpoint, str)
@@ -51,5 +51,5 @@ def one_input(data: bytes) -> None:
         with path.open() as lock:  # as the emulator has it
             fcntl.flock(lock, fcntl.LOCK_EX)
             with refusal("emulator 'up'"):
-                one = session.find("up")
+                one = emulator_session.find("up")
                 assert all(isinstance(field, str) for field in one)

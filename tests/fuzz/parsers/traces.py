@@ -2,8 +2,8 @@
 
 import json
 
-from noack.impairment_files import read_files
-from noack.impairments import Delay, LinkSettings, LossOf, Trace
+from noack.config.impairment_files import read_files
+from noack.config.impairments import Delay, LinkSettings, LossOf, Trace
 from tests.fuzz.harness import refusal, workspace
 
 SEEDS = [

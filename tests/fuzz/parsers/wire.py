@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 
-from noack.wire import Decoder, Encoder, Flow, Message, flow_of, read_header
+from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, flow_of, read_header
 from tests.fuzz.choices import Choices
 
 KEY = bytes(range(32))

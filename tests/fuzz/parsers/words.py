@@ -1,10 +1,10 @@
 """Words of ``tc netem``: text as it stands, or, after a zero byte, a sentence of its words."""
 
-from netem.words.meaning import meaning_of
-from netem.words.parser import KEYWORDS, SHAPES, parse
-from netem.words.tc import tc_command
-from netem.words.text import text_of
-from noack.errors import CallerError
+from netem.words.explanation import meaning_of
+from netem.words.settings_to_words import text_of
+from netem.words.tc_command import tc_command
+from netem.words.words_to_settings import KEYWORDS, SHAPES, parse
+from noack.core.errors import CallerError
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.harness import refusal
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from netem.capture.packets import Bytes, Events
+from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import Interface, Section
-from netem.events import EVENT
+from netem.relay_events import EVENT
 
 T_NS = 1_767_225_600_123_456_789
 INTERFACES = (Interface("link0 client", "where the clients are"), Interface("link0 server"))

@@ -1,4 +1,4 @@
-"""``docs/noack.lua`` in tshark, over datagrams of :mod:`noack.wire`."""
+"""``docs/noack.lua`` in tshark, over datagrams of :mod:`noack.protocol.wire_format`."""
 
 import math
 import random
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.wire import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
+from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
 from tests.netem.capture.batches import file_of
 from tests.netem.capture.conftest import Tshark
 

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.capture import pcapng
-from netem.capture.packets import put_blocks
+from netem.capture.packet_blocks import put_blocks
 from netem.capture.pcapng import Interface, Section
-from noack.records import Fate
+from noack.protocol.record_tables import Fate
 from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
 from tests.netem.capture.reader import Datagram, datagram, read
 

@@ -11,10 +11,10 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 
-from netem.capture.packets import Bytes, Events
+from netem.capture.capture_writer import CaptureWriter
+from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import Section
-from netem.capture.writer import CaptureWriter
-from noack.errors import CallerError
+from noack.core.errors import CallerError
 from tests.netem.capture.batches import INTERFACES, batch, file_of
 from tests.netem.capture.reader import read
 
@@ -183,7 +183,7 @@ def test_a_terminal_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_the_standard_output_takes_a_capture() -> None:
     program = (
-        "from netem.capture.writer import CaptureWriter\n"
+        "from netem.capture.capture_writer import CaptureWriter\n"
         "from tests.netem.capture.batches import *\n"
         "with CaptureWriter('-', INTERFACES) as capture: capture.offer(*batch({}, {'flow': 5}))\n"
         "assert capture.error is None\n"

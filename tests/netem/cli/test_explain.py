@@ -10,12 +10,12 @@ from typing import Any, get_type_hints
 import pytest
 
 from netem.__main__ import main
-from netem.cli.explain import DirectionExplanation, Explanation, LinkExplanation
-from netem.cli.options import parser, specs_of
-from netem.engine.api import LinkSpec
-from netem.words.links import load_links
-from netem.words.parser import settings_of
-from noack.impairments import LinkSettings
+from netem.cli.emulator_options import parser, specs_of
+from netem.cli.explain_links import DirectionExplanation, Explanation, LinkExplanation
+from netem.engine.relay_interface import LinkSpec
+from netem.words.links_file import load_links
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
 MUCH = (

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 
 from netem.__main__ import main
-from netem.cli.options import parsed, parser, specs_of
-from netem.engine.api import LinkSpec
-from netem.words.examples import EXAMPLES
-from netem.words.losses import LOSS_MODELS
-from netem.words.parser import KEYWORDS, parse, settings_of
-from noack.errors import CallerError
-from noack.impairments import LinkSettings, LossOf, Scripted
+from netem.cli.emulator_options import parsed, parser, specs_of
+from netem.engine.relay_interface import LinkSpec
+from netem.words.loss_words import LOSS_MODELS
+from netem.words.word_examples import EXAMPLES
+from netem.words.words_to_settings import KEYWORDS, parse, settings_of
+from noack.config.impairments import LinkSettings, LossOf, Scripted
+from noack.core.errors import CallerError
 
 ADDRESSES = ["--listen", ":9000", "--to", ":9001"]
 NOTHING = LinkSettings()

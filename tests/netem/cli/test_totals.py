@@ -5,8 +5,8 @@ from typing import Any
 
 from rich.console import Console
 
-from netem.cli.totals import print_totals
-from netem.control.statistics import Statistics
+from netem.cli.relay_totals import print_totals
+from netem.control.emulator_statistics import Statistics
 
 
 def direction(**changes: Any) -> Any:

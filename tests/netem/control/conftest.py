@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.errands import Errands
-from netem.control.server import ControlServer
+from netem.control.command_queue import Errands
+from netem.control.control_server import ControlServer
 from tests.netem.control.relays import FakeRelay, running
 
 

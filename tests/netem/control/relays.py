@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.errands import Errands
+from netem.control.command_queue import Errands
 from netem.engine import histogram
-from netem.engine.api import (
+from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
     Direction,
@@ -20,9 +20,9 @@ from netem.engine.api import (
     LinkSpec,
     Relay,
 )
-from netem.records import Counters
-from netem.words.parser import settings_of
-from noack.impairments import LinkSettings
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

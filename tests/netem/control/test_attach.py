@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.attach import Options, add_options, attached, options_of
-from netem.control.session import running
-from noack.errors import CallerError, ExitStatus
+from netem.control.emulator_session import running
+from netem.control.relay_attachments import Options, add_options, attached, options_of
+from noack.core.errors import CallerError, ExitStatus
 from tests.netem.control.processes import read_until, udp_socket
 from tests.netem.control.relays import FakeRelay
 

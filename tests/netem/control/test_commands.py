@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from netem.control import commands
-from netem.control.errands import Errands
-from netem.control.server import ControlServer
-from netem.words.parser import settings_of
-from noack.errors import ExitStatus
+from netem.control import emulator_commands
+from netem.control.command_queue import Errands
+from netem.control.control_server import ControlServer
+from netem.words.words_to_settings import settings_of
+from noack.core.errors import ExitStatus
 from tests.netem.control.processes import read_until
 from tests.netem.control.relays import SETTINGS, FakeRelay, running
 
@@ -26,7 +26,7 @@ LEAVE = "\x1b[?1049l"
 
 
 def run(arguments: str) -> ExitStatus:
-    return commands.main(arguments.split())
+    return emulator_commands.main(arguments.split())
 
 
 def test_what_has_happened_is_shown(

@@ -9,8 +9,8 @@ from typing import Any, get_type_hints
 
 import pytest
 
-from netem.control.server import ControlServer
-from netem.control.statistics import (
+from netem.control.control_server import ControlServer
+from netem.control.emulator_statistics import (
     DirectionStatistics,
     Flow,
     LinkStatistics,
@@ -19,11 +19,11 @@ from netem.control.statistics import (
     Recent,
     Statistics,
 )
-from netem.engine.api import LinkSpec
-from netem.fates.recorder import FateRecorder
-from netem.fates.trace import SCHEMA
-from netem.words.parser import settings_of
-from noack.impairments import LinkSettings
+from netem.engine.relay_interface import LinkSpec
+from netem.fates.fate_recorder import FateRecorder
+from netem.fates.fate_trace import SCHEMA
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
 from tests.netem.control.relays import FakeRelay, running
 
 NOTHING = LinkSettings()

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.control import commands
-from netem.control.session import running
-from noack.errors import ExitStatus
+from netem.control import emulator_commands
+from netem.control.emulator_session import running
+from noack.core.errors import ExitStatus
 from tests.netem.control.processes import emulator, read_until, send_through, udp_socket
 
 
 def shown(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """The statistics of the only emulator that runs."""
     capsys.readouterr()
-    assert commands.main(["show", "--json"]) == ExitStatus.OK
+    assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
     return document
 
@@ -40,7 +40,7 @@ def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixt
             client.send(payload)
         assert [server.recv(10) for _ in range(20)] == sent[:20]
 
-        assert commands.main(["set", "loss", "100%", "mansd 2"]) == ExitStatus.OK
+        assert emulator_commands.main(["set", "loss", "100%", "mansd 2"]) == ExitStatus.OK
         assert "forward: loss 100% mansd 2\n" in capsys.readouterr().out
         for payload in sent[20:]:
             client.send(payload)
@@ -59,14 +59,17 @@ def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixt
         assert sum(found["unintended"].values()) == 0
         assert [flow["packets"] for flow in found["flows"]] == [320]
 
-        assert commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
+        assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (
             "noack netem set: relay forward has no cap any more, it had mansd 2; "
             "the words replace all that was said before\n"
         )
 
         before = shown(capsys)["links"][0]["forward"]["words"]
-        assert commands.main(["set", "lab", "--direction", "back", "lozz 5%"]) == ExitStatus.CALLER
+        assert (
+            emulator_commands.main(["set", "lab", "--direction", "back", "lozz 5%"])
+            == ExitStatus.CALLER
+        )
         error = capsys.readouterr().err
         assert error.startswith("noack netem set: lozz: ")
         assert error.count("\n") == 1
@@ -79,7 +82,7 @@ def test_a_killed_emulator_is_not_found(capsys: pytest.CaptureFixture[str]) -> N
         options = ("--control", "lab", "--engine", "plain")
         with emulator(server.getsockname(), *options, status=-signal.SIGKILL) as (_, process):
             process.kill()
-    assert commands.main(["show", "lab"]) == ExitStatus.CALLER
+    assert emulator_commands.main(["show", "lab"]) == ExitStatus.CALLER
     assert "no emulator 'lab' runs that can be reached" in capsys.readouterr().err
 
 

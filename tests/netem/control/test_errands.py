@@ -2,10 +2,10 @@ import threading
 
 import pytest
 
-from netem.control.errands import Errands
-from netem.records import Counters
-from netem.words.parser import settings_of
-from noack.errors import CallerError, PeerError
+from netem.control.command_queue import Errands
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.core.errors import CallerError, PeerError
 from tests.netem.control.relays import FakeRelay
 
 
@@ -62,7 +62,7 @@ def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
 def test_a_relay_that_is_stuck_is_not_waited_for_forever(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("netem.control.errands._PATIENCE_S", 0.01)
+    monkeypatch.setattr("netem.control.command_queue._PATIENCE_S", 0.01)
     errands = Errands(relay)
     with pytest.raises(PeerError, match="has not answered for"):
         errands.snapshot()

@@ -2,8 +2,8 @@ from typing import Any, cast
 
 import pytest
 
-from netem.control.history import History
-from netem.control.statistics import Statistics
+from netem.control.emulator_statistics import Statistics
+from netem.control.statistics_history import History
 
 
 def statistics(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> Statistics:

@@ -9,16 +9,16 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from netem.control.client import Client
-from netem.control.errands import Errands
-from netem.control.server import ControlServer, secret_of
-from netem.control.session import Session, find, running
-from netem.records import Counters
-from netem.words.parser import settings_of
-from noack.errors import CallerError
-from noack.impairments import LinkSettings
-from noack.io.private import private_folder
-from noack.io.star import open_star, star_config
+from netem.control.command_queue import Errands
+from netem.control.control_client import Client
+from netem.control.control_server import ControlServer, secret_of
+from netem.control.emulator_session import Session, find, running
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.config.impairments import LinkSettings
+from noack.core.errors import CallerError
+from noack.runtime.private_folder import private_folder
+from noack.runtime.zenoh_session import open_star, star_config
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 
@@ -188,7 +188,7 @@ def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
         held.set()
         assert free.wait(60)
 
-    monkeypatch.setattr("netem.control.server.statistics", slow)
+    monkeypatch.setattr("netem.control.control_server.statistics", slow)
     assert held.wait(60)
     try:
         for _ in range(10):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.session import Session, find, published, running
-from noack.errors import CallerError, PeerError
+from netem.control.emulator_session import Session, find, published, running
+from noack.core.errors import CallerError, PeerError
 
 LAB = Session("lab", "tcp/127.0.0.1:1", "secret")
 
@@ -42,7 +42,7 @@ def test_unfit_names_are_refused(name: str) -> None:
 
 HOLDER = """
 import sys
-from netem.control.session import Session, published
+from netem.control.emulator_session import Session, published
 with published(Session("dead", "tcp/127.0.0.1:1", "secret")):
     print("published", flush=True)
     sys.stdin.read()

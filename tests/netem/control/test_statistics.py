@@ -4,17 +4,12 @@ from typing import Any, get_type_hints
 import numpy as np
 import pytest
 
-from netem.control.errands import InForce, Snapshot
-from netem.control.statistics import (
-    DirectionStatistics,
-    Recent,
-    Statistics,
-    statistics,
-)
-from netem.engine.api import DIRECTIONS, FlowReport
-from netem.records import Counters
-from netem.words.parser import settings_of
-from noack.clock import NS_PER_S
+from netem.control.command_queue import InForce, Snapshot
+from netem.control.emulator_statistics import DirectionStatistics, Recent, Statistics, statistics
+from netem.engine.relay_interface import DIRECTIONS, FlowReport
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.core.clock import NS_PER_S
 from tests.netem.control.relays import FakeRelay, times
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 import pytest
 from rich.console import Console
 
-from netem.control.errands import Errands
-from netem.control.history import History
-from netem.control.statistics import Statistics, statistics
-from netem.control.view import plain_lines, render
-from netem.engine.api import LinkSpec
-from netem.records import Counters
-from netem.words.parser import settings_of
-from noack.clock import NS_PER_S
+from netem.control.command_queue import Errands
+from netem.control.emulator_statistics import Statistics, statistics
+from netem.control.statistics_history import History
+from netem.control.statistics_view import plain_lines, render
+from netem.engine.relay_interface import LinkSpec
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.core.clock import NS_PER_S
 from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 

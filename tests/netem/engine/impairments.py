@@ -2,7 +2,7 @@
 
 from hypothesis import strategies as st
 
-from noack.impairments import (
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.engine.api import Address, LinkReport, LinkSpec, Relay, Tap
-from netem.engine.start import Engine, open_relay
-from noack.impairments import LinkSettings
-from noack.io.udp import enlarge_buffer
+from netem.engine.engine_choice import Engine, open_relay
+from netem.engine.relay_interface import Address, LinkReport, LinkSpec, Relay, Tap
+from noack.config.impairments import LinkSettings
+from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60
 """What never happens fails by then; nothing is measured."""

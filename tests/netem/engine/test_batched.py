@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.compiled import compile_rule
-from netem.engine.memory import PumpMemory
-from netem.engine.names import address_of_name, name_of
-from netem.engine.pump.clients import find, insert, key_of, remove
-from netem.engine.pump.store import drop, keep, pop, push
-from netem.engine.sockets import place_of
-from noack.impairments import Bernoulli, Delay, Duplicate, LinkSettings, LossOf
+from netem.engine.compiled_rules import compile_rule
+from netem.engine.pump.client_table import find, insert, key_of, remove
+from netem.engine.pump.payload_store import drop, keep, pop, push
+from netem.engine.pump_memory import PumpMemory
+from netem.engine.relay_sockets import place_of
+from netem.engine.socket_names import address_of_name, name_of
+from noack.config.impairments import Bernoulli, Delay, Duplicate, LinkSettings, LossOf
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, running
 from tests.netem.engine.relays import name_of as bound_name
 
@@ -126,9 +126,9 @@ def handled(report: object) -> int:
 FIRST_START = """
 import socket
 from netem.engine import batched
-from netem.engine.api import LinkSpec
-from netem.engine.start import open_relay
-from noack.impairments import LinkSettings
+from netem.engine.relay_interface import LinkSpec
+from netem.engine.engine_choice import open_relay
+from noack.config.impairments import LinkSettings
 def checked(specs, bind=batched.open_links):
     # What came to an open port would wait until all is compiled.
     assert specs[0].name == "none" or batched.functions().run_pump.signatures

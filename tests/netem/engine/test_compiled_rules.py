@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.compiled import compile_rule, compiled_program, compiled_state, set_flow
-from netem.engine.many import admit_many
-from netem.link import Link
-from netem.program import empty_state, program_of, recent_width
-from netem.records import Counters, Decision, FlowState, Verdict, array_of, dtype_of
-from netem.rules.change import carry
-from netem.rules.link import Program, State
-from noack.impairments import LinkSettings
+from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
+from netem.engine.many_decisions import admit_many
+from netem.link_machine import Link
+from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_records import Counters, Decision, FlowState, Verdict, array_of, dtype_of
+from netem.rules.link_rules import Program, State
+from netem.rules.settings_change import carry
+from noack.config.impairments import LinkSettings
 from tests.netem.engine import impairments
 
 FLOWS = 4

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from netem.engine.start import Engine
-from noack.impairments import LinkSettings
+from netem.engine.engine_choice import Engine
+from noack.config.impairments import LinkSettings
 from tests.netem.engine import impairments
 from tests.netem.engine.relays import drain, endpoints, link, name_of, running
 

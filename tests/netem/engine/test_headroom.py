@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from netem.engine.start import Engine
-from noack.errors import ExitStatus
+from netem.engine.engine_choice import Engine
+from noack.core.errors import ExitStatus
 from tests.netem.control.processes import emulator, send_through, udp_socket
 
 SIZE_BYTES, BATCH, MOST = 60_000, 100, 40_000

@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from netem.engine import start as starting
-from netem.engine.api import LinkSpec
-from netem.engine.sockets import raise_file_limit
-from netem.engine.start import Engine, open_relay
-from netem.records import Decision
-from noack.errors import CallerError
-from noack.impairments import (
+from netem.engine import engine_choice as starting
+from netem.engine.engine_choice import Engine, open_relay
+from netem.engine.relay_interface import LinkSpec
+from netem.engine.relay_sockets import raise_file_limit
+from netem.rule_records import Decision
+from noack.config.impairments import (
     Bernoulli,
     Corrupt,
     Delay,
@@ -33,7 +32,8 @@ from noack.impairments import (
     Periodic,
     WorstCase,
 )
-from noack.records import Fate
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import Fate
 from tests.netem.engine.relays import HOSTS, KeepAll, drain, endpoints, link, name_of, running
 
 ENGINES: Sequence[Engine] = ("batched", "plain")

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.api import LinkSpec
-from netem.engine.start import Engine
-from netem.link import Datagram, Link
-from noack.impairments import LinkSettings
+from netem.engine.engine_choice import Engine
+from netem.engine.relay_interface import LinkSpec
+from netem.link_machine import Datagram, Link
+from noack.config.impairments import LinkSettings
 from tests.netem.engine import impairments
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
 

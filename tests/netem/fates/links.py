@@ -9,12 +9,12 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from netem.engine.api import LinkSpec
-from netem.events import EVENT
-from netem.fates.recorder import FateRecorder
-from netem.link import Datagram, Link
-from netem.records import Verdict
-from noack.impairments import (
+from netem.engine.relay_interface import LinkSpec
+from netem.fates.fate_recorder import FateRecorder
+from netem.link_machine import Datagram, Link
+from netem.relay_events import EVENT
+from netem.rule_records import Verdict
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from netem.fates.replay import read_fates
-from netem.fates.trace import METADATA
-from noack.errors import CallerError
+from netem.fates.fate_replay import read_fates
+from netem.fates.fate_trace import METADATA
+from noack.core.errors import CallerError
 from tests.fuzz.parsers.fates import DOCUMENT, TABLE
 
 

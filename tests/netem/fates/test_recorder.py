@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from netem.events import EVENT
-from netem.fates.recorder import FateRecorder
-from netem.fates.replay import read_fates
-from netem.fates.trace import METADATA
-from noack.errors import CallerError
-from noack.impairments import Corrupt, LinkSettings
-from noack.records import Fate
+from netem.fates.fate_recorder import FateRecorder
+from netem.fates.fate_replay import read_fates
+from netem.fates.fate_trace import METADATA
+from netem.relay_events import EVENT
+from noack.config.impairments import Corrupt, LinkSettings
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import Fate
 from tests.netem.fates.links import Arrival, record, spec_of
 
 NOTHING = np.zeros(0, np.uint8)

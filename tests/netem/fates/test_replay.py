@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.fates.replay import read_fates
-from netem.link import Link
-from netem.records import Decision
-from noack.impairments import (
+from netem.fates.fate_replay import read_fates
+from netem.link_machine import Link
+from netem.rule_records import Decision
+from noack.config.impairments import (
     Corrupt,
     Delay,
     Duplicate,
@@ -21,7 +21,7 @@ from noack.impairments import (
     Rate,
     WorstCase,
 )
-from noack.records import Fate
+from noack.protocol.record_tables import Fate
 from tests.netem.fates.links import Arrival, Run, arrivals, drive, payload, record, settings
 
 BAD = LinkSettings(

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import pyarrow.parquet as pq
 
-from noack.records import Fate
+from noack.protocol.record_tables import Fate
 
 LET_OUT = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
 

@@ -20,9 +20,9 @@ import pytest
 from dnslib import RR, DNSRecord
 from dnslib.server import BaseResolver, DNSHandler, DNSLogger, DNSServer
 
-from netem.cli.options import LINK_NAME
-from netem.link import Link
-from netem.words.parser import settings_of
+from netem.cli.emulator_options import LINK_NAME
+from netem.link_machine import Link
+from netem.words.words_to_settings import settings_of
 from tests.netem.programs.conftest import Emulate
 from tests.netem.programs.emulator import LET_OUT
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from noack.records import Fate
+from noack.protocol.record_tables import Fate
 from tests.netem.programs.conftest import Emulate
 from tests.netem.programs.emulator import Emulator
 from tests.netem.programs.iperf import (

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import pytest
 
-from noack.errors import ExitStatus
-from noack.records import Fate
+from noack.core.errors import ExitStatus
+from noack.protocol.record_tables import Fate
 from tests.netem.programs.conftest import Emulate
 from tests.netem.programs.emulator import LET_OUT
 

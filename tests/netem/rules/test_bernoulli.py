@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.impairments import Bernoulli, LinkSettings, LossOf
+from noack.config.impairments import Bernoulli, LinkSettings, LossOf
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.8])

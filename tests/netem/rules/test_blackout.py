@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.program import program_of
+from netem.rule_program import program_of
 from netem.rules.blackout import dark
-from noack.impairments import Blackout, LinkSettings
+from noack.config.impairments import Blackout, LinkSettings
 
 NS = 10**9
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from noack.impairments import Bernoulli, LossOf
+from noack.config.impairments import Bernoulli, LossOf
 
 COUNT = 400_000
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from netem.link import flipped
-from noack.impairments import Corrupt, Duplicate, LinkSettings
+from netem.link_machine import flipped
+from noack.config.impairments import Corrupt, Duplicate, LinkSettings
 
 
 @pytest.mark.parametrize("size_bytes", [1, 2, 100, 65_507])

@@ -10,9 +10,9 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from netem.program import program_of
+from netem.rule_program import program_of
 from netem.rules.delay import quantile_ns
-from noack.impairments import (
+from noack.config.impairments import (
     Bernoulli,
     Delay,
     Duplicate,

@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.impairments import Bernoulli, Delay, Duplicate, LossOf
+from noack.config.impairments import Bernoulli, Delay, Duplicate, LossOf
 
 
 def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> None:

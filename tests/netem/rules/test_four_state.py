@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.impairments import FourState, LossOf
+from noack.config.impairments import FourState, LossOf
 
 LOSES = np.array([False, False, True, True])
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.impairments import GilbertElliott, LossOf
+from noack.config.impairments import GilbertElliott, LossOf
 
 ERRORS = 5
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from netem.engine.compiled import compile_rule
+from netem.engine.compiled_rules import compile_rule
 from netem.rules.philox import philox, uniforms
 
 ONES = 0xFFFFFFFF

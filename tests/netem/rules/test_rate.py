@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.program import empty_state, program_of
+from netem.rule_program import empty_state, program_of
 from netem.rules.rate import enters, serve
-from noack.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCase
+from noack.config.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCase
 
 NS = 10**9
 Queue = tuple[Rate, list[tuple[int, int, bool]]]

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.impairments import Delay, LinkSettings, Reorder
+from noack.config.impairments import Delay, LinkSettings, Reorder
 
 FIXED = Delay(delay_s=0.01)
 

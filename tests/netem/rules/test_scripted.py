@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.program import program_of
-from netem.rules.scripted import lost
-from noack.impairments import LinkSettings, Loss, LossOf, Periodic, Scripted, WorstCase
+from netem.rule_program import program_of
+from netem.rules.scripted_losses import lost
+from noack.config.impairments import LinkSettings, Loss, LossOf, Periodic, Scripted, WorstCase
 
 
 def flags(loss: Loss, packets: Any) -> list[bool]:

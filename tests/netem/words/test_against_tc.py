@@ -5,10 +5,10 @@ from hypothesis import given
 from hypothesis import settings as example_settings
 from hypothesis import strategies as st
 
-from netem.words.parser import settings_of
-from netem.words.tc import tc_command
-from noack import impairments as imp
-from noack.errors import CallerError
+from netem.words.tc_command import tc_command
+from netem.words.words_to_settings import settings_of
+from noack.config import impairments as imp
+from noack.core.errors import CallerError
 from tests.netem import any_settings
 from tests.netem.words.tc_request import Request, Tc
 

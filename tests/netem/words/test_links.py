@@ -11,13 +11,13 @@ import pytest
 import tomli_w
 from hypothesis import given
 
-from netem.engine.api import LinkSpec
-from netem.words.links import LinksFile, json_schema, load_links
-from netem.words.parser import settings_of
-from netem.words.text import text_of
-from noack import toml_file
-from noack.errors import CallerError
-from noack.impairments import Delay, LinkSettings, LossOf, Scripted
+from netem.engine.relay_interface import LinkSpec
+from netem.words.links_file import LinksFile, json_schema, load_links
+from netem.words.settings_to_words import text_of
+from netem.words.words_to_settings import settings_of
+from noack.config import toml_file
+from noack.config.impairments import Delay, LinkSettings, LossOf, Scripted
+from noack.core.errors import CallerError
 from tests.netem.any_settings import settings, words_can_say
 
 ROOT = Path(__file__).parents[3]

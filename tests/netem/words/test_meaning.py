@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 
-from netem.link import Link
-from netem.words.meaning import meaning_of, settings_meaning
-from netem.words.parser import settings_of
+from netem.link_machine import Link
+from netem.words.explanation import meaning_of, settings_meaning
+from netem.words.words_to_settings import settings_of
 
 DRAWS = 20_000
 

@@ -6,11 +6,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from netem.words.parser import parse, settings_of
 from netem.words.quantities import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percent_text, time_text
-from netem.words.text import text_of
-from noack.errors import CallerError
-from noack.impairments import (
+from netem.words.settings_to_words import text_of
+from netem.words.words_to_settings import parse, settings_of
+from noack.config.impairments import (
     Bernoulli,
     Blackout,
     Corrupt,
@@ -30,6 +29,7 @@ from noack.impairments import (
     Trace,
     WorstCase,
 )
+from noack.core.errors import CallerError
 from tests.netem.any_settings import settings, words_can_say
 
 

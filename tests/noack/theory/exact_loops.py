@@ -5,10 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.exact.loop import ContinuousLoop, Samples
-from cosim.exact.run import ContinuousRun, TooManyEventsError, simulate_continuous
-from noack.linear import Vector
-from noack.resolve import Loop
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, Samples
+from cosim.simulation.continuous.continuous_run import (
+    ContinuousRun,
+    TooManyEventsError,
+    simulate_continuous,
+)
+from noack.config.resolution import Loop
+from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.loops import System
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.linear import Matrix, Vector, spectral_abscissa
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.certificate import Conditions, Constants, Level, solve
 from noack.theory.gains import ErrorGains, PlantGains
 

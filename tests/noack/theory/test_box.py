@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, Phase, assume, find, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.linear import Matrix, Vector, spectral_abscissa
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.box import BoxGains
 from noack.theory.certificate import Conditions, Constants, Level, VoidError, solve
 from noack.theory.enclosure import NotDecayingError

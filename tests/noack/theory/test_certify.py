@@ -14,16 +14,16 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_continuous_lyapunov
 
-from noack.linear import spectral_abscissa
-from noack.resolve import loop_of, resolve
-from noack.scenario import Scenario
-from noack.scenario_file import load, validate
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load, validate
+from noack.core.linear_systems import spectral_abscissa
 from noack.theory.assumptions import Verdict
 from noack.theory.certificate import Conditions, Constants, VoidError
-from noack.theory.certify import OWN_PLANT, Certificate, certify, certify_box
 from noack.theory.gains import ErrorGains
-from noack.theory.printed import theorem_2
-from noack.theory.schedule import ideal_conditions
+from noack.theory.paper_bounds import theorem_2
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import OWN_PLANT, Certificate, certify, certify_box
 from tests.noack.theory.loops import STEPS, System, Trace, networks, simulate, systems, times_s
 
 ROUNDING = 1 + 1e-9

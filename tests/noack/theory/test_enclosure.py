@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.linear import Matrix, spectral_abscissa
-from noack.theory.decay import decay_of
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.theory.contraction import decay_of
 from noack.theory.enclosure import (
     Kernel,
     NotDecayingError,

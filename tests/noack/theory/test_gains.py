@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from noack.linear import Matrix
+from noack.core.linear_systems import Matrix
 from noack.theory.certificate import Conditions, VoidError, first_passage_s
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import System, systems

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, Phase, find, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.linear import Matrix, Vector
-from noack.theory.monitor import ErrorBounds, ErrorMonitor
+from noack.core.linear_systems import Matrix, Vector
+from noack.theory.error_bounds import ErrorBounds, ErrorMonitor
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import System, systems

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from noack.impairments import Delay, LinkSettings, Rate
-from noack.resolve import resolve
-from noack.scenario_file import validate
+from noack.config.impairments import Delay, LinkSettings, Rate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
 from noack.theory.assumptions import assumptions
-from noack.theory.schedule import nominal_conditions
+from noack.theory.run_conditions import nominal_conditions
 
 
 @pytest.mark.parametrize(

@@ -10,17 +10,11 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from cosim.exact.run import ContinuousRun
-from noack.linear import Matrix, Vector, spectral_abscissa
-from noack.resolve import Loop
+from cosim.simulation.continuous.continuous_run import ContinuousRun
+from noack.config.resolution import Loop
+from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.certificate import Conditions, VoidError
-from noack.theory.printed import (
-    Interval,
-    Theorem2,
-    longest_interval_s,
-    theorem_1,
-    theorem_2,
-)
+from noack.theory.paper_bounds import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe
 from tests.noack.theory.loops import System, systems
 

@@ -17,10 +17,10 @@ from noack.trigger.dynamic import DynamicTrigger
 from noack.trigger.lyapunov import LyapunovTrigger
 from noack.trigger.mixed import MixedTrigger
 from noack.trigger.periodic import PeriodicTrigger
-from noack.trigger.policy import Policy, Trigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.trigger_policy import Policy, Trigger
 
 Vector = NDArray[np.float64]
 MS = 1_000_000

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.errors import CallerError
-from noack.scenario_file import validate
-from noack.trigger.guard import Form
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
+from noack.trigger.trigger_condition import Form
 
 DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
 RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}

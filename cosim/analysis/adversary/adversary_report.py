@@ -1,0 +1,71 @@
+"""What ``noack adversary`` says."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cosim.analysis.adversary.objective import Objective
+from cosim.analysis.adversary.tightness import Worst
+from noack.config.scenario import Scenario
+from noack.theory.scenario_certificates import Certificate
+
+
+def document(
+    found: Sequence[Worst], resolved: Scenario, certificate: Certificate
+) -> dict[str, Any]:
+    """The results as JSON."""
+    return {
+        "scenario": resolved.name,
+        "mode": resolved.mode,
+        "mansd": resolved.network.mansd,
+        "horizon_s": resolved.horizon_s,
+        "certificate": certificate.to_json(),
+        "worst": {worst.objective.value: worst.to_json() for worst in found},
+    }
+
+
+def print_worst(
+    console: Console, found: Sequence[Worst], resolved: Scenario, certificate: Certificate
+) -> None:
+    """Print the results, and the patterns that led to them."""
+    table = Table(
+        title=f"{resolved.name}: the worst losses, at most M − 1 = {resolved.network.mansd} "
+        f"in a row, {resolved.horizon_s:g} s"
+    )
+    for heading in ("", "no loss", "as seeded", "worst", "certified", "tightness"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for worst in found:
+        values = (worst.lossless, worst.own, worst.value, worst.certified)
+        table.add_row(
+            _quantity(worst.objective, certificate),
+            *map(_number, values),
+            "[bold red]breached[/]" if worst.breaches else _number(worst.tightness),
+        )
+    console.print(table)
+    for worst in found:
+        at = "" if worst.at_s is None else f"at {worst.at_s:.6f} s; "
+        how = "no pattern is worse" if worst.exact else "not all patterns were tried"
+        speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
+        console.print(f"{worst.objective.value}: {at}{how} ({speed})")
+        console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
+    console.print("[dim]D delivered, · lost; --json tells the times of the events[/]")
+
+
+def _quantity(objective: Objective, certificate: Certificate) -> str:
+    rate = certificate.alpha_per_s
+    if certificate.constants is not None:
+        rate = certificate.constants.rate_per_s
+    symbol = "α" if rate == certificate.alpha_per_s else f"{rate:.3g}"
+    growth = f" e^({symbol}t)" if rate else ""
+    return {
+        Objective.ERROR: f"Δ: ‖e_c‖{growth} / β",
+        Objective.STATE: f"X: ‖x‖{growth}",
+        Objective.COST: "∫ ‖x‖² dt",
+        Objective.INTER_EVENT: "inter-event time, s",
+    }[objective]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"

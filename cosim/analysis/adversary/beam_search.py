@@ -1,0 +1,141 @@
+"""Beam search: where there are too many patterns, the most promising of each kind go on.
+
+All runs pass through the same windows of time. At the end of each the runs are thinned out: of runs
+that nearly coincide one is kept, and then, of every number of successive dropouts and every part of
+the window, first the best, then the second best, and so on; one half by what a run is worth so far,
+the other by its promise. The promise is what the loop would do by itself, without events: the
+integral of the output's square over the window to come.
+"""
+
+import numpy as np
+
+from cosim.analysis.adversary.search_nodes import (
+    Best,
+    Found,
+    Indices,
+    Log,
+    Nodes,
+    Report,
+    branches,
+    root,
+    together,
+)
+from cosim.analysis.adversary.segments import SegmentFlow
+from noack.core.linear_systems import Matrix, Vector
+
+_ALIKE = 1e-4
+_PARTS = 2
+_CROWD = 8
+_POINTS = 12
+
+
+def search_beam(
+    flow: SegmentFlow,
+    mansd: int,
+    width: int,
+    window_s: float,
+    *,
+    known: float = -np.inf,
+    report: Report = lambda nodes, value: None,
+) -> Found:
+    """Look for a large value among patterns with at most ``mansd`` dropouts in a row.
+
+    Args:
+        flow: the loop with its objective.
+        mansd: M − 1.
+        width: how many runs go on from one window to the next.
+        window_s: about the time between two events.
+        known: a value that is reached for sure.
+        report: is told of progress.
+
+    Raises:
+        TooManyEventsError: two events at the same time.
+    """
+    log, best, choice = Log(), Best(flow, known), _Choice(flow, width, window_s)
+    waiting, visited, until_s = root(flow), 0, 0.0
+    while len(waiting.t_s) and best.value < np.inf:
+        until_s = max(until_s, float(waiting.t_s.min())) + window_s
+        now = waiting.t_s < until_s
+        active, later = waiting.take(now), [waiting.take(~now)]
+        while len(active.t_s):
+            segments = flow(active.t_s, active.z, best.value)
+            visited += len(active.t_s)
+            value = best.see(active, segments)
+            following = branches(active, segments, value, mansd, log)
+            now = following.t_s < until_s
+            later.append(following.take(~now))
+            active = choice.thin(following.take(now), _CROWD * width)
+        waiting = choice.thin(together(later), width)
+        report(visited, best.value)
+    return best.found(log, visited, complete=False)
+
+
+class _Choice:
+    """Who goes on."""
+
+    def __init__(self, flow: SegmentFlow, width: int, window_s: float) -> None:
+        self._measure, self._window_s = flow.measure, window_s
+        self._gramian = _gramian(flow, window_s)
+
+    def thin(self, nodes: Nodes, width: int) -> Nodes:
+        """At most ``width`` of them."""
+        if len(nodes.t_s) <= width:
+            return nodes
+        nodes = nodes.take(self._distinct(nodes))
+        promise, kind = self._promise(nodes), self._kind(nodes)
+        if self._measure.additive:
+            return nodes.take(_turns(nodes.value + promise, kind)[:width])
+        by_value = _turns(nodes.value, kind, promise)[: width // 2]
+        by_promise = _turns(promise, kind)
+        chosen = np.concatenate([by_value, by_promise[~np.isin(by_promise, by_value)]])
+        return nodes.take(chosen[:width])
+
+    def _scaled(self, nodes: Nodes) -> Matrix:
+        return np.asarray(nodes.z / self._measure.level(nodes.t_s)[:, None])
+
+    def _promise(self, nodes: Nodes) -> Vector:
+        z = self._scaled(nodes)
+        return np.asarray(np.einsum("ai,ij,aj->a", z, self._gramian, z))
+
+    def _kind(self, nodes: Nodes) -> Indices:
+        since_s = nodes.t_s - nodes.t_s.min()
+        part = np.minimum(since_s * _PARTS / self._window_s, _PARTS).astype(int)
+        return np.asarray(nodes.dropouts * (_PARTS + 1) + part)
+
+    def _distinct(self, nodes: Nodes) -> Indices:
+        """The most valuable of those that nearly coincide."""
+        z = self._scaled(nodes)
+        size = np.abs(z).max() or 1.0
+        features = np.column_stack([nodes.t_s / self._window_s, z / size, nodes.dropouts])
+        order = np.argsort(-nodes.value, kind="stable")
+        _, first = np.unique(np.round(features[order] / _ALIKE), axis=0, return_index=True)
+        return np.asarray(order[np.sort(first)])
+
+
+def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
+    """Indices in the order of choice: the best of each kind, the second best of each, and so on."""
+    then = score if then is None else then
+    order = np.lexsort((-then, -score, kind))
+    starts = np.flatnonzero(np.diff(kind[order], prepend=-1))
+    rank = np.empty(len(order), int)
+    rank[order] = np.arange(len(order)) - np.repeat(starts, np.diff(starts, append=len(order)))
+    return np.asarray(np.lexsort((-then, -score, rank)))
+
+
+def _gramian(flow: SegmentFlow, window_s: float) -> Matrix:
+    """∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
+    system, measure = flow.system, flow.measure
+    n = system.loop.n
+    if measure.output is None:  # how fast e_s sets out
+        speed = system.generator[n : 2 * n]
+        speed = speed if system.trigger.weight is None else system.trigger.weight @ speed
+        return np.asarray(speed.T @ speed)
+    from scipy.linalg import expm
+
+    generator = system.generator + measure.rate_per_s * np.eye(3 * n)
+    points, weights = np.polynomial.legendre.leggauss(_POINTS)
+    total = np.zeros_like(generator)
+    for s, weight in zip((points + 1) / 2 * window_s, weights / 2 * window_s, strict=True):
+        y = measure.output @ expm(generator * s)
+        total += weight * (y.T @ y)
+    return total

@@ -1,0 +1,58 @@
+"""What the rest of a run can still add to ∫‖x‖² at most.
+
+From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞),
+
+    ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B U‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
+
+(Young's inequality for the convolution; K = U R), where by identity (I1) no pattern makes ‖R e_c‖
+larger than D level(t): D sums the gains of the present e_s and of M − 1 missed ones, however close.
+It is cheap, and it leaves out what comes late in a run. For suprema there is nothing as good: they
+may come at any time, and a bound by rates of growth reaches only the last fraction of a second.
+"""
+
+import numpy as np
+
+from cosim.analysis.adversary.pattern_tree import Ceiling
+from cosim.analysis.adversary.search_nodes import Nodes
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from noack.core.linear_systems import Vector
+from noack.theory.enclosure import NotDecayingError, response
+from noack.theory.gains import ErrorGains, Output
+
+
+def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceiling | None:
+    """The bound for a loop; None if A + BK is not stable."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    loop, trigger = system.loop, system.decaying
+    closed = loop.A + loop.B @ loop.K
+    models = _models(system)
+    missing = models.now(Output.GAIN) + models.missing(Output.GAIN, mansd, 0.0)
+    try:
+        pushed = response(closed, loop.B @ models.split_K[0])
+    except NotDecayingError:
+        return None
+    gain = pushed.through(np.eye(loop.n)).integral() * missing
+    P = solve_continuous_lyapunov(closed.T, -np.eye(loop.n))
+    rate, beta = 2 * models.alpha_per_s, trigger.beta
+
+    def ceiling(nodes: Nodes) -> Vector:
+        x, rest_s = nodes.z[:, : loop.n], horizon_s - nodes.t_s
+        own = np.einsum("ai,ij,aj->a", x, P, x)
+        faded = -np.expm1(-rate * rest_s) / rate if rate else rest_s
+        level = beta**2 * np.exp(-rate * nodes.t_s) * faded + trigger.floor**2 * rest_s
+        return np.asarray((np.sqrt(own) + gain * np.sqrt(level)) ** 2)
+
+    return ceiling
+
+
+def _models(system: ContinuousLoop) -> ErrorGains:
+    """The gains at the threshold's own rate if the models decay faster, otherwise at rate 0."""
+    loop, trigger = system.loop, system.decaying
+    weight = np.eye(loop.n) if trigger.weight is None else trigger.weight
+    gains = ErrorGains(loop.H, loop.K, weight, trigger.alpha_per_s)
+    try:
+        gains.missing(Output.GAIN, 1, 0.0)
+    except NotDecayingError:
+        return ErrorGains(loop.H, loop.K, weight, 0.0)
+    return gains

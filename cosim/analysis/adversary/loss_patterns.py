@@ -1,0 +1,101 @@
+"""Given patterns: what they are worth, and what a change of single decisions makes of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.adversary.search_nodes import Found, Log, after_events, root, together
+from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEventsError
+from noack.core.linear_systems import Vector
+
+Pattern = tuple[bool, ...]
+"""Whether the update of each event is delivered; of events beyond its end it is."""
+
+_RANDOM = 64
+
+
+class Outcomes(NamedTuple):
+    """What became of patterns."""
+
+    value: Vector
+    """(N,)"""
+    patterns: list[Pattern]
+    """The decisions that were made, up to the horizon."""
+
+
+def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
+    """Run patterns to the horizon; where one asks for too many dropouts, an update is delivered.
+
+    Raises:
+        TooManyEventsError: a run has more than 100,000 events, or two at the same time.
+    """
+    count, log = len(patterns), Log()
+    longest = max(map(len, patterns), default=0)
+    wanted = np.ones((count, longest + 1), dtype=bool)
+    for row, pattern in zip(wanted, patterns, strict=True):
+        row[: len(pattern)] = pattern
+    nodes = together([root(flow)] * count)
+    run, value, last = np.arange(count), nodes.value.copy(), nodes.entry.copy()
+    for event in range(MAX_EVENTS):
+        segments = flow(nodes.t_s, nodes.z)
+        value[run] = flow.measure.joined(nodes.value, segments.value)
+        last[run] = nodes.entry
+        going = np.flatnonzero(segments.is_event)
+        if not len(going):
+            return Outcomes(value, [log.decisions(int(entry)) for entry in last])
+        forced = nodes.dropouts[going] >= mansd
+        delivered = wanted[run[going], min(event, longest)] | forced
+        run, nodes = run[going], after_events(nodes, segments, value[run], going, delivered, log)
+    raise TooManyEventsError(f"trigger: more than {MAX_EVENTS} events: they accumulate")
+
+
+def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Pattern]:
+    """Patterns to begin with: none lost, all that may be, regular ones, random ones.
+
+    Args:
+        mansd: M − 1.
+        events: how many decisions to make.
+        rng: for the random ones.
+    """
+    if mansd == 0:
+        return [()]
+    regular = [
+        tuple((i + phase) % (lost + 1) == lost for i in range(events))
+        for lost in range(1, mansd + 1)
+        for phase in range(lost + 1)
+    ]
+    share = rng.uniform(size=(_RANDOM, 1))
+    random = rng.uniform(size=(_RANDOM, events)) < share
+    return [(), *regular, *(tuple(row) for row in random.tolist())]
+
+
+def improve(
+    flow: SegmentFlow, mansd: int, pattern: Pattern, value: float, most_nodes: int
+) -> Found:
+    """Change single decisions as long as that makes a pattern worse for the loop.
+
+    Args:
+        flow: the loop with its objective.
+        mansd: M − 1.
+        pattern: to begin with.
+        value: of it.
+        most_nodes: give up beyond.
+    """
+    # One that was only decided up to its worst moment is completed.
+    pattern, visited = follow(flow, mansd, [pattern]).patterns[0], len(pattern)
+    while visited + len(pattern) ** 2 <= most_nodes:
+        changed = [_changed(pattern, i) for i in range(len(pattern))]
+        if not changed:
+            break
+        tried = follow(flow, mansd, changed)
+        visited += sum(map(len, tried.patterns))
+        top = int(tried.value.argmax())
+        if not tried.value[top] > value:
+            break
+        value, pattern = float(tried.value[top]), tried.patterns[top]
+    return Found(value, pattern, visited, complete=False)
+
+
+def _changed(pattern: Pattern, i: int) -> Pattern:
+    return (*pattern[:i], not pattern[i], *pattern[i + 1 :])

@@ -1,0 +1,90 @@
+"""What the adversary maximises along a run.
+
+With z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous.continuous_loop`, a level that falls
+like the threshold, and the run's events t_0 < t_1 < …, over a horizon T:
+
+* error: sup_{t ≤ T} ‖W e_c(t)‖ / level(t), the observed Δ;
+* state: sup_{t ≤ T} ‖x(t)‖ β / level(t), the observed X;
+* cost: ∫₀^T ‖x(t)‖² dt;
+* inter-event: −min_i (t_{i+1} − t_i).
+
+level(t) = βe^{−rt}, r = α unless a certificate decays at another rate; where the threshold has a
+floor ε and r = α, it is the threshold max(βe^{−αt}, ε).
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from noack.core.linear_systems import Matrix
+
+
+class Objective(StrEnum):
+    """What is to be made as bad as possible."""
+
+    ERROR = "error"
+    STATE = "state"
+    COST = "cost"
+    INTER_EVENT = "inter-event"
+
+
+@dataclass(frozen=True)
+class Measure:
+    """An objective of a given loop: how its segments between events are valued and put together."""
+
+    objective: Objective
+    output: Matrix | None
+    """C of the output y = C z whose norm counts, (q, 3n); None if only event times count."""
+    beta: float
+    """The level at t = 0."""
+    rate_per_s: float
+    """r, at which the level falls; 0 for the cost."""
+    floor: float
+    """Below which the level does not fall."""
+
+    @property
+    def additive(self) -> bool:
+        """Whether the values of segments add up; otherwise the largest counts."""
+        return self.objective is Objective.COST
+
+    @property
+    def nothing(self) -> float:
+        """The value of no segment at all."""
+        return 0.0 if self.additive else -np.inf
+
+    def level(self, t_s: Matrix) -> Matrix:
+        """The level at times (k,), over its value at 0."""
+        level = np.exp(-self.rate_per_s * t_s)
+        return np.asarray(np.maximum(level, self.floor / self.beta) if self.floor else level)
+
+    def joined(self, first: Matrix, second: Matrix) -> Matrix:
+        """The value of two stretches one after the other."""
+        return np.asarray(first + second if self.additive else np.maximum(first, second))
+
+
+def measure_of(
+    system: ContinuousLoop, objective: Objective, rate_per_s: float | None = None
+) -> Measure:
+    """Make a loop's measure.
+
+    Args:
+        system: the loop.
+        objective: what counts.
+        rate_per_s: r of the level; α unless given.
+    """
+    n, trigger = system.loop.n, system.decaying
+    rate_per_s = trigger.alpha_per_s if rate_per_s is None else rate_per_s
+    floor = trigger.floor if rate_per_s == trigger.alpha_per_s else 0.0
+    output = np.zeros((n, 3 * n))
+    if objective is Objective.INTER_EVENT:
+        return Measure(objective, None, trigger.beta, 0.0, 0.0)
+    if objective is Objective.ERROR:
+        weight = np.eye(n) if trigger.weight is None else trigger.weight
+        output[:, 2 * n :] = weight / trigger.beta
+        return Measure(objective, output, trigger.beta, rate_per_s, floor)
+    output[:, :n] = np.eye(n)
+    if objective is Objective.COST:
+        return Measure(objective, output, trigger.beta, 0.0, 0.0)
+    return Measure(objective, output, trigger.beta, rate_per_s, floor)

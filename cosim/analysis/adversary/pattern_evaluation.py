@@ -1,0 +1,117 @@
+"""What a run of the reference simulator is worth, with suprema enclosed rather than sampled.
+
+Within a cell |y|² is a polynomial of degree 36. In the Bernstein basis its largest coefficient
+bounds it from above, its first and last are values of it; intervals are halved until nothing can
+exceed the largest value known by more than 1e-12 of it.
+"""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.analysis.adversary.objective import Measure, Objective
+from cosim.analysis.adversary.polynomial_curves import curve_stack, powers
+from cosim.analysis.adversary.segment_objective import SquareIntegral
+from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.simulation.continuous.exact_flow import DEGREE, taylor_terms
+from noack.core.linear_systems import Matrix, Vector
+
+_RESOLUTION = 1e-12
+_FINEST = 2.0**-40
+
+
+class Valued(NamedTuple):
+    """The value of a run."""
+
+    value: float
+    at_s: float | None
+    """Where a supremum is reached, or the later of the two closest events."""
+
+
+def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
+    """The objective along a run; infinite if it diverged.
+
+    The inter-event time comes with the sign of the objective: negative, −∞ without two events.
+    """
+    if measure.output is None:
+        between_s = np.diff(run.event_s)
+        if not len(between_s):
+            return Valued(-math.inf, None)
+        shortest = int(between_s.argmin())
+        return Valued(-float(between_s[shortest]), float(run.event_s[shortest + 1]))
+    if run.diverged_at_s is not None:
+        return Valued(math.inf, run.diverged_at_s)
+    if measure.objective is Objective.COST:
+        return Valued(_integral(run, measure.output), None)
+    best = Valued(0.0, 0.0)
+    for part in _parts(run, measure):
+        best = _highest(part, best)
+    return best
+
+
+class _Part(NamedTuple):
+    """A part of a cell in which the level falls exponentially."""
+
+    begin_s: float
+    width_s: float
+    """Of the part."""
+    taylor: Matrix
+    """Coefficients of the scaled output over it, brought to [0, 1], (p + 1, q)."""
+
+
+def _cells(run: ContinuousRun, cuts_s: Vector) -> Iterator[tuple[float, float, Vector]]:
+    """Begin, width and (x, e_s, e_c) of all parts of cells between events and cuts."""
+    flow = run.system.flow
+    ends_s = [*run.event_s.tolist(), run.horizon_s]
+    # With a first packet the run starts at event 0.
+    for state, end_s in zip((run.start, *run.after), ends_s, strict=True):
+        stops_s = [*cuts_s[(cuts_s > state.t_s) & (cuts_s < end_s)].tolist(), end_s]
+        t_s, z = state.t_s, np.concatenate(state[1:])
+        for stop_s in stops_s:
+            while t_s < stop_s:
+                width_s = min(flow.width_s, stop_s - t_s)
+                yield t_s, width_s, z
+                z = flow.within_cell(z, width_s / flow.width_s)
+                t_s = t_s + width_s if width_s == flow.width_s else stop_s
+
+
+def _parts(run: ContinuousRun, measure: Measure) -> Iterator[_Part]:
+    system, cuts_s = run.system, np.empty(0)
+    identity = np.eye(len(system.generator))
+    width_s, output = system.flow.width_s, measure.output
+    assert output is not None
+    if measure.floor and measure.rate_per_s:
+        cuts_s = np.array([math.log(measure.beta / measure.floor) / measure.rate_per_s])
+    rates = (measure.rate_per_s, 0.0)
+    terms = [output @ taylor_terms(system.generator + r * identity, width_s) for r in rates]
+    for begin_s, part_s, z in _cells(run, cuts_s):
+        level = float(measure.level(np.array([begin_s]))[0])
+        late = bool(len(cuts_s) and begin_s >= cuts_s[0])
+        taylor = (terms[late] @ z) / level
+        yield _Part(begin_s, part_s, taylor * powers(np.array([part_s / width_s]), DEGREE).T)
+
+
+def _highest(part: _Part, best: Valued) -> Valued:
+    """The larger of the best and the supremum of |y| over a part, to 1e-12 of it."""
+    basis = curve_stack(DEGREE)
+    pending = [(0.0, 1.0, basis.squares(part.taylor[None])[0])]
+    while pending:
+        start, width, squares = pending.pop()
+        for u, square in ((start, squares[0]), (start + width, squares[-1])):
+            if square > best.value**2:
+                best = Valued(math.sqrt(square), part.begin_s + u * part.width_s)
+        if squares.max() > best.value**2 * (1 + _RESOLUTION) and width > _FINEST:
+            left, right = basis.halves(squares)
+            pending += [(start, width / 2, left), (start + width / 2, width / 2, right)]
+    return best
+
+
+def _integral(run: ContinuousRun, output: Matrix) -> float:
+    flow = run.system.flow
+    whole = SquareIntegral(output @ taylor_terms(run.system.generator, flow.width_s), flow.width_s)
+    cells = list(_cells(run, np.empty(0)))
+    z = np.array([cell[2] for cell in cells])
+    widths = np.array([cell[1] for cell in cells])
+    return float(whole(z, widths / flow.width_s, widths).sum())

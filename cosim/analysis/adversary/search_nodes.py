@@ -1,0 +1,166 @@
+"""Runs of the loop that are under way together, and what was decided on the way."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.adversary.segments import SegmentFlow, Segments
+from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from noack.core.linear_systems import Matrix, Vector
+
+Indices = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+Report = Callable[[int, float], None]
+"""Is told the nodes visited and the best value so far."""
+
+START = -1
+"""The entry of runs in which nothing has been decided."""
+
+
+class Nodes(NamedTuple):
+    """N runs, each just after an event whose update was delivered or dropped."""
+
+    t_s: Vector
+    """(N,)"""
+    z: Matrix
+    """(x, e_s, e_c), (N, 3n)."""
+    dropouts: Indices
+    """Successive ones up to now, (N,)."""
+    value: Vector
+    """What the run is worth so far, (N,)."""
+    entry: Indices
+    """The last decision's number in the log, (N,)."""
+
+    def take(self, which: Indices | Flags | slice) -> "Nodes":
+        """Some of them."""
+        return Nodes(
+            self.t_s[which],
+            self.z[which],
+            self.dropouts[which],
+            self.value[which],
+            self.entry[which],
+        )
+
+
+def root(flow: SegmentFlow) -> Nodes:
+    """The start: sensor and controller know x(0), be it from a first packet or before."""
+    x0 = flow.system.loop.x0
+    z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
+    return Nodes(
+        np.zeros(1), z, np.zeros(1, int), np.array([flow.measure.nothing]), np.array([START])
+    )
+
+
+def together(parts: Sequence[Nodes]) -> Nodes:
+    """All of several groups."""
+    return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+class Log:
+    """Decisions, each with the one before it."""
+
+    def __init__(self) -> None:
+        self._parents: list[Indices] = []
+        self._delivered: list[Flags] = []
+        self._length = 0
+
+    def add(self, parents: Indices, delivered: Flags) -> Indices:
+        """Enter decisions; returns their numbers."""
+        self._parents.append(parents)
+        self._delivered.append(delivered)
+        self._length += len(parents)
+        return np.arange(self._length - len(parents), self._length)
+
+    def decisions(self, entry: int) -> tuple[bool, ...]:
+        """Whether each event up to this entry was delivered."""
+        starts = np.cumsum([0, *map(len, self._parents)])
+        found: list[bool] = []
+        while entry != START:
+            block = int(np.searchsorted(starts, entry, side="right")) - 1
+            row = entry - int(starts[block])
+            found.append(bool(self._delivered[block][row]))
+            entry = int(self._parents[block][row])
+        return tuple(reversed(found))
+
+
+class Found(NamedTuple):
+    """What a search came to."""
+
+    value: float
+    """The largest value seen, or what the search started with."""
+    decisions: tuple[bool, ...] | None
+    """Whether the update of each event arrives, up to where the value was reached; None if nothing
+    exceeded what the search started with."""
+    nodes: int
+    """Segments between events that were computed."""
+    complete: bool
+    """Whether every pattern was covered."""
+
+
+class Best:
+    """The worst run seen: for the adversary, the best."""
+
+    def __init__(self, flow: SegmentFlow, value: float = -np.inf) -> None:
+        self._measure = flow.measure
+        self.value = value
+        self.entry: int | None = None
+        """Its last decision; None while nothing has exceeded the value to start with."""
+
+    def see(self, nodes: Nodes, segments: Segments) -> Vector:
+        """Look at the segments that follow nodes; returns what the runs are worth now, (N,)."""
+        value = self._measure.joined(nodes.value, segments.value)
+        # A sum counts once it is complete.
+        pending = segments.is_event & self._measure.additive
+        candidates = np.where(pending, -np.inf, value)
+        top = int(candidates.argmax())
+        if candidates[top] > self.value:
+            self.value, self.entry = float(candidates[top]), int(nodes.entry[top])
+        return value
+
+    def found(self, log: Log, nodes: int, *, complete: bool) -> Found:
+        """What was found in the end."""
+        decisions = None if self.entry is None else log.decisions(self.entry)
+        return Found(self.value, decisions, nodes, complete)
+
+
+def after_events(
+    nodes: Nodes, segments: Segments, value: Vector, these: Indices, delivered: Flags, log: Log
+) -> Nodes:
+    """The runs ``these`` after the events that ended their segments.
+
+    Args:
+        nodes: before the segments.
+        segments: that ended in events.
+        value: of the runs up to there, (N,).
+        these: which runs, (k,).
+        delivered: whether the update of each arrives, (k,).
+        log: takes the decisions.
+
+    Raises:
+        TooManyEventsError: two events at the same time.
+    """
+    t_s = segments.end_s[these]
+    stuck = t_s <= nodes.t_s[these]
+    if (stuck & (nodes.entry[these] != START)).any():
+        raise TooManyEventsError(f"trigger: the events accumulate at {t_s[stuck][0]:.9g} s")
+    z, n = segments.z[these], segments.z.shape[1] // 3
+    z[:, n : 2 * n] = 0.0
+    z[delivered, 2 * n :] = 0.0
+    return Nodes(
+        t_s,
+        z,
+        np.where(delivered, 0, nodes.dropouts[these] + 1),
+        value[these],
+        log.add(nodes.entry[these], delivered),
+    )
+
+
+def branches(nodes: Nodes, segments: Segments, value: Vector, mansd: int, log: Log) -> Nodes:
+    """All runs that can follow: each update lost, if ``mansd`` allows, and delivered."""
+    events = np.flatnonzero(segments.is_event)
+    losable = events[nodes.dropouts[events] < mansd]
+    fates = np.repeat([False, True], [len(losable), len(events)])
+    return after_events(nodes, segments, value, np.concatenate([losable, events]), fates, log)

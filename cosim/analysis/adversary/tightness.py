@@ -1,0 +1,115 @@
+"""What the adversary found, beside what a certificate claims."""
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cosim.analysis.adversary.loss_patterns import Pattern
+from cosim.analysis.adversary.objective import Measure, Objective
+from cosim.analysis.adversary.pattern_evaluation import Valued
+from noack.theory.certificate import Constants
+from noack.theory.scenario_certificates import Certificate
+
+_BREACH = 1 + 1e-9
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The worst run found, for one objective.
+
+    Values are in the objective's own units: Δ, X, ∫‖x‖² dt, seconds between two events.
+    """
+
+    objective: Objective
+    horizon_s: float
+    value: float | None
+    """Infinite if the loop diverges; None if there are no two events between which time passes."""
+    at_s: float | None
+    """Where a supremum is reached, or the later of the two closest events."""
+    pattern: Pattern
+    """Whether the update of each event is delivered."""
+    event_s: tuple[float, ...]
+    """Times of the events."""
+    exact: bool
+    """Whether every admissible pattern was covered; otherwise others may be worse."""
+    nodes: int
+    """Segments between events that were computed."""
+    lossless: float | None
+    """The same when nothing is lost."""
+    own: float | None
+    """The same under the losses of the scenario's own network."""
+    certified: float | None
+    """The certificate's bound, for the paper's conditions; None without a certificate."""
+    elapsed_s: float = field(compare=False)
+    """Wall time of the search."""
+
+    @property
+    def tightness(self) -> float | None:
+        """Found over certified, or for inter-event times certified over found: at most 1."""
+        if self.value is None or self.certified is None or not self.certified or not self.value:
+            return None
+        if self.objective is Objective.INTER_EVENT:
+            return self.certified / self.value
+        return self.value / self.certified
+
+    @property
+    def breaches(self) -> bool:
+        """Whether this run refutes the certificate."""
+        return self.tightness is not None and self.tightness > _BREACH
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the pattern takes the state to infinity."""
+        return self.value == math.inf
+
+    @property
+    def text(self) -> str:
+        """The pattern, one letter per event: ``D`` delivered, ``·`` lost."""
+        return "".join("D" if delivered else "·" for delivered in self.pattern)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON knows it: null stands for what is infinite, too."""
+        found = asdict(self) | {
+            "objective": self.objective.value,
+            "pattern": self.text,
+            "delivered": [event for event, delivered in enumerate(self.pattern) if delivered],
+            "tightness": self.tightness,
+            "breaches": self.breaches,
+            "diverges": self.diverges,
+        }
+        return {key: None if value == math.inf else value for key, value in found.items()}
+
+
+def shown(value: float, objective: Objective) -> float | None:
+    """In the objective's own sign."""
+    if objective is not Objective.INTER_EVENT:
+        return value
+    return None if value == -math.inf else -value
+
+
+def certified(
+    certificate: Certificate, measure: Measure, horizon_s: float, valued: Valued
+) -> float | None:
+    """What the certificate says of the same quantity, at the same time."""
+    first, late = certificate.constants, certificate.floor_constants
+    if first is None:
+        return None
+    if measure.objective is Objective.INTER_EVENT:
+        return certificate.inter_event_s
+    if measure.objective is Objective.COST:
+        until_s = min(horizon_s, certificate.floor_from_s) if late is not None else horizon_s
+        cost = _square_integral(first, until_s)
+        return cost if late is None else cost + late.state**2 * (horizon_s - until_s)
+    at_s = np.array([0.0 if valued.at_s is None else valued.at_s])
+    level = float(measure.level(at_s)[0])
+    if measure.objective is Objective.STATE:
+        return float(certificate.state(at_s)[0]) / level
+    return float(certificate.controller_error(at_s)[0]) / (level * measure.beta)
+
+
+def _square_integral(constants: Constants, until_s: float) -> float:
+    """∫(X e^{−rt})² dt up to ``until_s``."""
+    rate = 2 * constants.rate_per_s
+    return constants.state**2 * (-math.expm1(-rate * until_s) / rate if rate else until_s)

@@ -1,0 +1,284 @@
+"""The claims about a run whose settings are changed while it goes on.
+
+What is claimed at the start is so up to the change. What follows is judged as a run of its own, in
+deviations from the set-point, whose time begins with the first event after the change whose update
+the controller has: there x_s = x, and x_c is reset to it. In between nothing is claimed.
+
+Such a run begins with another input than none. Until the plant feels the first update, u is what
+the controller's older knowledge made of it; how far from Kx that was is on record, and a
+certificate holds if it is of input errors no smaller than that
+(:class:`noack.theory.scenario_certificates.Scope`).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from cosim.analysis.claims.claim_evaluation import Claim, Claims, ClaimVerdict, Envelope, Part
+from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
+from cosim.analysis.claims.observed_conditions import Left
+from cosim.record.recorded_changes import NEVER_NS, Made, changes_of
+from cosim.record.run_record import Rows, RunRecord
+from noack.config.resolution import loop_of, setpoint_of
+from noack.config.runtime_parameters import text_of
+from noack.config.scenario import Scenario
+from noack.config.triggers import Decaying
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Vector, row_norms
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    SETTINGS,
+)
+from noack.theory.scenario_certificates import BOX, OWN_PLANT
+
+_TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
+_STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
+_LEAST_BETA = 1e-300
+_AT_REST = 1e-9
+"""Of the larger term: what A x_r + B u_r may differ from 0 by for the plant to rest there."""
+
+
+@dataclass(frozen=True)
+class RunClaims:
+    """The claims about a run, part by part; computed when asked for, and once.
+
+    Args:
+        record: the run's record.
+    """
+
+    record: RunRecord
+
+    @cached_property
+    def _judged(self) -> RunRecord:
+        return up_to_common_end(self.record)
+
+    @property
+    def judged_until_s(self) -> float | None:
+        """Up to when a run that was stopped is judged; None if it is judged to its end."""
+        end_ns = common_end_ns(self.record)
+        return None if end_ns is None else end_ns / NS_PER_S
+
+    @cached_property
+    def _changes(self) -> list[Made]:
+        return [made for made in changes_of(self._judged) if made.touches_claims]
+
+    @cached_property
+    def parts(self) -> list[Claims | Claim]:
+        """The claims of each part; where nothing can be claimed, the word on it."""
+        record, changes = self._judged, self._changes
+        at_0 = setpoint_of(record.scenario)
+        if not changes and at_0 is None:
+            return [Claims(record)]
+        first_ns = changes[0].first_ns if changes else NEVER_NS
+        part = Part(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
+        own = record if at_0 is None else _part_of(record, record.scenario, 0, None)
+        found: list[Claims | Claim] = [Claims(own, part)]
+        for made, after in zip(changes, [*changes[1:], None], strict=True):
+            until_ns = NEVER_NS if after is None else after.first_ns
+            found.append(self._after(made, until_ns))
+        return found
+
+    @property
+    def conditions(self) -> dict[str, float | None]:
+        """Largest observed value of each condition, over the whole run."""
+        return Claims(self._judged).conditions
+
+    @property
+    def beyond_mansd(self) -> Left:
+        """When more than M − 1 updates in a row had been lost, whoever lost them."""
+        if not self._changes:
+            return Claims(self._judged).beyond_mansd
+        found: list[Left] = []
+        for one in self.parts:
+            if isinstance(one, Claims) and one.part is not None:
+                left = one.beyond_mansd
+                if left is not None and left[0] < one.part.until_s:
+                    found.append((left[0] + one.part.from_s, left[1]))
+        return min(filter(None, found), default=None)
+
+    def judge(self) -> list[Claim]:
+        """Every claim with its verdict, in the run's time."""
+        found: list[Claim] = []
+        for one in self.parts:
+            if isinstance(one, Claim):
+                found.append(one)
+                continue
+            from_s, until_s = (0.0, math.inf) if one.part is None else one.part[1:3]
+            found += [
+                claim._replace(
+                    since_s=None if claim.since_s is None else claim.since_s + from_s,
+                    from_s=from_s,
+                    until_s=from_s + until_s if math.isfinite(until_s) else None,
+                )
+                for claim in one.judge()
+            ]
+        return found
+
+    def envelopes(self) -> list[Envelope]:
+        """The certified curves, at the measurements, each over the part that it is of."""
+        found: list[Envelope] = []
+        for one in self.parts:
+            if isinstance(one, Claim):
+                continue
+            if one.part is None:
+                return one.envelopes()
+            if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
+                # In deviations from another set-point, or with other constants.
+                continue
+            found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
+        return found
+
+    def _after(self, made: Made, until_ns: int) -> Claims | Claim:
+        """The claims of the run of its own that follows a change."""
+        record, text = self._judged, text_of(made.change.settings)
+        at_s, end_s = made.first_ns / NS_PER_S, until_ns / NS_PER_S
+        late_ns = made.everywhere_ns
+        deliveries = record[CONTROLLER_DELIVERY]
+        after = deliveries[deliveries["t_ns"] >= late_ns]
+        sensor = record[SENSOR_MEASUREMENT]
+        after = after[np.isin(after["sequence"], sensor["event"])]
+        why = f"changed at {at_s:.3f} s: {text}; "
+        if late_ns == NEVER_NS:
+            why += "not every process heard of it"
+        elif not len(after) or after["t_ns"][0] >= until_ns:
+            why += "no update was delivered after it" + (
+                "" if until_ns == NEVER_NS else f", up to {end_s:.3f} s"
+            )
+        else:
+            origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
+            own = _part_of(record, made.scenario, origin_ns, sequence)
+            part = Part(
+                record,
+                origin_ns / NS_PER_S,
+                _seconds(until_ns) - origin_ns / NS_PER_S,
+                _start_error(own, Claims(own).started_s),
+                _void(record, made.scenario),
+            )
+            return Claims(own, part)
+        until_s = None if until_ns == NEVER_NS else end_s
+        return Claim(
+            "what is claimed after a change", "claims", "none", None, None, None,
+            ClaimVerdict.VOID, at_s, why, at_s, until_s,
+        )  # fmt: skip
+
+
+def _seconds(t_ns: int) -> float:
+    return math.inf if t_ns == NEVER_NS else t_ns / NS_PER_S
+
+
+def _until(envelope: Envelope, until_s: float) -> Envelope:
+    values = np.where(envelope.t_s < until_s, envelope.values, np.nan)
+    if envelope.quantity == "inter_event":  # two ends of a line
+        ends_s = np.minimum(envelope.t_s, until_s)
+        return envelope._replace(t_s=ends_s)
+    return envelope._replace(values=values)
+
+
+def _part_of(
+    record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None
+) -> RunRecord:
+    """Return what follows an event as the record of a run of its own.
+
+    Args:
+        record: the run's record.
+        scenario: of the part, in the run's time.
+        origin_ns: time of the event, from which time counts.
+        sequence: its number; None for the start of the run.
+    """
+    setpoint = setpoint_of(scenario)
+    loop = loop_of(scenario)
+    x_r, u_r = (np.zeros(loop.n), np.zeros(loop.m)) if setpoint is None else setpoint
+    rows: dict[str, Rows] = {}
+    for table in record.tables:
+        kept = record[table]
+        if table in SETTINGS:
+            kept = kept[:0]
+        elif table in (SENSOR_MEASUREMENT, PLANT_STEP, CONTROLLER_STEP):
+            kept = kept[kept["t_ns"] >= origin_ns]
+        elif table == NETEM_PACKET:
+            kept = kept[kept["now_ns"] >= origin_ns]
+        elif table == CONTROLLER_DELIVERY and sequence is not None:
+            kept = kept[kept["sequence"] >= sequence]
+        rows[table] = _shifted(kept, origin_ns, x_r, u_r)
+    sensor = rows[SENSOR_MEASUREMENT]
+    if sequence is not None and len(sensor):  # what was before the reset is of the run before
+        sensor["x_s"][0] = sensor["x"][0]
+        sensor["e_s_norm"][0] = sensor["compared"][0] = 0.0
+        rows[CONTROLLER_DELIVERY]["dropouts"][:1] = 0
+    x_0 = sensor["x"][0] if len(sensor) else np.array(scenario.plant.initial_state) - x_r
+    update = {
+        "plant": scenario.plant.model_copy(update={"initial_state": tuple(x_0.tolist())}),
+        "controller": scenario.controller.model_copy(update={"setpoint": None}),
+        "horizon_s": max(scenario.horizon_s - origin_ns / NS_PER_S, 1e-9),
+        "changes": (),
+    }
+    if sequence is not None:
+        update["network"] = scenario.network.model_copy(update={"initial_sync": "first_packet"})
+    if isinstance(trigger := scenario.trigger, Decaying):
+        faded = math.exp(-trigger.alpha_per_s * origin_ns / NS_PER_S)
+        beta = max(trigger.beta * faded, _LEAST_BETA)
+        update["trigger"] = trigger.model_copy(update={"beta": beta})
+    own = scenario.model_copy(update=update)
+    return RunRecord(own, rows, record.notices, record.reports, record.kind, record.earlier)
+
+
+def _shifted(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
+    shifted = rows.copy()
+    for name in rows.dtype.names or ():
+        if name in _TIMES:
+            shifted[name] -= origin_ns
+        elif name in _STATES:
+            shifted[name] -= x_r
+        elif name == "u":
+            shifted[name] -= u_r
+    return shifted
+
+
+def _start_error(own: RunRecord, started_s: float) -> float:
+    """sup‖u − Kx‖ e^{αt} over the steps until the plant felt the first update.
+
+    Within a step, in which u is held, ‖u − Kx‖ is no more than at the worse of its ends, and what x
+    may bend in between: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
+    """
+    loop, steps = own.loop, own[PLANT_STEP]
+    steps = steps[: int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1]
+    if len(steps) < 2:
+        return 0.0
+    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.plant_period_ns * 1e-9
+    ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
+    speed = x[:-1] @ loop.A.T + u @ loop.B.T
+    grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
+    bend = dt_s**2 / 8 * grown * row_norms(speed @ (loop.K @ loop.A).T)
+    trigger = own.scenario.trigger
+    alpha = trigger.alpha_per_s if isinstance(trigger, Decaying) else 0.0
+    return float(((ends + bend) * np.exp(alpha * steps["t_ns"][1:] * 1e-9)).max())
+
+
+def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
+    """Why nothing is certified at a scenario's set-point, by scope: a plant may not rest there."""
+    setpoint = setpoint_of(scenario)
+    if setpoint is None or not scenario.is_linear:
+        return {}
+    x_r, u_r = setpoint
+    loop, plant = record.loop, scenario.plant
+    drift, push = loop.A @ x_r, loop.B @ u_r
+    largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
+    if float(np.abs(drift + push).max()) > _AT_REST * largest:
+        why = (
+            "the plant does not rest at the set-point as the model does, A x_r + B u_r ≠ 0: a "
+            "constant disturbance, of which a certificate knows nothing"
+        )
+        return {OWN_PLANT: why, BOX: why}
+    half_A, half_B = plant.uncertainty_A, plant.uncertainty_B
+    moved = np.zeros(loop.n) if half_A is None else np.array(half_A) @ np.abs(x_r)
+    moved = moved + (0.0 if half_B is None else np.array(half_B) @ np.abs(u_r))
+    if moved.any():
+        return {BOX: "not every plant of the box rests at the set-point, A x_r + B u_r ≠ 0"}
+    return {}

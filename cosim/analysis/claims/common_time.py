@@ -1,0 +1,63 @@
+"""Up to when all processes of a run took part in it, and the record of the run up to there.
+
+The processes of a run that is stopped end some milliseconds apart. What one of them does without
+the others is not the loop's doing, so claims and their conditions are judged up to the common time.
+"""
+
+import numpy as np
+
+from cosim.record.run_record import Rows, RunRecord
+from noack.protocol.record_tables import (
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    OWNER,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.process_life import HORIZON
+
+_PACES = {
+    "plant": (PLANT_STEP, "t_ns"),
+    "sensor": (SENSOR_MEASUREMENT, "t_ns"),
+    "netem": (NETEM_PACKET, "now_ns"),
+    "controller": (CONTROLLER_STEP, "t_ns"),
+}
+"""The table and column by which each process's rows are put into the order of the run's time."""
+
+
+def common_end_ns(record: RunRecord) -> int | None:
+    """The time up to which every process of a stopped run had done what was due.
+
+    None if the run was not stopped, or if a process left no word of how far it had come.
+    """
+    reports = [record.reports.get(role, {}) for role in LOOP_ROLES]
+    if all(report.get("ended") == HORIZON for report in reports):
+        return None
+    reached_ns = [report.get("reached_ns") for report in reports]
+    known_ns = [int(one) for one in reached_ns if one is not None]
+    measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
+    if len(known_ns) < len(reports) or not len(measured_ns):
+        return None
+    # A sensor has no deadlines of its own: it has come as far as it was sent measurements.
+    return int(min(*known_ns, measured_ns[-1]))
+
+
+def up_to_common_end(record: RunRecord) -> RunRecord:
+    """Return the record of a run up to its common end; the record itself if it has none.
+
+    Of each process the rows are kept that precede its first one beyond that time, in all tables.
+    """
+    end_ns = common_end_ns(record)
+    if end_ns is None:
+        return record
+    rows: dict[str, Rows] = {}
+    for role, (pace, column) in _PACES.items():
+        beyond = record[pace]["input"][record[pace][column] > end_ns]
+        first = int(beyond[0]) if len(beyond) else np.iinfo(np.int64).max
+        for table in record.tables:
+            if OWNER[table] == role:
+                rows[table] = record[table][record[table]["input"] < first]
+    return RunRecord(
+        record.scenario, rows, record.notices, record.reports, record.kind, record.earlier
+    )

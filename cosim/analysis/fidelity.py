@@ -1,0 +1,290 @@
+"""Fidelity: how a live run differs from the ideal loop, and why.
+
+The run's own packet fates, by event number, in a chain of simulations, each exact, each with one
+effect more: the ideal loop in continuous time; + sampling: the trigger is tested on the
+measurement grid; + delay: an update acts from the plant step on that really was the first to hold
+an input computed with it; + held actuation: the input of each step is K x_c at the model time of
+the actuation that really was latched there, zero before the first. The last has everything that the
+live run has, and must be the live run to rounding. Records are in simulated time, and the plant
+lives on its nominal grid, whenever its steps were really taken; so delays and model times are
+compared with that grid.
+
+For events that the run did not have, the network emulator's own word is taken (its decisions
+depend on its seed alone), and the median of the recorded delays.
+"""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cosim.analysis.step_schedule import IncomparableError, LiveRun, live_run
+from cosim.record.run_record import RunRecord
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_run import (
+    MAX_EVENTS,
+    ContinuousRun,
+    TooManyEventsError,
+    simulate_continuous,
+)
+from cosim.simulation.continuous.plant_grid_loop import SampledLoop
+from noack.core.errors import NoackError
+from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.record_tables import PLANT_STEP
+
+EXPLAINED = 0.1
+"""The share of the difference that may remain unexplained."""
+_ROUNDING = 1e-9
+"""Relative to x: a difference below is rounding, and there is nothing to explain."""
+_NUDGE = 1e-13
+"""Relative to x(0): about what rounding amounts to. If this changes a run, so does rounding."""
+_PARTED_PERIODS = 10
+"""Events further apart than so many measurements are told: the event sequences have parted."""
+_LARGEST = 1e100
+_STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
+"""A longer run is compared only if somebody asks: its end should not take longer than seconds."""
+_STAGES = ("sampling", "delay", "held actuation", "unexplained")
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A difference of two runs in x over all measurements."""
+
+    rms: float
+    """Root mean square of its norm."""
+    max: float
+    """Largest norm."""
+    rms_by_state: tuple[float, ...]
+    max_by_state: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What one effect adds to the difference between the ideal loop and the live run."""
+
+    name: str
+    difference: Difference
+    """To the stage before."""
+    share: float
+    """Of the whole difference D, ⟨d, D⟩/⟨D, D⟩; the shares add up to 1, one may be negative."""
+    events: int
+    """Events with this effect, and all before it, in place."""
+    max_event_difference_s: float | None
+    """Largest difference in time to the same event in the stage before."""
+    parted_event: int | None
+    """First event more than ten measurements from the stage before's, or that one of them lacks."""
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """The comparison of a live run with the ideal loop."""
+
+    scenario: str
+    mode: str
+    compared_s: float
+    """Simulated time that was compared."""
+    samples: int
+    state_names: tuple[str, ...]
+    rms_live: float
+    """Root mean square of ‖x‖ in the live run, for scale."""
+    total: Difference
+    """Live run minus the ideal loop."""
+    stages: tuple[Stage, ...]
+    explained_relative: float
+    """RMS of what remains unexplained over the RMS of the whole difference."""
+    events_ideal: int
+    events_live: int
+    max_event_difference_s: float | None
+    """Between the ideal loop and the live run, over the events that both have."""
+    parted_event: int | None
+    """First event that is more than ten measurements apart, or that one of the two lacks: from
+    there on the same packet fates meet different events."""
+
+    @property
+    def explained(self) -> bool:
+        """Whether the effects account for the difference to within a tenth."""
+        return self.explained_relative <= EXPLAINED or self._nothing_to_explain
+
+    @property
+    def _nothing_to_explain(self) -> bool:
+        return self.total.rms <= _ROUNDING * self.rms_live
+
+    @property
+    def verdict(self) -> str:
+        """One line for people."""
+        if self._nothing_to_explain:
+            return "x is that of the ideal loop, to rounding"
+        of_x = 100 * self.total.rms / self.rms_live
+        shares = ", ".join(f"{stage.name} {percent(stage.share)}" for stage in self.stages[:-1])
+        return (
+            f"x differs from the ideal loop by {of_x:.2g} % (RMS); of this {shares}; "
+            f"{100 * self.explained_relative:.2g} % unexplained"
+            + ("" if self.explained else ", which is too much")
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """All figures, for ``noack fidelity --json``."""
+        return {**asdict(self), "explained": self.explained, "verdict": self.verdict}
+
+    def compact(self) -> dict[str, Any]:
+        """The summary's share of it; ``docs/record.md`` documents the keys."""
+        return {
+            "explained": self.explained,
+            "explained_relative": self.explained_relative,
+            "rms_x": self.total.rms,
+            "max_x": self.total.max,
+            "rms_x_live": self.rms_live,
+            "shares": {stage.name.replace(" ", "_"): stage.share for stage in self.stages},
+            "events_ideal": self.events_ideal,
+            "events_live": self.events_live,
+            "max_event_difference_s": self.max_event_difference_s,
+            "parted_event": self.parted_event,
+            "reason": None,
+        }
+
+
+def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
+    """The comparison for a run's summary: all of it null but ``reason`` if there can be none."""
+    nothing: dict[str, Any] = dict.fromkeys(
+        ("explained", "explained_relative", "rms_x", "max_x", "rms_x_live", "shares",
+         "events_ideal", "events_live", "max_event_difference_s", "parted_event")
+    )  # fmt: skip
+    if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
+        return nothing | {"reason": "the run is long; `noack fidelity` compares it"}
+    try:
+        return fidelity_of(record, _EVENTS_AT_THE_END).compact()
+    except NoackError as error:
+        return nothing | {"reason": str(error)}
+    except Exception as error:  # whatever it is, the run itself went as it went
+        return nothing | {"reason": repr(error)}
+
+
+def fidelity_of(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
+    """Compare a live run with the ideal loop, effect by effect.
+
+    Args:
+        record: the run's record.
+        max_events: events of the ideal loop; it has no end of them if it is unstable.
+
+    Raises:
+        IncomparableError: the run diverged, its record is too short or incomplete, or its loop
+            turns rounding into another run.
+    """
+    live = live_run(record)
+    schedule, scenario = live.schedule, record.scenario
+    known = scenario.network.initial_sync == "known_state"
+    system = continuous_loop_of(scenario)
+    period_s = schedule.period_ns * 1e-9
+    t_s = np.flatnonzero(schedule.measured).astype(np.float64) * period_s
+    ideal = _ideal(system, live, float(t_s[-1]), max_events, known_start=known)
+    states, events_s = [ideal.at(t_s).x], [ideal.event_s]
+    loop = SampledLoop(system, schedule, known_start=known)
+    for delay, hold in ((False, False), (True, False), (True, True)):
+        run = loop.run(delay=delay, hold=hold)
+        states.append(run.x[schedule.measured])
+        events_s.append(run.event_steps.astype(np.float64) * period_s)
+    states.append(live.x)
+    events_s.append(live.event_s)
+    if not all(np.abs(x).max() < _LARGEST for x in states):
+        raise IncomparableError("a simulation of the run diverges")
+    whole = live.x - states[0]
+    total, remainder = _difference(whole), _difference(live.x - states[-2])
+    if remainder.rms > EXPLAINED * total.rms:
+        other = replace(system.loop, x0=system.loop.x0 * (1 + _NUDGE))
+        nudged = SampledLoop(ContinuousLoop(other, system.trigger), schedule, known_start=known)
+        moved = nudged.run(delay=True, hold=True).x[schedule.measured] - states[-2]
+        if not _difference(moved).rms < EXPLAINED * total.rms:
+            raise IncomparableError(
+                "the loop turns rounding into another run: so does a change of x(0) by "
+                f"{_NUDGE:g} of itself; a shorter run can be compared"
+            )
+    part_s = _PARTED_PERIODS * scenario.plant.measure_every * period_s
+    return Fidelity(
+        scenario=scenario.name,
+        mode=scenario.mode,
+        compared_s=float(t_s[-1]),
+        samples=len(t_s),
+        state_names=record.loop.state_names,
+        rms_live=_difference(live.x).rms,
+        total=total,
+        stages=tuple(
+            Stage(
+                name,
+                _difference(states[i + 1] - states[i]),
+                _share(states[i + 1] - states[i], whole),
+                len(events_s[i + 1]),
+                _largest(_apart(events_s[i], events_s[i + 1])),
+                _parted(events_s[i], events_s[i + 1], part_s),
+            )
+            for i, name in enumerate(_STAGES)
+        ),
+        explained_relative=remainder.rms / total.rms if total.rms else 0.0,
+        events_ideal=len(ideal.event_s),
+        events_live=len(live.event_s),
+        max_event_difference_s=_largest(_apart(ideal.event_s, live.event_s)),
+        parted_event=_parted(ideal.event_s, live.event_s, part_s),
+    )
+
+
+def _ideal(
+    system: ContinuousLoop, live: LiveRun, horizon_s: float, max_events: int, *, known_start: bool
+) -> ContinuousRun:
+    try:
+        ideal = simulate_continuous(
+            system,
+            horizon_s=horizon_s,
+            delivered=live.schedule.delivered,
+            known_start=known_start,
+            max_events=max_events,
+        )
+    except TooManyEventsError:
+        raise IncomparableError(
+            f"the ideal loop has more than {max_events} events, which accumulate"
+        ) from None
+    if ideal.diverged_at_s is not None:
+        raise IncomparableError(f"the ideal loop diverges at {ideal.diverged_at_s:g} s")
+    return ideal
+
+
+def percent(share: float) -> str:
+    """A share for people, to a tenth of a per cent; the smallest have no sign."""
+    return f"{round(100 * share, 1) + 0.0:.1f} %"
+
+
+def is_against(share: float) -> bool:
+    """Whether a share, as people see it, takes away from what the others make."""
+    return round(100 * share, 1) < 0
+
+
+def _difference(x: Matrix) -> Difference:
+    norms = np.linalg.norm(x, axis=1)
+    return Difference(
+        rms=float(np.sqrt(np.mean(norms**2))),
+        max=float(norms.max()),
+        rms_by_state=tuple(np.sqrt(np.mean(x**2, axis=0)).tolist()),
+        max_by_state=tuple(np.abs(x).max(axis=0).tolist()),
+    )
+
+
+def _share(part: Matrix, whole: Matrix) -> float:
+    energy = float((whole**2).sum())
+    return float((part * whole).sum()) / energy if energy else 0.0
+
+
+def _apart(first_s: Vector, second_s: Vector) -> Vector:
+    """How far apart the events of the same number are, over those that both have."""
+    both = min(len(first_s), len(second_s))
+    apart_s: Vector = np.abs(first_s[:both] - second_s[:both])
+    return apart_s
+
+
+def _largest(values: Vector) -> float | None:
+    return float(values.max()) if len(values) else None
+
+
+def _parted(first_s: Vector, second_s: Vector, tolerance_s: float) -> int | None:
+    apart_s = _apart(first_s, second_s)
+    far = np.flatnonzero(apart_s > tolerance_s)
+    if len(far):
+        return int(far[0])
+    return len(apart_s) if len(first_s) != len(second_s) else None

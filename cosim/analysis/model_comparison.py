@@ -1,0 +1,84 @@
+"""What a plant that is not linear is near its operating point, beside what its loop believes."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.errors import NoackError
+from noack.core.linear_systems import Matrix, Vector
+from plant_server.plant_linearisation import linearise
+from plant_server.system import System
+from plant_server.systems.system_from_settings import system_of
+
+Linearisation = dict[str, Any]
+
+
+def linearisation(resolved: Scenario) -> Linearisation | None:
+    """Return the linearisation of a resolved scenario's plant; None of a linear plant.
+
+    ``A``, ``B`` by rows, ``eigenvalues`` of A + BK as pairs of real and imaginary part, ``off_A``
+    and ``off_B`` = A − Â and B − B̂, and ``in_box``, whether these are within the half-widths of the
+    scenario's uncertainty box; None without one. All are None of a plant whose x is no state.
+    """
+    if resolved.is_linear:
+        return None
+    loop, plant = loop_of(resolved), resolved.plant
+
+    def system_at(x0: Vector) -> System:
+        started = plant.model_copy(update={"initial_state": tuple(x0.tolist())})
+        return system_of(resolved.model_copy(update={"plant": started}))
+
+    n, m = loop.n, loop.m
+    try:
+        with np.errstate(all="ignore"):
+            A, B = linearise(system_at, n, m, settling_s=plant.system.settling_s)
+    except NoackError:  # of the user's own: it fails, or begins only where it wants
+        A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        return dict.fromkeys(("A", "B", "eigenvalues", "off_A", "off_B", "in_box"))
+    off_A, off_B = A - loop.A_model, B - loop.B_model
+    poles = np.linalg.eigvals(A + B @ loop.K)
+    in_box: bool | None = None
+    if plant.uncertainty_A is not None or plant.uncertainty_B is not None:
+        in_box = _within(off_A, plant.uncertainty_A) and _within(off_B, plant.uncertainty_B)
+    return {
+        "A": A.tolist(),
+        "B": B.tolist(),
+        "eigenvalues": [[float(pole.real), float(pole.imag)] for pole in poles],
+        "off_A": off_A.tolist(),
+        "off_B": off_B.tolist(),
+        "in_box": in_box,
+    }
+
+
+_EXACT = 1e-3
+"""What an entry may be off that no half-width allows to be: it was found by differences."""
+
+
+def _within(off: Matrix, halfwidth: ArrayLike | None) -> bool:
+    allowed = np.zeros_like(off) if halfwidth is None else np.array(halfwidth)
+    return bool((np.abs(off) <= np.maximum(allowed, _EXACT)).all())
+
+
+def said(found: Linearisation) -> tuple[tuple[str, str], ...]:
+    """A linearisation as a person reads it: quantities and their values."""
+    if found["A"] is None:
+        return (("the plant, linearised", "none: x does not tell what follows, or not smoothly"),)
+    slowest = max(real for real, _ in found["eigenvalues"])
+    worst, where = max(_entries("A", found["off_A"]) + _entries("B", found["off_B"]))
+    box = {True: ", inside the box", False: ", outside the box", None: ""}[found["in_box"]]
+    return (
+        ("the plant, linearised: poles of A + BK", f"up to {slowest:.3g} /s"),
+        ("  farthest from the model", f"{where}, by {worst:.3g}{box}"),
+    )
+
+
+def _entries(name: str, rows: list[list[float]]) -> list[tuple[float, str]]:
+    return [
+        (abs(entry), f"{name}[{i}, {j}]")
+        for i, row in enumerate(rows, 1)
+        for j, entry in enumerate(row, 1)
+    ]

@@ -1,0 +1,188 @@
+"""Compares what each process sends in its replay with what the next one received in the run.
+
+What was lost under way was received by nobody and is not compared; what was received must have
+been sent, and bit for bit so.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+
+from cosim.analysis.replay.machine_replay import Replayed, vector_columns
+from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
+from cosim.record.run_record import Rows, RunRecord
+from netem.link_machine import Datagram
+from noack.protocol.record_tables import (
+    ACKNOWLEDGEMENTS,
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    PACKET_HEAD_BYTES,
+    PLANT_ACTUATION,
+    SENSOR_ACKNOWLEDGEMENT,
+    SENSOR_MEASUREMENT,
+    SETTINGS,
+    UPDATES,
+    entry_names,
+)
+from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message, read_header
+
+
+def check_messages(
+    record: RunRecord, replayed: Mapping[str, Replayed]
+) -> tuple[MessagesReplay, ...]:
+    """Compare the messages of every leg of the loop."""
+    plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
+    measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant, Flow.MEASUREMENT)
+    entering = _Received("sensor → netem", NETEM_PACKET, record, sensor, Flow.UPDATE)
+    updates = _Received("netem → controller", CONTROLLER_DELIVERY, record, sensor, Flow.UPDATE)
+    actuations = _Received(
+        "controller → plant", PLANT_ACTUATION, record, controller, Flow.ACTUATION
+    )
+    found = [measurements, entering, updates, actuations]
+    measurements.compare_vectors()
+    entering.compare_heads()
+    updates.compare_vectors()
+    updates.compare_with_survivors(replayed["netem"])
+    actuations.compare_vectors()
+    if record.scenario.is_acknowledged:
+        flow = Flow.ACKNOWLEDGEMENT
+        answers = _Received("controller → netem", NETEM_PACKET, record, controller, flow)
+        returned = _Received("netem → sensor", SENSOR_ACKNOWLEDGEMENT, record, controller, flow)
+        answers.compare_heads()
+        returned.compare_vectors()
+        returned.compare_with_survivors(replayed["netem"])
+        found += [answers, returned]
+    else:
+        entering.compare_flows()
+    changes = () if (told := _compare_changes(record)) is None else (told,)
+    return (*(one.result() for one in found), *changes)
+
+
+def _compare_changes(record: RunRecord) -> MessagesReplay | None:
+    """Look whether all processes were told the same of each change; None if there were none."""
+    first: dict[int, tuple[object, ...]] = {}
+    compared, found = 0, None
+    for table in SETTINGS:
+        for place, row in enumerate(record[table]):
+            number = int(row["sequence"])
+            said = (int(row["t_ns"]), row["change"].tobytes())
+            compared += number in first
+            known = first.setdefault(number, said)
+            for column, one, other in zip(("t_ns", "change"), said, known, strict=True):
+                if one != other and found is None:
+                    what = "another process was told otherwise"
+                    found = difference(table, place, int(row["now_ns"]), what, column, one, other)
+    received = sum(len(record[table]) for table in SETTINGS)
+    return MessagesReplay("coordinator → all", received, compared, found) if received else None
+
+
+class _Received:
+    """The messages of one leg, as they were received and as they are sent in the replay."""
+
+    def __init__(
+        self, leg: str, table: str, record: RunRecord, sender: Replayed, flow: Flow
+    ) -> None:
+        self._leg = leg
+        self._table = table
+        self._rows: Rows = record[table]
+        self._at = np.arange(len(self._rows))
+        self._way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        if table == NETEM_PACKET and record.scenario.is_acknowledged:
+            self._at = np.flatnonzero(self._rows["flow"] == self._way)
+            self._rows = self._rows[self._at]
+        self._sent: dict[int, Message] = {
+            message.sequence: message for message in sender.sent if message.flow is flow
+        }
+        self._all_sent = sender.whole
+        self._compared = 0
+        self._first: tuple[int, str, str, object, object] | None = None
+
+    def result(self) -> MessagesReplay:
+        found = None
+        if self._first is not None:
+            row, what, column, recorded, replayed = self._first
+            now_ns, place = int(self._rows["now_ns"][row]), int(self._at[row])
+            found = difference(self._table, place, now_ns, what, column, recorded, replayed)
+        return MessagesReplay(self._leg, len(self._rows), self._compared, found)
+
+    def compare_vectors(self) -> None:
+        """Compare sequence number, time and vector of what a machine received."""
+        rows, columns, newest = self._rows, vector_columns(self._table, self._rows), -1
+        entries = [
+            entry for column in columns for entry in entry_names(column, rows[column].shape[1])
+        ]
+        vectors = (
+            np.hstack([rows[column] for column in columns]) if columns else np.zeros((len(rows), 0))
+        )
+        fields = (rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors)
+        for row, (sequence, t_ns, vector) in enumerate(zip(*fields, strict=True)):
+            if sequence <= newest:
+                self._differs(row, "not newer than what came before", "sequence", sequence)
+            newest = max(newest, sequence)
+            message = self._find(row, sequence, "sequence", sequence)
+            if message is None:
+                continue
+            if t_ns != message.t_ns:
+                self._differs(row, "was not sent so", "t_ns", t_ns, message.t_ns)
+            elif vector.tobytes() != message.vector.tobytes():
+                entry = first_entry(vector, message.vector)
+                if entry is not None:
+                    place, *values = entry
+                    self._differs(row, "was not sent so", entries[place], *values)
+
+    def compare_heads(self) -> None:
+        """Compare what netem keeps of a datagram: its first bytes and its size."""
+        heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
+        headers = [read_header(head) for head in heads]
+        # The run's number is drawn for each run and recorded here only.
+        ids = Counter(header.run_id for header in headers if header is not None)
+        encoder = Encoder(ids.most_common(1)[0][0] if ids else 0, bytes(KEY_BYTES))
+        for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
+            message = self._find(row, -1 if header is None else header.sequence, "head", head)
+            if message is None:
+                continue
+            data = encoder.encode(message)
+            expected = data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+            if head != expected:
+                self._differs(row, "was not sent so", "head", head, expected)
+            elif size != len(data):
+                self._differs(row, "was not sent so", "size_bytes", size, len(data))
+
+    def compare_flows(self) -> None:
+        """Look whether anybody but the sensor was served."""
+        for row, flow in enumerate(self._rows["flow"].tolist()):
+            if flow != 0:
+                self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
+
+    def compare_with_survivors(self, network: Replayed) -> None:
+        """Look whether the network let through what was received."""
+        if not network.whole:
+            return
+        survivors = {
+            header.sequence
+            for datagram in network.sent
+            if datagram.flow == self._way and (header := _header(datagram))
+        }
+        for row, sequence in enumerate(self._rows["sequence"].tolist()):
+            if sequence not in survivors:
+                self._differs(row, "netem does not let it through", "sequence", sequence)
+
+    def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
+        """Return the message of a number, if it was sent; if that can be told at all."""
+        if (message := self._sent.get(sequence)) is not None:
+            self._compared += 1
+            return message
+        if sequence < 0 or self._all_sent:
+            self._differs(row, "was never sent", column, value)
+        return None
+
+    def _differs(
+        self, row: int, what: str, column: str, recorded: object, replayed: object = None
+    ) -> None:
+        if self._first is None or row < self._first[0]:
+            self._first = (row, what, column, recorded, replayed)
+
+
+def _header(datagram: Datagram) -> Header | None:
+    return read_header(datagram.data)

@@ -1,0 +1,187 @@
+"""What a replay found: per process, per flow of messages, and the first difference of all."""
+
+import math
+import struct
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from noack.protocol.record_tables import entry_names
+
+Value = float | int | str | None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A place where the record and the replay part.
+
+    Floating-point values come with ``float.hex()``, which shows every bit; one that is not finite
+    has no other form.
+    """
+
+    table: str
+    row: int
+    """Index in the table, from 0."""
+    column: str
+    """As in the Parquet file: ``x_2`` is an entry of a vector. Empty if no single one is."""
+    recorded: Value
+    recorded_hex: str | None
+    replayed: Value
+    replayed_hex: str | None
+    what: str
+    """In words."""
+    now_ns: int
+    """The row's recorded time."""
+
+    def __str__(self) -> str:
+        column = f", {self.column}" if self.column else ""
+        values = ""
+        if self.recorded is not None or self.recorded_hex is not None:
+            recorded = _text(self.recorded, self.recorded_hex)
+            values = f": recorded {recorded}, replayed {_text(self.replayed, self.replayed_hex)}"
+        return f"{self.table} row {self.row}{column}: {self.what}{values}"
+
+
+def difference(
+    table: str,
+    row: int,
+    now_ns: int,
+    what: str,
+    column: str = "",
+    recorded: object = None,
+    replayed: object = None,
+) -> Difference:
+    """Return a difference with its values made presentable."""
+    (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
+    return Difference(table, row, column, first, first_hex, second, second_hex, what, now_ns)
+
+
+def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> Difference:
+    """Name the first column in which two rows of a table differ in any bit."""
+    now_ns = int(recorded["now_ns"])
+    for name in recorded.dtype.names or ():
+        if (entry := first_entry(recorded[name], replayed[name])) is not None:
+            place, *values = entry
+            width = np.size(recorded[name])
+            column = entry_names(name, width)[place] if np.ndim(recorded[name]) else name
+            return difference(table, row, now_ns, "the row differs", column, *values)
+    raise ValueError("the rows are equal")
+
+
+def first_entry(recorded: Any, replayed: Any) -> tuple[int, object, object] | None:
+    """Return index and values of the first entry in which a column's two values differ."""
+    pairs = zip(np.atleast_1d(recorded), np.atleast_1d(replayed), strict=True)
+    for i, (one, other) in enumerate(pairs):
+        if one.tobytes() != other.tobytes():
+            return i, one.item(), other.item()
+    return None
+
+
+def _shown(value: object) -> tuple[Value, str | None]:
+    if isinstance(value, float):
+        if math.isnan(value):  # they are not all alike
+            return None, f"nan, bits {struct.pack('>d', value).hex()}"
+        return value if math.isfinite(value) else None, value.hex()
+    if isinstance(value, bytes):
+        return value.hex(), None
+    return (value if isinstance(value, int | str) else None), None
+
+
+def _text(value: Value, as_hex: str | None) -> str:
+    if value is None:
+        return as_hex or "nothing"
+    return f"{value} ({as_hex})" if as_hex else str(value)
+
+
+@dataclass(frozen=True)
+class ProcessReplay:
+    """How one process's replay went."""
+
+    process: str
+    inputs: int
+    """Inputs in the record."""
+    compared: int
+    """Inputs that were replayed; each leaves one row, which was compared."""
+    missing_from: int | None
+    """Number of the first input whose row the record lacks: the replay went up to there."""
+    end_known: bool
+    """Whether the process left a report of how many rows there are."""
+    difference: Difference | None
+
+    @property
+    def whole(self) -> bool:
+        """Whether all that the process did was replayed."""
+        return self.end_known and self.compared == self.inputs and self.missing_from is None
+
+    @property
+    def gap(self) -> str | None:
+        """What the replay of this process does not cover, in words."""
+        if self.missing_from is not None:
+            return f"{self.process}: rows are missing from input {self.missing_from} on"
+        if self.compared < self.inputs:
+            return f"{self.process}: replayed up to input {self.compared}"
+        if not self.end_known:
+            return f"{self.process}: left no report; whether its last rows are missing is not known"
+        return None
+
+
+@dataclass(frozen=True)
+class MessagesReplay:
+    """How the messages of one leg compare: what was sent in the replay, what arrived in the run."""
+
+    leg: str
+    received: int
+    """Messages in the receiver's record."""
+    compared: int
+    """Those whose sender was replayed that far."""
+    difference: Difference | None
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The verdict."""
+
+    processes: tuple[ProcessReplay, ...]
+    messages: tuple[MessagesReplay, ...]
+
+    @property
+    def inputs(self) -> int:
+        """Inputs that were replayed."""
+        return sum(process.compared for process in self.processes)
+
+    @property
+    def first_difference(self) -> Difference | None:
+        """The earliest difference by the recorded time; of a message before that of a row."""
+        found = [messages.difference for messages in self.messages]
+        found += [process.difference for process in self.processes]
+        differences = [one for one in found if one is not None]
+        return min(differences, key=lambda difference: difference.now_ns, default=None)
+
+    @property
+    def bit_exact(self) -> bool | None:
+        """Whether nothing that was compared differs; None if there was nothing to compare."""
+        return self.first_difference is None if self.inputs else None
+
+    @property
+    def gaps(self) -> list[str]:
+        """What is not covered, in words: the record's gaps."""
+        return [gap for process in self.processes if (gap := process.gap)]
+
+    def verdict(self) -> dict[str, Any]:
+        """The verdict for the run's summary."""
+        found = self.first_difference
+        return {
+            "bit_exact": self.bit_exact,
+            "complete": not self.gaps,
+            "inputs": self.inputs,
+            "first_difference": None if found is None else asdict(found),
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        return self.verdict() | {
+            "gaps": self.gaps,
+            "processes": [asdict(process) for process in self.processes],
+            "messages": [asdict(messages) for messages in self.messages],
+        }

@@ -1,0 +1,160 @@
+"""What happened when in a live run, counted in steps of the plant: from the record."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.claims.condition_reader import observe
+from cosim.record.recorded_changes import changes_of
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.continuous.plant_grid_loop import NO_ACTUATION, Schedule
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+
+_LEAST_MEASUREMENTS = 10
+_NEVER_NS = 2**62
+_LARGEST = 1e100
+
+
+class IncomparableError(CallerError):
+    """The run's record does not allow the comparison; the message says why."""
+
+
+class LiveRun(NamedTuple):
+    """A live run on the plant's grid, up to its last measurement."""
+
+    schedule: Schedule
+    x: Matrix
+    """The plant's state at the measurements, (k, n)."""
+    event_s: Vector
+    """Times of the events."""
+
+
+def live_run(record: RunRecord) -> LiveRun:
+    """Read what happened in a run.
+
+    Raises:
+        IncomparableError: the run diverged, a process was started anew, settings were changed, the
+            record is too short or has gaps, or the input was not that of the controller's model
+            throughout.
+        CallerError: it is of a scenario that exact simulation cannot take.
+    """
+    record.scenario.require_unacknowledged()
+    if changes_of(record):
+        raise IncomparableError(
+            "no ideal loop is like it: its settings were changed during the run"
+        )
+    record.scenario.require_unchanging()
+    record.scenario.require_exact()
+    steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
+    if (again := record.restarted()) is not None:
+        raise IncomparableError(
+            f"no ideal loop is like it: {again} was started anew during the run"
+        )
+    if len(sensor) < _LEAST_MEASUREMENTS:
+        raise IncomparableError(
+            f"the record holds {len(sensor)} measurements; {_LEAST_MEASUREMENTS} are needed"
+        )
+    period_ns = record.scenario.plant_period_ns
+    last = int(sensor["t_ns"][-1]) // period_ns
+    steps = steps[: last + 1]
+    if len(steps) <= last or (steps["sequence"] != np.arange(last + 1)).any():
+        raise IncomparableError("steps of the plant are missing from the record")
+    if (np.diff(sensor["input"], prepend=-1) != 1).any():
+        raise IncomparableError("measurements are missing from the sensor's record")
+    _require_times(record)
+    if not np.abs(steps["x"]).max() < _LARGEST:  # nor with NaN
+        raise IncomparableError("the run diverged")
+    measured = np.zeros(last + 1, dtype=np.bool_)
+    measured[sensor["t_ns"] // period_ns] = True
+    ticks, taken = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
+    latched = _latched(steps["actuation"], ticks)
+    seen = observe(record)
+    if len(seen.watchdog.t_s) or len(seen.safe_input.t_s):
+        raise IncomparableError(
+            "for a time the input was the watchdog's, or a safe one, which no ideal loop has"
+        )
+    events = sensor[sensor["event"] != NO_SEQUENCE]
+    numbers, event_ns = np.arange(len(events)), events["t_ns"]
+    acts_at_tick = np.searchsorted(ticks.newest, numbers)
+    acts_at_step = np.searchsorted(latched.newest, numbers)
+    act_ns = np.append(ticks.model_ns, _NEVER_NS)[acts_at_tick]
+    schedule = Schedule(
+        period_ns=period_ns,
+        measured=measured,
+        delivered=_fates(taken, len(events), network_fates(record.scenario)),
+        delay_ns=_delays(taken, act_ns - event_ns, act_ns < _NEVER_NS),
+        delay_steps=_delays(taken, acts_at_step - event_ns // period_ns, acts_at_step <= last),
+        model_ns=latched.model_ns,
+    )
+    return LiveRun(schedule, steps["x"][measured], event_ns * 1e-9)
+
+
+def _require_times(record: RunRecord) -> None:
+    """Require times that a run has; a simulation would follow others for ever.
+
+    Raises:
+        IncomparableError: some are not.
+    """
+    horizon_ns = record.scenario.horizon_ns
+    for table, column in (
+        (SENSOR_MEASUREMENT, "t_ns"),
+        (CONTROLLER_STEP, "model_t_ns"),
+        (CONTROLLER_DELIVERY, "model_t_ns"),
+    ):
+        times_ns = record[table][column]
+        if (times_ns < 0).any() or (times_ns > horizon_ns).any() or (np.diff(times_ns) < 0).any():
+            raise IncomparableError(f"the record's {table} has times that no run has")
+
+
+class _Ticks(NamedTuple):
+    """What the controller's actuations, by sequence number, or the plant's steps rest on."""
+
+    model_ns: NDArray[np.int64]
+    newest: NDArray[np.int64]
+    """Sequence number of the newest update in them, −1 for none."""
+
+
+def _ticks(ticks: Rows, deliveries: Rows) -> tuple[_Ticks, set[int]]:
+    """What each actuation rests on, and the updates that the controller took."""
+    inputs = np.sort(np.concatenate([ticks["input"], deliveries["input"]]))
+    whole = np.array_equal(inputs, np.arange(len(inputs)))
+    if not whole or (ticks["sequence"] != np.arange(len(ticks))).any():
+        raise IncomparableError("ticks or deliveries are missing from the controller's record")
+    sequences = np.concatenate([[NO_SEQUENCE], deliveries["sequence"]])
+    newest = sequences[np.searchsorted(deliveries["input"], ticks["input"])]
+    return _Ticks(ticks["model_t_ns"], newest), set(deliveries["sequence"].tolist())
+
+
+def _latched(actuations: NDArray[np.int64], ticks: _Ticks) -> _Ticks:
+    """What the input held from each step on rests on; −1 before the first."""
+    if actuations.max(initial=NO_SEQUENCE) >= len(ticks.newest):
+        raise IncomparableError("the controller's record ends before the plant's")
+    by_sequence = _Ticks(
+        np.append(ticks.model_ns, NO_ACTUATION), np.append(ticks.newest, NO_SEQUENCE)
+    )
+    return _Ticks(by_sequence.model_ns[actuations], by_sequence.newest[actuations])
+
+
+def _fates(taken: set[int], known: int, network: Callable[[int], bool]) -> Callable[[int], bool]:
+    """What the controller took; for events that the run did not have, the network's own word."""
+    return lambda event: event in taken if event < known else network(event)
+
+
+def _delays(
+    taken: set[int], delays: NDArray[np.int64], acted: NDArray[np.bool_]
+) -> Callable[[int], int]:
+    """Recorded delays; for events that the run did not have, their median."""
+    usable = [int(delays[event]) for event in taken if event < len(delays) and acted[event]]
+    usual = int(np.median(usable)) if usable else 0
+    return lambda event: int(delays[event]) if event < len(delays) else usual

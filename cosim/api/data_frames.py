@@ -1,0 +1,73 @@
+"""Tables of a run for data frames: Arrow tables, which pandas and polars take as they are."""
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from cosim.record.align import join_all
+from cosim.record.packet_outcomes import crossing
+from cosim.record.run_record import RunRecord
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NO_SEQUENCE,
+    SENSOR_MEASUREMENT,
+    Fate,
+    effective,
+    entry_names,
+)
+
+_NOT_THERE = "none"
+_OVERTAKEN = "overtaken"
+_UNDER_WAY = "under_way"
+
+
+def with_seconds(table: pa.Table) -> pa.Table:
+    """Put ``t_s``, the time ``t_ns`` in seconds, before the columns of a table."""
+    return table.add_column(0, "t_s", pa.array(_seconds(table["t_ns"].to_numpy())))
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def samples(record: RunRecord) -> pa.Table:
+    """Plant, sensor and controller on the measurements' time grid; :meth:`noack.Run.samples`."""
+    joined = join_all(record)
+    columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(joined.t_ns), "t_ns": joined.t_ns}
+    for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
+        columns |= dict(zip(entry_names(name, states.shape[1]), states.T, strict=True))
+    columns |= {
+        "e_s_norm": joined.e_s_norm,
+        "threshold": joined.threshold,
+        "e_c_norm": joined.e_c_norm,
+        "event": record[SENSOR_MEASUREMENT]["event"],
+    }
+    return _table(columns)
+
+
+def events(record: RunRecord) -> pa.Table:
+    """The sensor's transmissions and what became of them; :meth:`noack.Run.events`."""
+    measurements = record[SENSOR_MEASUREMENT]
+    sent = measurements[measurements["event"] != NO_SEQUENCE]
+    t_s = _seconds(sent["t_ns"])
+    crossed = crossing(record)
+    fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
+    # Delivered, as far as the emulator could know, but not in the end.
+    fates[effective(crossed.rows["fate"]) & crossed.lost] = _OVERTAKEN
+    fates[crossed.under_way] = _UNDER_WAY
+    known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
+    columns = {
+        "event": sent["event"],
+        "t_s": t_s,
+        "t_ns": sent["t_ns"],
+        "interval_s": np.diff(t_s, prepend=np.nan),
+        "fate": np.array([known.get(int(n), _NOT_THERE) for n in sent["event"]], dtype=np.str_),
+        "received": np.isin(sent["event"], record[CONTROLLER_DELIVERY]["sequence"]),
+    }
+    return _table(columns)
+
+
+def _table(columns: dict[str, NDArray[np.generic]]) -> pa.Table:
+    return pa.table({name: pa.array(np.ascontiguousarray(v)) for name, v in columns.items()})
+
+
+def _seconds(t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.asarray(t_ns / NS_PER_S, dtype=np.float64)

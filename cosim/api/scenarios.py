@@ -1,0 +1,163 @@
+"""Scenarios: of a file, of a table, of somebody's own matrices; and with other settings."""
+
+import math
+from collections.abc import Mapping, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.shipped_files import find_shipped
+from noack.config import toml_file
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import completed, put
+from noack.config.state_space import matrices_of, model_of
+from noack.core.linear_systems import spectral_abscissa
+
+Source = Scenario | str | PathLike[str] | Mapping[str, Any]
+"""A scenario; or the name of a shipped one, a file, or a table of a scenario file's content."""
+
+_BETA_SHARE = 0.1
+_ALPHA_SHARE = 0.5
+_SETTLED = 0.01
+_MANSD = 4
+_LOSS_PROBABILITY = 0.5
+
+
+def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
+    """Load a scenario.
+
+    Args:
+        source: the name of a shipped scenario (``"lane_following"``); or a scenario file, by its
+            path; or its content as a table, ``{"name": ..., "model": {...}, ...}``. Files that a
+            table names are looked for in the working directory. A scenario is taken as it is.
+        settings: values that replace the source's, as in :func:`with_settings`.
+
+    Raises:
+        NoackError: one line per mistake, each with key, value and remedy.
+    """
+    if isinstance(source, Scenario):
+        return with_settings(source, settings) if settings else source
+    if isinstance(source, Mapping):
+        return _completed(_plain(source), settings, Path("scenario"))
+    path = find_shipped(str(source), "scenarios")
+    return _completed(toml_file.read(path, Scenario), settings, path)
+
+
+def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
+    """Return the scenario with other settings; the one given stays as it is.
+
+    Args:
+        scenario: as loaded, or of a run.
+        settings: values by the keys of a scenario file, with dots between their parts:
+            ``{"network.loss.probability": 0.8, "trigger.beta": 0.3}``. Arrays may be NumPy's. None
+            takes a key away, so that its default holds. What the keys mean, and their units, is in
+            ``docs/scenarios.md``.
+
+    Raises:
+        NoackError: one line per mistake, each with key, value and remedy.
+    """
+    content = scenario.model_dump(mode="json", exclude_none=True)
+    return _completed(content, settings, Path("settings"))
+
+
+def from_system(
+    system: Any,
+    gain: Any,
+    initial_state: Sequence[float],
+    *,
+    plant: Any = None,
+    settings: Mapping[str, Any] | None = None,
+    name: str = "own_system",
+    state_names: Sequence[str] | None = None,
+    input_names: Sequence[str] | None = None,
+) -> Scenario:
+    """Return a scenario around a linear model of one's own, with n states and m inputs.
+
+    Whatever ``settings`` do not say, it chooses: the trigger's α is half the decay rate of
+    Â + B̂K, its β a tenth of ‖x(0)‖ (0.1 if that is 0), the horizon the time in which e^(−αt) falls
+    to a hundredth, each to three digits; M − 1 is 4, and half of the updates are lost.
+
+    Args:
+        system: the model ẋ = Âx + B̂u as a tuple (A, B) of matrices (n, n), per second, and (n, m);
+            or ``control.StateSpace`` or ``scipy.signal.StateSpace``, in continuous time, whose
+            output is the state.
+        gain: K of u = Kx, (m, n), with which the model is stable. ``control.lqr`` and
+            ``scipy.signal.place_poles`` give the K of u = −Kx.
+        initial_state: x(0), n entries.
+        plant: the true plant, as ``system``; by default it is the model, and then x_s never parts
+            from x.
+        settings: as in :func:`with_settings`.
+        name: of the scenario: letters, digits, _ and -.
+        state_names: n names, for plots; by default those of the ``system``, or x_1, x_2, ….
+        input_names: m names, likewise.
+
+    Raises:
+        NoackError: shapes do not fit; the model is not stable with u = Kx; or settings are wrong.
+    """
+    model = model_of(system, gain, state_names=state_names, input_names=input_names)
+    A, B = model.matrices
+    decay_per_s = -spectral_abscissa(A + B @ np.array(model.gain))
+    alpha_per_s = _rounded(_ALPHA_SHARE * decay_per_s)
+    start = _plain(initial_state)
+    norm = (
+        float(np.linalg.norm(start)) if _is_vector(start) else 0.0
+    )  # validation says what is wrong
+    content: dict[str, Any] = {
+        "name": name,
+        "horizon_s": _rounded(math.log(1 / _SETTLED) / alpha_per_s),
+        "model": model.model_dump(mode="json", exclude_none=True),
+        "plant": {"initial_state": start},
+        "trigger": {
+            "policy": "decaying",
+            "beta": _rounded(_BETA_SHARE * norm or _BETA_SHARE),
+            "alpha_per_s": alpha_per_s,
+        },
+        "network": {
+            "mansd": _MANSD,
+            "loss": {"model": "bernoulli", "probability": _LOSS_PROBABILITY},
+        },
+    }
+    if plant is not None:
+        true = matrices_of(plant)
+        content["plant"] |= {"draw": "given", "A": true["A"].tolist(), "B": true["B"].tolist()}
+    return _completed(content, settings, Path(name))
+
+
+def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path: Path) -> Scenario:
+    """Put the settings in, validate, read the files that are named; ``path`` says where from."""
+    for key, value in (settings or {}).items():
+        if value is None:
+            _take_away(content, key)
+        else:
+            put(content, key, _plain(value), f"settings: {key}")
+    return completed(content, path)
+
+
+def _take_away(content: dict[str, Any], key: str) -> None:
+    table: Any = content
+    *path, last = key.split(".")
+    for part in path:
+        table = table.get(part) if isinstance(table, dict) else None
+    if isinstance(table, dict):
+        table.pop(last, None)
+
+
+def _plain(value: Any) -> Any:
+    """A value as a TOML parser would give it: NumPy's arrays and numbers as lists and numbers."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value
+
+
+def _is_vector(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, int | float) for entry in value)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.3g}")

@@ -1,0 +1,276 @@
+"""Measures a machine, in some seconds, with what a run itself uses."""
+
+import ctypes
+import json
+import os
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import zenoh
+from zenoh.handlers import FifoChannel
+
+from cosim.doctor.machine_facts import Buffer, Disk, Lateness, Machine, RoundTrips, Wanted
+from cosim.live.disk_space import needed_bytes
+from cosim.output.viewer.live_viewer import has_display
+from cosim.record.environment import environment
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
+from noack.core.python_process import python_command
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.code_cache import cache_folder
+from noack.runtime.private_folder import open_private
+from noack.runtime.udp_sockets import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
+from noack.runtime.zenoh_session import Secret, answer_to, cause_of, open_star
+
+T = TypeVar("T")
+
+EXTRAS = {"fmi": "fmpy", "vehicle": "vehiclemodels", "cluster": "distributed"}
+"""Extras of noack by name, and the module that each brings."""
+
+_DATAGRAM = bytes(72)
+_ROUND_TRIPS = 1000
+_FLOOD = 20_000
+_WRITE_BYTES = 32 * 1024 * 1024
+_PATIENCE_S = 20.0
+_ANSWER_S = 2.0
+_PR_GET_TIMERSLACK = 30
+
+
+def measure(resolved: Scenario, wanted: Wanted, runs: Path, duration_s: float) -> Machine:
+    """Measure this machine for a scenario.
+
+    Args:
+        resolved: the resolved scenario.
+        wanted: what it asks of the machine.
+        runs: where its run directory would be made; it need not exist.
+        duration_s: how long wake-ups are watched, without real-time settings and with.
+    """
+    plain, realtime, granted = _wake_ups(wanted, duration_s)
+    about = environment("live")
+    return Machine(
+        cores=about["cores"],
+        cores_online=os.cpu_count() or 1,
+        load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        governor=_read(Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")),
+        granted=granted,
+        timer_resolution_ns=round(time.get_clock_info("monotonic").resolution * NS_PER_S),
+        timer_slack_ns=_timer_slack_ns(),
+        plain=plain,
+        realtime=realtime,
+        round_trips=_or_why(_round_trips),
+        buffer=_or_why(_buffer),
+        ports_taken=list(_ports_taken(wanted)),
+        control=_or_why(_control),
+        disk=_or_why(lambda: _disk(runs, needed_bytes(resolved))),
+        runtime_folder=_runtime_folder(),
+        cache=_cache(),
+        display=has_display(),
+        viewer=about["packages"].get("rerun-sdk") if find_spec("rerun") else None,
+        extras={name: find_spec(module) is not None for name, module in EXTRAS.items()},
+        versions={"python": about["python"], **about["packages"]},
+    )
+
+
+def _or_why(measuring: Callable[[], T]) -> T | str:
+    try:
+        return measuring()
+    except NoackError as error:
+        return str(error)
+    except zenoh.ZError as error:
+        return cause_of(error)
+    except OSError as error:
+        return why(error)
+
+
+def _probe(*arguments: object) -> list[str]:
+    return python_command("-m", "cosim.doctor.probe", *arguments)
+
+
+def _wake_ups(
+    wanted: Wanted, duration_s: float
+) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
+    command = _probe("wake", wanted.period_ns, duration_s, wanted.fifo_priority, wanted.spin_us)
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True,
+            timeout=_PATIENCE_S + 10 * duration_s,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError) as error:
+        said = one_line(error)
+        return said, said, {}
+    found: dict[str, Any] = json.loads(done.stdout)
+    plain, realtime = (lateness(found[name], wanted.allowance_ns) for name in ("plain", "realtime"))
+    return plain, realtime, found["granted"]
+
+
+def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
+    """Return what is said of wake-ups that were late by so many nanoseconds."""
+    late = np.array(list(late_ns), dtype=np.int64)
+    if not len(late):
+        return "it never woke up"
+    p50, p99 = np.quantile(late, [0.5, 0.99]) / 1e3
+    beyond = int((late > allowance_ns).sum())
+    return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, beyond)
+
+
+def _round_trips() -> RoundTrips:
+    with (
+        subprocess.Popen(_probe("echo"), stdout=subprocess.PIPE, text=True) as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint,
+    ):
+        try:
+            assert process.stdout is not None
+            endpoint.settimeout(1.0)
+            port = int(process.stdout.readline() or 0)
+            if not port:
+                raise MachineError("a process that echoes datagrams did not start")
+            endpoint.connect((LOOPBACK, port))
+            taken_us, lost = [], 0
+            for _ in range(_ROUND_TRIPS):
+                begun_ns = time.perf_counter_ns()
+                try:
+                    endpoint.send(_DATAGRAM)
+                    endpoint.recv(len(_DATAGRAM) + 1)
+                except TimeoutError:
+                    lost += 1
+                    if lost > 2:
+                        raise MachineError("datagrams on the loopback are lost") from None
+                else:
+                    taken_us.append((time.perf_counter_ns() - begun_ns) * 1e-3)
+            endpoint.send(b"")
+        except BaseException:
+            process.kill()
+            raise
+    p50, p99 = np.quantile(taken_us, [0.5, 0.99])
+    return RoundTrips(_ROUND_TRIPS, lost, float(p50), float(p99))
+
+
+def _buffer() -> Buffer:
+    with (
+        closing(bind(0, "nothing")) as endpoint,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        sender.connect(endpoint.getsockname())
+        for _ in range(_FLOOD):
+            sender.send(_DATAGRAM)
+        held = 0
+        try:
+            while held < _FLOOD:
+                endpoint.recv(len(_DATAGRAM) + 1)
+                held += 1
+        except BlockingIOError:
+            pass
+        granted = endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    most = _read(Path("/proc/sys/net/core/rmem_max"))
+    return Buffer(held, granted, int(most) if most else None)
+
+
+def _ports_taken(wanted: Wanted) -> Iterable[str]:
+    for name, port in wanted.ports.items():
+        try:
+            if name in LOOP_ROLES:
+                bind(port, f"ports.{name}").close()
+            else:
+                require_free_tcp_port(port, f"ports.{name}")
+        except CallerError as error:
+            yield str(error)
+
+
+def _control() -> float:
+    """Ask a question over a star as the control plane is; return how long the answer took."""
+    secret = Secret("doctor", secrets.token_hex(16))
+    endpoint, key = f"tcp/{LOOPBACK}:{free_tcp_port()}", "noack/doctor"
+    centre = open_star(endpoint, secret, listen=True)
+    try:
+        with centre.declare_queryable(key, FifoChannel(4)) as answering:
+            other = open_star(endpoint, secret, listen=False)
+            try:
+                ended = threading.Event()
+                thread = threading.Thread(target=_answer, args=(answering, key, ended))
+                thread.start()
+                begun_s = time.perf_counter()
+                answer = answer_to(other, key, "", _ANSWER_S)
+                taken_s = time.perf_counter() - begun_s
+                ended.set()
+                thread.join()
+            finally:
+                other.close()  # type: ignore[no-untyped-call]
+    finally:
+        centre.close()  # type: ignore[no-untyped-call]
+    if answer is None:
+        raise MachineError(f"no answer within {_ANSWER_S:g} s")
+    return taken_s
+
+
+def _answer(queryable: Any, key: str, ended: threading.Event) -> None:
+    while not ended.is_set():
+        if (query := queryable.try_recv()) is not None:
+            query.reply(key, "here")
+            query.drop()
+        else:
+            ended.wait(0.001)
+
+
+def _disk(runs: Path, needed: int) -> Disk:
+    folder = next(one for one in (runs, *runs.absolute().parents) if one.is_dir())
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            block = bytes(1024 * 1024)
+            begun_s = time.perf_counter()
+            for _ in range(_WRITE_BYTES // len(block)):
+                file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
+            taken_s = time.perf_counter() - begun_s
+    except OSError as error:
+        raise MachineError(f"{folder}: cannot be written: {why(error)}") from None
+    free = shutil.disk_usage(folder).free
+    return Disk(str(folder), free, needed, _WRITE_BYTES / taken_s)
+
+
+def _runtime_folder() -> str | None:
+    try:
+        with open_private(create=True):
+            pass
+    except CallerError as error:
+        return str(error)
+    return None
+
+
+def _cache() -> bool:
+    try:
+        folder = cache_folder("doctor", [Path(__file__)])
+    except ImportError:  # no numba, nothing to keep
+        return False
+    if folder is not None:
+        with suppress(OSError):
+            folder.rmdir()
+    return folder is not None
+
+
+def _timer_slack_ns() -> int | None:
+    """Of this thread, which has asked for nothing."""
+    if sys.platform != "linux":
+        return None
+    found: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    return found if found >= 0 else None
+
+
+def _read(path: Path) -> str | None:
+    try:
+        return path.read_text().strip() or None
+    except OSError:
+        return None

@@ -1,0 +1,1 @@
+"""A live run: launcher, coordinator, recorder, finalisation."""

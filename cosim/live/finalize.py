@@ -1,0 +1,185 @@
+"""The conclusion of a run: its record made whole, its summary written."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.analysis.claims.claim_evaluation import as_json
+from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.fidelity import fidelity_for_summary
+from cosim.analysis.model_comparison import linearisation
+from cosim.analysis.replay import replay
+from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import Summary, dumps, summarise
+from cosim.analysis.summary_check import can_be_shown
+from cosim.record.run_directory import (
+    ENDING_FILE,
+    RECORD,
+    REPORT_FILE,
+    SCENARIO_FILE,
+    SPOOL,
+    SUMMARY_FILE,
+    concluded,
+    read_object,
+)
+from cosim.record.run_ending import Ending
+from cosim.record.run_record import RunRecord, finish_record, load_record
+from noack.core.errors import CallerError, ExitStatus, MachineError, why
+
+
+@np.errstate(all="ignore")
+def conclude(ending: Ending, *, report: bool = True) -> Outcome:
+    """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
+    run_dir = ending.run_dir
+    with _told_with(ending), concluded(run_dir):
+        if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
+            record = finish_record(run_dir)
+            from cosim.output.viewer.run_view import write_view
+
+            write_view(record, run_dir, ending.run_id)
+        else:
+            record = load_record(run_dir)
+        summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
+        summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
+        summary["judged_until_s"] = None
+        _write_summary(run_dir, summary)
+        # Written once more, so that nothing that is found out afterwards can cost a summary.
+        claims = RunClaims(record)
+        summary |= _found_out(record, claims, summary)
+        summary["exit"] = _end(summary)
+        _write_summary(run_dir, summary)
+        try:
+            if report:
+                _report(record, summary, run_dir, claims)
+        except Exception as error:  # whatever it is: a run is none the worse for it
+            (run_dir / REPORT_FILE).unlink(missing_ok=True)
+            print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
+    end = summary["exit"]
+    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+
+
+@contextmanager
+def _told_with(ending: Ending) -> Iterator[None]:
+    """Let an error that keeps the record from being finished say how the run ended, too."""
+    try:
+        yield
+    except MachineError as error:
+        if ending.status == ExitStatus.OK:
+            raise
+        raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
+
+
+def _write_summary(run_dir: Path, summary: Summary) -> None:
+    path = run_dir / SUMMARY_FILE
+    scratch = path.with_suffix(".partial")
+    try:
+        scratch.write_text(dumps(summary), encoding="utf-8")
+        scratch.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise MachineError(
+            f"{path}: cannot be written: {why(error)}; `noack summary {run_dir}` does it later"
+        ) from None
+
+
+def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
+    """What needs more than the record's own numbers; a failure of it is a line in the summary."""
+    found: Summary = {}
+    if record.kind == "live":
+        try:
+            found["replay"] = replay(record).verdict()
+        except Exception as error:  # whatever it is, the run itself went as it went
+            found["replay"] = {"bit_exact": None, "error": repr(error)}
+    found["fidelity"] = fidelity_for_summary(record)
+    try:
+        if (near := linearisation(record.scenario)) is not None:
+            found["linearisation"] = near
+    except Exception as error:  # likewise
+        print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
+    try:
+        found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
+        found["judged_until_s"] = claims.judged_until_s
+        found |= _lost_by_others(claims, summary)
+    except Exception as error:  # likewise
+        print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
+    return found
+
+
+def _end(summary: Summary) -> dict[str, Any]:
+    """How the run ended, whose replay is known: one that cannot be replayed failed."""
+    end: dict[str, Any] = summary["exit"]
+    verdict = summary["replay"]
+    if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
+        return end
+    why = verdict.get("error", "the record has no inputs")
+    return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
+
+
+def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
+    """Runs of losses that neither the network nor the controller knows of, as somebody was away."""
+    longest = int(claims.conditions["dropouts"] or 0)
+    if not summary["lost_outside_netem"] or longest <= summary["longest_drop_run"]:
+        return {}
+    found: Summary = {"longest_drop_run": longest}
+    if (beyond := claims.beyond_mansd) is not None and not summary["assumption_violations"]:
+        at_s, what = beyond
+        found["assumption_violations"] = [
+            {"t_s": at_s, "process": "recorder", "what": f"MANSD violated: {what}"}
+        ]
+    return found
+
+
+def reopen(run_dir: Path) -> Outcome:
+    """Return the outcome of an earlier run; finish its record if nobody did.
+
+    Raises:
+        CallerError: it is not a run directory, or the run is still under way.
+    """
+    if not (run_dir / SCENARIO_FILE).is_file():
+        raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
+    summary = read_object(run_dir / SUMMARY_FILE)
+    ending = _ending(run_dir, summary)
+    # It is of an earlier version or damaged; or a process woke up after the end.
+    if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
+        return conclude(ending)
+    return Outcome(run_dir, ending.status, ending.reason, summary)
+
+
+def _ending(run_dir: Path, summary: Summary) -> Ending:
+    """How a run ended, as its summary has it, or else as its launcher stored it."""
+    for said in (summary, read_object(run_dir / ENDING_FILE)):
+        with suppress(LookupError, TypeError, ValueError):
+            status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
+            return Ending(run_dir, 0, status, reason, said["startup_s"])
+        summary.clear()  # without an end, nothing of it can be trusted
+    return Ending(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
+
+
+@np.errstate(all="ignore")
+def report_anew(run_dir: Path) -> Path:
+    """Write the report of an earlier run anew, and return its path.
+
+    Raises:
+        CallerError: it is not a run directory, or the run is still under way.
+        MachineError: the report cannot be written.
+    """
+    outcome = reopen(run_dir)
+    record = load_record(run_dir)
+    return _report(record, outcome.summary, run_dir, RunClaims(record))
+
+
+def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
+    from cosim.output.report.report_file import (
+        write_report,  # imports matplotlib, which no process needs sooner
+    )
+
+    try:
+        envelopes = claims.envelopes()
+    except Exception:  # the page is worth having without them
+        envelopes = []
+    return write_report(record, summary, run_dir, envelopes)

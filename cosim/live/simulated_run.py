@@ -1,0 +1,79 @@
+"""A simulated run: a run directory like a live run's, made in virtual time."""
+
+import json
+import secrets
+import shutil
+from pathlib import Path
+from typing import Protocol
+
+from cosim.record.environment import write_environment
+from cosim.record.run_directory import (
+    REPORTS_FILE,
+    new_run_dir,
+    point_to_latest,
+    under_way,
+    write_scenario,
+)
+from cosim.record.run_ending import Ending, EndingFile
+from cosim.record.run_record import RunRecord, write_record
+from cosim.simulation.virtual_time import Progress, simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import ExitStatus, MachineError, why
+from noack.runtime.process_life import HORIZON
+
+
+class Simulator(Protocol):
+    """Turns a resolved scenario into the record of a run."""
+
+    def __call__(self, resolved: Scenario, *, progress: Progress | None) -> RunRecord:
+        """Simulate the run; tell ``progress`` how far it is."""
+        ...
+
+
+def simulate_run(
+    scenario: Scenario,
+    runs: Path,
+    simulator: Simulator = simulate,
+    progress: Progress | None = None,
+    *,
+    view: bool = True,
+) -> Ending:
+    """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.conclude` ends it.
+
+    A run that is broken off leaves nothing behind: it can be repeated.
+
+    Args:
+        scenario: as loaded; it is resolved here.
+        runs: where run directories are made.
+        simulator: makes the record.
+        progress: is told how far the run is.
+        view: whether to write the recording for the viewer.
+
+    Raises:
+        CallerError: the scenario's numbers are too large.
+        MachineError: the run directory cannot be written.
+    """
+    resolved = resolve(scenario)
+    run_dir = new_run_dir(runs, resolved.name)
+    run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
+    try:
+        with under_way(run_dir), EndingFile(run_dir) as ending:
+            resolved = write_scenario(resolved, run_dir)
+            write_environment(run_dir, "simulated")
+            record = simulator(resolved, progress=progress)
+            reports = json.dumps(record.reports, indent=2)
+            (run_dir / REPORTS_FILE).write_text(reports, encoding="utf-8")
+            write_record(record, run_dir)
+            if view:
+                from cosim.output.viewer.run_view import write_view  # imports rerun
+
+                write_view(record, run_dir, run_id)
+            ending.store(ExitStatus.OK, HORIZON)
+    except BaseException as error:
+        shutil.rmtree(run_dir, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise MachineError(f"{run_dir}: cannot be written: {why(error)}") from None
+        raise
+    point_to_latest(run_dir)
+    return Ending(run_dir, run_id, ExitStatus.OK, HORIZON)

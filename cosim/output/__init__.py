@@ -1,0 +1,1 @@
+"""What people see: number formats, tables, figures, report, viewer."""

@@ -1,0 +1,321 @@
+"""The certificates of a scenario, as a person or a program wants to see them."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.output.assumptions_table import print_assumptions
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+from noack.theory.assumptions import assumptions
+from noack.theory.certificate import Conditions
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.paper_bounds import Theorem2, theorem_2
+from noack.theory.run_conditions import ideal_conditions, nominal_conditions
+from noack.theory.scenario_certificates import BOX, Certificate, Scope, box, outside_box, own_plant
+from noack.theory.weight import choose_weight
+
+IDEAL = "paper"
+"""Under the paper's conditions: nothing is sampled, delayed or held."""
+SCHEDULE = "schedule"
+"""Under the scenario's own schedule and allowance."""
+
+MOST_LATE = 1000
+_MOST_S = 10.0
+
+
+class Limits(NamedTuple):
+    """How far the schedule could go before a certificate is lost, one thing at a time."""
+
+    sampling_s: float
+    delay_s: float
+    hold_s: float
+
+
+@dataclass(frozen=True)
+class Study:
+    """Everything that is certified of a scenario.
+
+    Args:
+        resolved: the resolved scenario.
+        certificates: under the paper's conditions and under the schedule's.
+        scopes: whose certificates they are.
+        scheduled: the schedule's conditions.
+        theorem_2: the paper's bounds, with Δ from the ideal certificate.
+        weight: W, if the tool chose it.
+    """
+
+    resolved: Scenario
+    certificates: Sequence[tuple[str, Certificate]]
+    scopes: Sequence[Scope]
+    scheduled: Conditions
+    theorem_2: Theorem2 | None
+    weight: Matrix | None
+
+    @cached_property
+    def limits(self) -> dict[str, Limits]:
+        """By scope; found when first asked for, by a hundred certificates."""
+        return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
+
+    def certificate(self, under: str) -> Certificate:
+        """The certificate of the scenario's own plant, under IDEAL or SCHEDULE."""
+        return next(one for key, one in self.certificates if key == under)
+
+    def box_certificate(self, under: str) -> Certificate | None:
+        """The certificate of the scenario's uncertainty box; None if it has none."""
+        of_box = (one for key, one in self.certificates if key == under and one.scope == BOX)
+        return next(of_box, None)
+
+    def to_json(self) -> dict[str, Any]:
+        """As one document."""
+        theorem = None if self.theorem_2 is None else self.theorem_2._asdict()
+        return {
+            "scenario": self.resolved.name,
+            "weight": None if self.weight is None else self.weight.tolist(),
+            "paper": {
+                "assumptions": [a._asdict() for a in assumptions(self.resolved)],
+                "theorem_2": theorem,
+            },
+            "certificates": [
+                {"under": under, **certificate.to_json()}
+                for under, certificate in self.certificates
+            ],
+            "limits": {scope: limits._asdict() for scope, limits in self.limits.items()},
+        }
+
+
+def with_weight(
+    resolved: Scenario, which: str, progress: Callable[[float], None] = lambda share: None
+) -> tuple[Scenario, Matrix | None]:
+    """The scenario with the weight that was asked for, and W if it had to be chosen.
+
+    Raises:
+        CallerError: there is no such choice, or none can be made for this scenario.
+    """
+    weight: Matrix | None = None
+    if which == "given":
+        return resolved, None
+    if which == "chosen":
+        trigger = resolved.decaying
+        try:
+            weight = choose_weight(
+                loop_of(resolved), trigger.beta, trigger.alpha_per_s, resolved.network.mansd,
+                progress,
+            )  # fmt: skip
+        except NotDecayingError as error:
+            raise CallerError(f"weight chosen: {error}") from None
+    elif which != "identity":
+        raise CallerError(f'weight: given, identity or chosen, not "{which}"')
+    rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
+    trigger = resolved.decaying.model_copy(update={"weight": rows})
+    return resolved.model_copy(update={"trigger": trigger}), weight
+
+
+def study_scenario(
+    scenario: Scenario,
+    weight: str = "given",
+    late_periods: int | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Study:
+    """Certify a scenario as :func:`study` does, under a norm and an allowance of one's choice.
+
+    Args:
+        scenario: as loaded; it is resolved here.
+        weight: given, identity or chosen.
+        late_periods: steps of the plant, 0 to 1000; the scenario's own allowance unless given.
+        progress: is told which share of the choice of a weight is done.
+
+    Raises:
+        CallerError: there is no such choice, or no certificates are of this scenario.
+    """
+    resolved = resolve(scenario)
+    allowed = resolved.certificate.late_periods if late_periods is None else late_periods
+    if not 0 <= allowed <= MOST_LATE:
+        raise CallerError(f"late: {allowed} steps; give 0 to {MOST_LATE}")
+    weighted, W = with_weight(resolved, weight, progress)
+    return study(weighted, allowed, W)
+
+
+def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -> Study:
+    """Certify a scenario under the paper's conditions and under its own schedule.
+
+    Raises:
+        CallerError: its updates are acknowledged; its plant is not linear, or is disturbed; or its
+            state is not measured as it is.
+    """
+    resolved.require_unacknowledged()
+    resolved.require_unchanging()
+    resolved.require_exact()
+    ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
+    scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
+    certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]
+    certificates += [(SCHEDULE, scope.certificate(scheduled)) for scope in scopes]
+    first = certificates[0][1].constants
+    trigger = resolved.decaying
+    theorem = (
+        theorem_2(loop_of(resolved), trigger.beta, trigger.alpha_per_s, first.delta)
+        if first is not None and first.rate_per_s == trigger.alpha_per_s and not trigger.floor
+        and trigger.weight is None
+        else None
+    )  # fmt: skip
+    return Study(resolved, certificates, scopes, scheduled, theorem, weight)
+
+
+def _limits(scope: Scope, scheduled: Conditions) -> Limits:
+    return Limits(
+        scope.largest(
+            scheduled, lambda c, value: c._replace(sampling_s=value, spacing_s=value), _MOST_S
+        ),
+        scope.largest(
+            scheduled, lambda c, value: c._replace(delay_s=value, start_s=value), _MOST_S
+        ),
+        scope.largest(scheduled, lambda c, value: c._replace(hold_s=value), _MOST_S),
+    )
+
+
+def print_study(console: Console, found: Study) -> None:
+    """Print the tables."""
+    _print_constants(console, found)
+    _print_limits(console, found)
+    if (outside := outside_box(found.resolved)) is not None:
+        console.print(f"[yellow]the box certificates say nothing of this plant:[/] {outside}")
+    console.print("assumptions of the certificates under the schedule:")
+    certificate = next(c for under, c in found.certificates if under == SCHEDULE)
+    print_assumptions(console, [a._asdict() for a in certificate.assumptions])
+    console.print("assumptions of the paper's theorems:")
+    print_assumptions(console, [a._asdict() for a in assumptions(found.resolved)])
+    for sentence in in_words(found):
+        console.print(sentence, markup=False, highlight=False)
+    if found.weight is not None:
+        rows = ",\n".join(f"  {[float(f'{v:.6g}') for v in row]}" for row in found.weight)
+        console.print(
+            f"for the scenario file:\n[trigger]\nweight = [\n{rows},\n]",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+
+
+def in_words(found: Study) -> Iterator[str]:
+    """What is certified under the scenario's own schedule, in sentences."""
+    for under, certificate in found.certificates:
+        constants, dropouts = certificate.constants, certificate.conditions.dropouts
+        if under != SCHEDULE or constants is None:
+            continue
+        plants = "every plant of the box" if certificate.scope == BOX else "the scenario's plant"
+        decay = f" e^(−{constants.rate_per_s:.3g}t)" if constants.rate_per_s else ""
+        late = ""
+        if (floor := certificate.floor_constants) is not None:
+            late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
+        apart = ""
+        if (spacing_s := certificate.inter_event_s) is not None:
+            apart = f" No two transmissions are closer than {_limit(spacing_s)}."
+        yield (
+            f"In words: of {plants}, where what is presupposed above holds, whichever updates are "
+            f"lost, at most {dropouts} in a row: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+        )
+
+
+def _print_constants(console: Console, found: Study) -> None:
+    trigger = found.resolved.decaying
+    norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
+    table = Table(
+        title=f"{found.resolved.name}: what is certified, M = {found.resolved.network.mansd + 1}, "
+        f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, errors in {norm}"
+    )
+    table.add_column("")
+    for under, certificate in found.certificates:
+        table.add_column(f"{under},\n{whose(certificate)}", justify="right")
+    printed = found.theorem_2 is not None
+    if printed:
+        table.add_column("printed,\nTheorem 2", justify="right")
+    for label, values, of_theorem in constants(found):
+        table.add_row(label, *values, *([of_theorem] if printed else []))
+    console.print(table)
+    console.print(
+        "[dim]bounds × e^(−rate·t). paper: nothing sampled, delayed or held; "
+        "schedule: as the scenario runs, and late by what it allows[/]"
+    )
+    for under, certificate in found.certificates:
+        if certificate.void:
+            console.print(
+                f"[yellow]void[/] ({under}, {certificate.scope}): {escape(certificate.void)}"
+            )
+
+
+def whose(certificate: Certificate) -> str:
+    """Of which plants a certificate is, in a word."""
+    return "box" if certificate.scope == BOX else "plant"
+
+
+def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
+    """Yield what a person is told: label, the value of each certificate, and of Theorem 2."""
+    theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
+
+    def row(value: Callable[[Certificate], float | None]) -> list[str]:
+        return [_number(value(c)) if c.constants else "void" for c in all_certificates]
+
+    def constant(name: str) -> list[str]:
+        return row(lambda c: getattr(c.constants, name))
+
+    yield (
+        "decay rate, 1/s",
+        constant("rate_per_s"),
+        _number(found.resolved.decaying.alpha_per_s),
+    )
+    yield "updates missing", constant("missing_events"), "-"
+    yield (
+        "Δ, bound of ‖e_c‖/β",
+        constant("delta"),
+        ("(same)" if theorem is not None else "-"),
+    )
+    yield "bound of ‖e_s‖/β", constant("overshoot"), "1"
+    yield "bound of ‖u − Kx‖", constant("input_error"), "-"
+    yield (
+        "X, bound of ‖x‖",
+        constant("state"),
+        (_number(theorem.state_start + theorem.state_forced) if theorem is not None else "-"),
+    )
+    yield (
+        "inter-event, s",
+        row(lambda c: c.inter_event_s),
+        (_number(theorem.inter_event_s) if theorem is not None else "-"),
+    )
+    yield "error gain (< 1)", constant("loop_gain"), "-"
+    if any(c.floor_constants for c in all_certificates):
+        yield "floor from, s", row(lambda c: c.floor_from_s), "-"
+        for label, name in (("then, of ‖e_c‖/ε", "delta"), ("then, of ‖x‖", "state")):
+            yield (
+                label,
+                row(
+                    lambda c, name=name: getattr(c.floor_constants, name, None)  # type: ignore[misc]
+                ),
+                "-",
+            )
+
+
+def _print_limits(console: Console, found: Study) -> None:
+    table = Table(title="largest certified values of the schedule, one at a time")
+    for heading in ("", "sampling period", "delay of an update", "age of the input"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for scope, limits in found.limits.items():
+        table.add_row(scope, *map(_limit, limits))
+    console.print(table)
+
+
+def _number(value: float | None) -> str:
+    if value is None or math.isnan(value):
+        return "none"
+    return f"{value:.4g}"
+
+
+def _limit(value_s: float) -> str:
+    if value_s <= 0:
+        return "none"
+    return "any" if value_s >= _MOST_S else f"{1e3 * value_s:.3g} ms"

@@ -1,0 +1,87 @@
+"""What a person sees of a run's fidelity."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.analysis.fidelity import Difference, Fidelity, is_against, percent
+
+
+def print_fidelity(console: Console, fidelity: Fidelity) -> None:
+    """Print the chain from the ideal loop to the run, and the verdict."""
+    table = Table(title=f"{fidelity.scenario}: difference in x to the ideal loop")
+    table.add_column("effect", no_wrap=True)
+    for heading in ("RMS", "max", "share", "events", "Δt, ms", "parted"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_row("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
+    for stage in fidelity.stages:
+        table.add_row(
+            stage.name,
+            *_sizes(stage.difference),
+            percent(stage.share),
+            str(stage.events),
+            _milliseconds(stage.max_event_difference_s),
+            _event(stage.parted_event),
+        )
+    table.add_section()
+    table.add_row(
+        "all together",
+        *_sizes(fidelity.total),
+        "100.0 %",
+        str(fidelity.events_live),
+        _milliseconds(fidelity.max_event_difference_s),
+        _event(fidelity.parted_event),
+    )
+    console.print(table)
+    console.print(_by_state(fidelity))
+    console.print(
+        "Each effect is added to those above it. Δt: largest time difference of an event to the "
+        "line above; parted: first event more than ten measurements apart, from which on the same "
+        "packet fates meet other events. A negative share takes away from what the others make.",
+        highlight=False,
+    )
+    colour = "green" if fidelity.explained else "bold red"
+    console.print(f"[{colour}]{escape(fidelity.verdict)}[/]", highlight=False)
+
+
+def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
+    """Rows for the table of a run, from its summary."""
+    if fidelity is None:
+        return
+    if fidelity["reason"] is not None:
+        yield "difference to the ideal loop", f"not compared: {fidelity['reason']}"
+        return
+    scale = fidelity["rms_x_live"]
+    of_x = f" ({100 * fidelity['rms_x'] / scale:.2g} % of x)" if scale else ""
+    yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
+    for name, share in fidelity["shares"].items():
+        if name != "unexplained":
+            against = " (partly cancels the other effects)" if is_against(share) else ""
+            yield f"  share of {name.replace('_', ' ')}", percent(share) + against
+    yield "  residual, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
+
+
+def _by_state(fidelity: Fidelity) -> Table:
+    table = Table(title="RMS by state")
+    table.add_column("effect", no_wrap=True)
+    for name in fidelity.state_names:
+        table.add_column(escape(name), justify="right")
+    rows = [(stage.name, stage.difference) for stage in fidelity.stages]
+    for name, difference in [*rows, ("all together", fidelity.total)]:
+        table.add_row(name, *(f"{value:.2e}" for value in difference.rms_by_state))
+    return table
+
+
+def _sizes(difference: Difference) -> tuple[str, str]:
+    return f"{difference.rms:.2e}", f"{difference.max:.2e}"
+
+
+def _milliseconds(value_s: float | None) -> str:
+    return "-" if value_s is None else f"{1e3 * value_s:.1f}"
+
+
+def _event(number: int | None) -> str:
+    return "-" if number is None else f"{number}"

@@ -1,0 +1,73 @@
+"""What a person should know before trusting the numbers of a run, a sentence each."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from cosim.analysis.run_summary import Summary
+from cosim.output.run_tables import away, changes_in
+from noack.theory.assumptions import Verdict
+
+_MOST = 5
+_MOST_GROWTH, _MOST_LATE = 10.0, 0.01
+
+
+class Remark(NamedTuple):
+    """One sentence."""
+
+    text: str
+    severe: bool = False
+    """Whether the run broke what it guarantees."""
+
+
+def remarks(summary: Summary) -> Iterator[Remark]:
+    """Yield the remarks on a run, the severe ones first; none if all went well."""
+    violations = summary["assumption_violations"]
+    for one in violations[:_MOST]:
+        where = f"t = {one['t_s']:.3f} s, seen by {one['process']}"
+        yield Remark(f"assumption violated at {where}: {one['what']}", severe=True)
+    if len(violations) > _MOST:
+        yield Remark(f"and {len(violations) - _MOST} more such violations", severe=True)
+    if (summary.get("replay") or {}).get("bit_exact") is False:
+        yield Remark("the replay of the run differs from its record", severe=True)
+    yield from map(Remark, _warnings(summary))
+
+
+def _warnings(summary: Summary) -> Iterator[str]:
+    for one in summary["assumptions"]:
+        if one["verdict"] == Verdict.VIOLATED:
+            yield f"assumption violated: {one['what']} ({one['source']}): {one['why']}"
+    late = summary["lateness_us"].get("plant")
+    if late and late["late_steps"] > _MOST_LATE * late["steps"]:
+        share = 100 * late["late_steps"] / late["steps"]
+        yield f"{share:.0f} % of the plant's steps were late: lower speed or plant.rate_hz"
+    first, last = summary["initial_state_norm"], summary["final_state_norm"]
+    if first is not None and last is not None and last > _MOST_GROWTH * first > 0:
+        yield f"‖x‖ grew from {first:.3g} to {last:.3g}: the loop diverges"
+    if (summary.get("fidelity") or {}).get("explained") is False:
+        yield "the run's difference to the ideal loop is not explained"
+    if summary["missing_samples"]:
+        where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
+        yield f"{summary['missing_samples']} samples are missing in the record: {where}"
+    if summary["lost_outside_netem"]:
+        where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
+        yield f"{summary['lost_outside_netem']} datagrams were lost elsewhere (kernel): {where}"
+    for one in summary.get("restarts") or ():
+        yield f"{one['process']} was restarted, {away(one)}; claims are void from its death on"
+    for when, what in changes_in(summary):
+        yield f"{when}: {what}"
+    for role, reasons in summary["rejected_datagrams"].items():
+        counts = ", ".join(f"{reason.replace('_', ' ')} {n}" for reason, n in reasons.items())
+        yield f"{role} rejected datagrams: {counts}"
+    if _was_late(summary):
+        yield (
+            "this machine was late, which voids claims that do not allow for it: a greater "
+            "certificate.late_periods does, where it can be certified; noack simulate is never late"
+        )
+
+
+def _was_late(summary: Summary) -> bool:
+    """Whether claims are void because of what the machine did, and nobody else."""
+    claims: list[dict[str, Any]] = summary.get("claims") or []
+    undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
+    causes = [str(claim.get("why")) for claim in claims]
+    return undisturbed and any("felt after" in cause or " old" in cause for cause in causes)

@@ -1,0 +1,233 @@
+"""What the figures' axes have in common: their place, legends, lines thinned to what can be seen.
+
+Axes are placed by the inch: that takes no layout engine's time, lines the figures of a page up with
+each other, and gives the same figure the same bytes.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatter
+
+from cosim.output import palette
+from cosim.output.report.decimate import Reals, decimate
+from cosim.output.report.figure_style import NotebookFigure, printed
+
+BoundKind = Literal["certified", "identity", "printed"]
+"""What a bound rests on: a certificate, identity (I1), or a formula printed in the paper."""
+
+
+class Bound(NamedTuple):
+    """A curve that bounds what was measured."""
+
+    label: str
+    t_s: Reals
+    """(k,)"""
+    values: Reals
+    """(k,)"""
+    kind: BoundKind = "certified"
+
+
+Shown = tuple[Artist, str]
+"""What is drawn and what the legend calls it."""
+
+TIME = "time t [s]"
+
+WIDTH_IN, LEFT_IN, RIGHT_IN, BELOW_IN = 10.0, 1.15, 0.2, 0.55
+"""A figure's width; what labels and ticks take at its left, right, and below an axes."""
+_ABOVE_IN, _LEGEND_ROW_IN, _TITLE_IN, _HANDLE_IN, _CHARACTER_IN = 0.34, 0.19, 2.3, 0.6, 0.075
+
+_COLUMNS = 600
+"""Pixel columns of a panel, which lines are thinned for."""
+_MARKS, _CROWD = 120, 80
+"""Markers are wider than a pixel: fewer columns of them fill a panel, and a crowd of them is drawn
+smaller."""
+_MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
+_LARGEST = 1e150
+_LONGEST_NAME = 16
+
+_BOUND_STYLES: dict[BoundKind, tuple[palette.Colour, tuple[Any, ...]]] = {
+    # There may be several certificates, for different conditions.
+    "certified": (
+        palette.CERTIFIED, ((0, (6, 2.5)), (0, (3, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 3)))
+    ),
+    "identity": (palette.IDENTITY, ((0, (1.2, 1.4)),)),
+    "printed": (palette.PRINTED, ((0, (6, 1.5, 1, 1.5, 1, 1.5)),)),
+}  # fmt: skip
+
+
+def place(
+    figure: Figure, left_in: float, top_in: float, width_in: float, height_in: float, **shared: Any
+) -> Axes:
+    """Add axes, whose upper left corner is so far from the figure's."""
+    whole_in = figure.get_figheight()
+    bottom_in = whole_in - top_in - height_in
+    axes = figure.add_axes(
+        (left_in / WIDTH_IN, bottom_in / whole_in, width_in / WIDTH_IN, height_in / whole_in),
+        **shared,
+    )
+    factor = axes.yaxis.get_offset_text()  # ×10⁻⁶; above the axes it would meet the title
+    factor.set(x=-0.05 / width_in, horizontalalignment="right")
+    return axes
+
+
+def single(
+    height_in: float, labels: Sequence[str], beside_in: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure of one panel, or of two with a common vertical axis.
+
+    Args:
+        height_in: height of the axes.
+        labels: those of the first panel's legend, which takes room above it.
+        beside_in: width of the second panel; 0 for none.
+    """
+    width_in = WIDTH_IN - LEFT_IN - RIGHT_IN - (beside_in + 0.25 if beside_in else 0.0)
+    above_in = head_in(labels, width_in)
+    figure = NotebookFigure(figsize=(WIDTH_IN, above_in + height_in + BELOW_IN))
+    axes = [place(figure, LEFT_IN, above_in, width_in, height_in)]
+    if beside_in:
+        left_in = WIDTH_IN - RIGHT_IN - beside_in
+        axes.append(place(figure, left_in, above_in, beside_in, height_in, sharey=axes[0]))
+        axes[1].tick_params(labelleft=False, which="both")
+    return figure, axes
+
+
+def head_in(labels: Sequence[str], width_in: float = WIDTH_IN - LEFT_IN - RIGHT_IN) -> float:
+    """What title and legend take above axes so wide."""
+    rows = math.ceil(len(labels) / _legend_columns(labels, width_in))
+    return _ABOVE_IN + _LEGEND_ROW_IN * max(rows - 1, 0)
+
+
+def _legend_columns(labels: Sequence[str], width_in: float) -> int:
+    """As many as there is room for beside the title."""
+    entries_in = [_HANDLE_IN + _CHARACTER_IN * len(_MARKUP.sub("", label)) for label in labels]
+    for columns in range(len(labels), 1, -1):
+        widths_in = [max(column) for column in np.array_split(entries_in, columns)]
+        if sum(widths_in) <= width_in - _TITLE_IN:
+            return columns
+    return 1
+
+
+def legend(axes: Axes, shown: Sequence[Shown]) -> None:
+    """Put the legend above the axes at the right, where no data are."""
+    if shown:
+        handles, labels = zip(*shown, strict=True)
+        columns = _legend_columns(labels, axes.get_position().width * WIDTH_IN)
+        axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=columns)
+
+
+def finite(values: Reals, *, positive: bool = False) -> Reals:
+    """Values with NaN for what no axis can show: infinite or immense, or on a log axis not > 0."""
+    values = np.asarray(values, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        shown = np.abs(values) < _LARGEST
+        if positive:
+            shown &= values > 0
+    return np.where(shown, values, np.nan)
+
+
+def plain(name: str, longest: int = _LONGEST_NAME) -> str:
+    """A user's name as it is, not taken for mathematics, on one line short enough for a label."""
+    line = " ".join(name.split())
+    if len(line) > longest:
+        line = line[: longest - 1] + "…"
+    return line.replace("$", r"\$")
+
+
+def line(axes: Axes, t_s: Reals, values: Reals, label: str = "", **style: Any) -> list[Shown]:
+    """Draw a curve; its values are finite or NaN, and a single one shows as a dot."""
+    keep = decimate(t_s, values, _COLUMNS)
+    if len(keep) < len(t_s):
+        style.pop("drawstyle", None)  # steps between the points that are left would be untrue
+    if np.isfinite(values).sum() == 1:
+        style["marker"] = "o"
+    (drawn,) = axes.plot(t_s[keep], values[keep], **style)
+    return [(drawn, label)]
+
+
+def marks(
+    axes: Axes, t_s: Reals, values: Reals, label: str = "", size: float = 5.0, **style: Any
+) -> list[Shown]:
+    """Draw markers, smaller where there are many; named in the legend only if there are any."""
+    seen = np.isfinite(values)
+    t_s, values = t_s[seen], values[seen]
+    if not len(values):
+        return []
+    keep = decimate(t_s, values, _MARKS)
+    style["markersize"] = size * min(max(math.sqrt(_CROWD / len(keep)), 0.4), 1.0)
+    (drawn,) = axes.plot(t_s[keep], values[keep], linestyle="none", clip_on=False, **style)
+    return [(drawn, label)]
+
+
+def stems(axes: Axes, t_s: Reals, values: Reals, **style: Any) -> None:
+    """Draw a stem from 0 to each value, all of them one line."""
+    keep = decimate(t_s, values, _MARKS)
+    feet = np.column_stack([np.zeros(len(keep)), values[keep], np.full(len(keep), np.nan)])
+    axes.plot(np.repeat(t_s[keep], 3), feet.ravel(), linewidth=1.0, **style)
+
+
+def bounds(axes: Axes, curves: Sequence[Bound]) -> list[Shown]:
+    """Draw bounds, dashed, on a logarithmic axis."""
+    shown = []
+    for bound, style in zip(curves, bound_styles(curves), strict=True):
+        values = finite(bound.values, positive=True)
+        shown += line(axes, np.asarray(bound.t_s), values, bound.label, **style)
+    return shown
+
+
+def bound_styles(curves: Sequence[Bound]) -> list[dict[str, Any]]:
+    """How each bound of a figure is drawn: one colour per kind, one dash per bound of a kind."""
+    drawn: Counter[BoundKind] = Counter()
+    styles = []
+    for bound in curves:
+        colour, dashes = _BOUND_STYLES[bound.kind]
+        dash = dashes[drawn[bound.kind] % len(dashes)]
+        drawn[bound.kind] += 1
+        styles.append({"color": printed(colour), "linestyle": dash, "linewidth": 1.6})
+    return styles
+
+
+def finish(axes: Axes, t_s: Reals | None = None) -> None:
+    """Span the time, from 0 if it begins near; say where no data are, lest they be taken for zero.
+
+    Args:
+        axes: the axes, all data drawn.
+        t_s: times whose first and last the axis shows, if time is what it shows.
+    """
+    if t_s is not None and len(t_s) and t_s[-1] > t_s[0]:
+        start = 0.0 if 0 <= t_s[0] < 0.05 * t_s[-1] else t_s[0]
+        axes.set_xlim(start, t_s[-1])
+    if not np.isfinite(axes.dataLim.bounds).all():
+        axes.text(0.5, 0.5, "no data", transform=axes.transAxes, ha="center", va="center")
+        axes.tick_params(left=False, labelleft=False, which="both")
+
+
+class _Numbers(LogFormatter):
+    """Writes 0.2 and 200, but 10⁻⁵; typesetting the powers would take longer than all the rest."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        if not super().__call__(x, pos):
+            return ""
+        if 1e-3 <= x < 1e5:
+            return f"{x:g}"
+        digits, exponent = f"{x:.0e}".split("e")
+        power = "10" + str(int(exponent)).translate(_RAISED)
+        return power if digits == "1" else f"{digits}·{power}"
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def logarithmic(axes: Axes, which: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, with numbers that are easy to read."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_formatter(_Numbers())
+    axis.set_minor_formatter(_Numbers(labelOnlyBase=False, minor_thresholds=(1.2, 0.5)))

@@ -1,0 +1,89 @@
+"""Figures as files and as part of a page; the same figure gives the same bytes."""
+
+import base64
+import io
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from cosim.output.report.figure_style import GRID, INK, PAPER, settings
+
+_UNDATED: dict[str, dict[str, str | None]] = {
+    "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
+    "png": {"Software": None},
+}
+_HEAVY_CHARACTERS = 400_000
+_REFERENCE = re.compile(r"(?<=#)[^)]+")
+_TAIL = re.compile(r"(\.\d\d)\d+")
+_BY_PAGE = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as SVG or PNG, by the name's ending: the same bytes for the same figure.
+
+    Raises:
+        ValueError: another ending.
+    """
+    path.write_bytes(_drawn(figure, path.suffix.removeprefix(".")))
+
+
+def inline(figure: Figure, name: str, description: str) -> str:
+    """Return a figure as HTML: SVG whose inks are the page's, or a picture where that is heavy.
+
+    Args:
+        figure: the figure.
+        name: sets the ids inside apart from those of the page's other figures; a word.
+        description: what is to be seen, for those who cannot see it.
+    """
+    text = _page_svg(_drawn(figure, "svg"), name, description)
+    if len(text) <= _HEAVY_CHARACTERS:
+        return text
+    picture = base64.b64encode(_drawn(figure, "png")).decode()
+    image = ET.Element("img", {"src": f"data:image/png;base64,{picture}", "alt": description})
+    return ET.tostring(image, encoding="unicode")
+
+
+def _drawn(figure: Figure, kind: str) -> bytes:
+    if kind not in _UNDATED:
+        raise ValueError(f"a figure is saved as .svg or .png, not as .{kind}")
+    buffer = io.BytesIO()
+    with settings():
+        figure.savefig(buffer, format=kind, metadata=_UNDATED[kind])
+    return buffer.getvalue()
+
+
+def _page_svg(drawn: bytes, name: str, description: str) -> str:
+    root = ET.fromstring(drawn)
+    for parent in root.iter():
+        for child in list(parent):
+            if child.tag.endswith("}style"):  # it would hold for the whole page
+                parent.remove(child)
+    referred = {
+        reference
+        for element in root.iter()
+        for value in element.attrib.values()
+        for reference in _REFERENCE.findall(value)
+    }
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+        element.text = element.tail = None
+        attributes = {key.rpartition("}")[2]: value for key, value in element.attrib.items()}
+        element.attrib.clear()
+        for key, value in attributes.items():
+            if key == "id":
+                if value in referred:
+                    element.set(key, f"{name}-{value}")
+            elif key == "style":
+                for ink, own in _BY_PAGE.items():
+                    value = value.replace(ink, own)
+                element.set(key, value)
+            elif key == "d":
+                element.set(key, _TAIL.sub(r"\1", value).replace("\n", ""))
+            else:
+                element.set(key, _REFERENCE.sub(lambda found: f"{name}-{found[0]}", value))
+    view = root.attrib["viewBox"]
+    root.attrib.clear()
+    root.attrib.update({"viewBox": view, "role": "img", "aria-label": description})
+    return ET.tostring(root, encoding="unicode")

@@ -1,0 +1,103 @@
+"""How every figure looks: settings of matplotlib and colours.
+
+Nothing here touches pyplot or leaves a trace in matplotlib's global settings.
+"""
+
+import functools
+import io
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, ParamSpec
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from cosim.output.palette import Colour
+
+P = ParamSpec("P")
+Rgb = tuple[float, float, float]
+
+INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
+"""Text and frames, grid lines, background: a page puts others in their place on a dark screen."""
+
+_SETTINGS: dict[Any, Any] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": INK,
+    "axes.formatter.limits": (-4, 5),
+    "axes.formatter.use_mathtext": True,
+    "axes.facecolor": PAPER,
+    "axes.grid": True,
+    "axes.labelcolor": INK,
+    "axes.labelsize": 10,
+    "axes.linewidth": 0.8,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlecolor": INK,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titley": 1.0,
+    "figure.dpi": 100,
+    "figure.facecolor": PAPER,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 10,
+    "grid.color": GRID,
+    "grid.linewidth": 0.7,
+    "legend.borderaxespad": 0.3,
+    "legend.borderpad": 0.0,
+    "legend.columnspacing": 1.4,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "legend.labelcolor": INK,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 5,
+    "mathtext.fontset": "dejavusans",
+    "savefig.dpi": 120,  # 1200 pixels wide
+    "svg.fonttype": "path",
+    "svg.hashsalt": "noack",
+    "text.color": INK,
+    "xtick.color": INK,
+    "xtick.labelsize": 9,
+    "ytick.color": INK,
+    "ytick.labelsize": 9,
+}
+
+
+@contextmanager
+def settings() -> Iterator[None]:
+    """Draw by these settings alone, whatever the user's matplotlibrc says."""
+    with mpl.rc_context(), warnings.catch_warnings():
+        mpl.rcdefaults()
+        mpl.rcParams.update(_SETTINGS)
+        # A name may use signs that the font lacks; a box in their place is no reason to complain.
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows, although pyplot has never heard of it."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        with settings():
+            self.savefig(buffer, format="png")
+        return buffer.getvalue()
+
+
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+    """Let a function draw its figure by these settings."""
+
+    @functools.wraps(draw)
+    def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
+        with settings():
+            return draw(*arguments, **options)
+
+    return drawn
+
+
+def printed(colour: Colour) -> Rgb:
+    """A colour of the palette, as matplotlib has them."""
+    r, g, b = (part / 255 for part in colour)
+    return r, g, b

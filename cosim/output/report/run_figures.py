@@ -1,0 +1,235 @@
+"""The figures of one run, drawn from its record."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from cosim.analysis.run_summary import latency_us, lateness_us
+from cosim.output.report import signal_figures
+from cosim.output.report.axes import Bound, BoundKind
+from cosim.output.report.decimate import Reals
+from cosim.record.align import Joined, join_all
+from cosim.record.estimation_error import true_states
+from cosim.record.packet_outcomes import crossing
+from cosim.record.run_record import RunRecord
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+)
+from noack.protocol.topology import LOOP_ROLES
+
+Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
+"""A bound: label, what it bounds, times in s (k,), values (k,), what it rests on."""
+
+
+class Picture(NamedTuple):
+    """A figure and what is said about it."""
+
+    name: str
+    figure: Figure
+    caption: str
+    description: str
+    """What it shows, for those who cannot see it."""
+
+
+BOUNDED = ("errors", "state-norm", "inter-event")
+"""The figures that show certified bounds."""
+
+
+def run_figures(
+    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
+) -> Iterator[Picture]:
+    """Draw the figures of a run, as :func:`pictures` lists them."""
+    return (draw() for draw in pictures(record, envelopes, timed=timed).values())
+
+
+def pictures(
+    record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
+) -> dict[str, Callable[[], Picture]]:
+    """List the figures of a run by name; each is drawn when it is called.
+
+    Args:
+        record: the run's record, of any length, none included.
+        envelopes: certified bounds to be drawn beside what they bound.
+        timed: whether the processes' lateness means anything; in virtual time it does not.
+    """
+
+    @cache
+    def joined() -> Joined:
+        with np.errstate(all="ignore"):  # a run that diverged has figures, too
+            return join_all(record)
+
+    found = {
+        "states": lambda: _states(record, joined()),
+        "errors": lambda: _errors(record, joined(), _bounding(envelopes, "e_c")),
+        "state-norm": lambda: _state_norm(record, _bounding(envelopes, "x")),
+        "input": lambda: _input(record),
+        "inter-event": lambda: _inter_event(record, _bounding(envelopes, "inter_event")),
+    }
+    if record.kind == "live" if timed is None else timed:
+        found |= {"lateness": lambda: _lateness(record), "latency": lambda: _latency(record)}
+    return found
+
+
+def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
+    return [
+        Bound(label, t_s, values, kind)
+        for label, what, t_s, values, kind in envelopes
+        if what == quantity
+    ]
+
+
+def _states(record: RunRecord, joined: Joined) -> Picture:
+    crossed = crossing(record)
+    measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
+    events = measurements[measurements["event"] != NO_SEQUENCE]
+    dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
+    forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.rows["fate"] == Fate.FORCED])
+    scenario, names = record.scenario, record.loop.state_names
+    known = "x" if scenario.knows_state else "x̂"
+    figure = signal_figures.paper_figure(
+        mode=scenario.mode,
+        t_s=_seconds(joined.t_ns),
+        x=joined.x if scenario.knows_state else true_states(record[PLANT_STEP], joined.t_ns),
+        x_hat=None if scenario.knows_state else joined.x,
+        x_s=joined.x_s,
+        x_c=joined.x_c,
+        state_names=names,
+        broadcast_s=_seconds(events["t_ns"]),
+        dropped=dropped,
+        received_s=_seconds(deliveries["t_ns"]),
+        forced=forced,
+        title=scenario.name,
+    )
+    return Picture(
+        "states",
+        figure,
+        "States, and the time between broadcasts and between receptions. "
+        + (
+            f"x_c jumps to {known} when a packet survives, x_s when its acknowledgement does, too. "
+            if scenario.is_acknowledged
+            else f"At every event x_s jumps to {known}; x_c does so only when the packet survives. "
+        )
+        + _known(scenario)
+        + "A cross is a packet that was lost, a "
+        "diamond one that only the bound on successive drops let through.",
+        f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
+        f"{len(events)} broadcasts, of which {int(dropped.sum())} were dropped, and for "
+        f"{len(deliveries)} receptions, of which {int(forced.sum())} were forced.",
+    )
+
+
+def _known(scenario: Scenario) -> str:
+    """What the sensor knows of x, where it does not measure x itself."""
+    if scenario.knows_state:
+        return ""
+    if scenario.observer is None:
+        return "x̂ is what is measured, x with noise. "
+    outputs = "1 measured output" if scenario.outputs == 1 else f"{scenario.outputs} outputs"
+    return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
+
+
+def _errors(record: RunRecord, joined: Joined, bounds: list[Bound]) -> Picture:
+    t_s = _seconds(joined.t_ns)
+    return Picture(
+        "errors",
+        signal_figures.error_figure(
+            t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
+        ),
+        (
+            "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; while none comes, "
+            "the sensor transmits again and again. The controller's error is ‖e_c‖ = ‖x_c − x‖."
+            if record.scenario.is_acknowledged
+            else "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset whenever it passes the threshold. "
+            "The controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, "
+            "leaves it while packets are lost."
+        )
+        + ("" if record.scenario.knows_state else " Both are against x̂, what the sensor knows.")
+        + _dashed(bounds),
+        "Error norms over time on a logarithmic axis: "
+        f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
+    )
+
+
+def _state_norm(record: RunRecord, bounds: list[Bound]) -> Picture:
+    steps = record[PLANT_STEP]
+    with np.errstate(all="ignore"):
+        x_norm = np.linalg.norm(steps["x"], axis=1)
+    return Picture(
+        "state-norm",
+        signal_figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, bounds),
+        "Norm of the plant's state." + _dashed(bounds),
+        "Norm of the state over time on a logarithmic axis"
+        + (f", from {x_norm[0]:.3g} to {x_norm[-1]:.3g}." if len(x_norm) else "."),
+    )
+
+
+def _input(record: RunRecord) -> Picture:
+    steps, names = record[CONTROLLER_STEP], record.loop.input_names
+    return Picture(
+        "input",
+        signal_figures.input_figure(_seconds(steps["t_ns"]), steps["u"], names),
+        "Control input u = K x_c, held from one tick of the controller to the next. Inputs that "
+        "coincide are drawn inside each other.",
+        f"Control inputs {', '.join(names)} over time.",
+    )
+
+
+def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> Picture:
+    measurements = record[SENSOR_MEASUREMENT]
+    event_s = _seconds(measurements["t_ns"][measurements["event"] != NO_SEQUENCE])
+    return Picture(
+        "inter-event",
+        signal_figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
+        "Time between successive transmissions, over time and as a histogram."
+        + _dashed(lower_bounds),
+        "Inter-event times on a logarithmic axis"
+        + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
+    )
+
+
+def _lateness(record: RunRecord) -> Picture:
+    scenario = record.scenario
+    period_us = scenario.plant_period_ns / (1e3 * scenario.speed)
+    late_us = {role: lateness_us(record, role) for role in LOOP_ROLES}
+    longest = ", ".join(f"{role} {_largest(late)} µs" for role, late in late_us.items())
+    return Picture(
+        "lateness",
+        signal_figures.lateness_figure(late_us, period_us),
+        "Share of its steps in which a process acted at least so late. Plant and controller count "
+        "from their own deadlines, the sensor from the measurement's grid time, the network from "
+        "the event's.",
+        f"Complementary distribution of lateness on logarithmic axes; the latest: {longest}.",
+    )
+
+
+def _latency(record: RunRecord) -> Picture:
+    event_ns, taken_us = latency_us(record)
+    return Picture(
+        "latency",
+        signal_figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
+        "Wall time from the sensor's event to the controller's update, one way.",
+        f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
+    )
+
+
+def _dashed(curves: Sequence[Bound]) -> str:
+    return " Dashed: the bounds that are claimed." if curves else ""
+
+
+def _largest(values: Reals) -> str:
+    values = values[np.isfinite(values)]
+    return f"{values.max():.3g}" if len(values) else "unknown"
+
+
+def _seconds(t_ns: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Reals:
+    return np.asarray(t_ns / NS_PER_S, dtype=np.float64)

@@ -1,0 +1,380 @@
+"""The figures of a run, from plain arrays: times in seconds, one row per sample.
+
+Every function takes arrays of any length, none included, and values that are not finite, and leaves
+pyplot alone. Norms are those of the run's trigger, ‖v‖ = ‖W v‖₂. In every figure the plant is grey,
+what the sensor knows blue, what the controller knows orange; dashed curves are certified bounds.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from cosim.output import palette
+from cosim.output.report.axes import (
+    BELOW_IN,
+    LEFT_IN,
+    RIGHT_IN,
+    TIME,
+    WIDTH_IN,
+    Bound,
+    Shown,
+    bound_styles,
+    bounds,
+    finish,
+    finite,
+    head_in,
+    legend,
+    line,
+    logarithmic,
+    marks,
+    place,
+    plain,
+    single,
+    stems,
+)
+from cosim.output.report.decimate import Reals
+from cosim.output.report.figure_style import PAPER, NotebookFigure, printed, styled
+
+Flags = NDArray[np.bool_]
+
+_PLANT, _SENSOR, _CONTROLLER = map(printed, (palette.PLANT, palette.SENSOR, palette.CONTROLLER))
+_THRESHOLD, _FORCED, _LOST = map(printed, (palette.THRESHOLD, palette.FORCED, palette.LOST))
+_ERRORS = (r"$\|e_c\|$ controller", r"$\|e_s\|$ sensor", "threshold")
+_STATE = r"$\|x\|$ plant"
+_PERIOD = "one period"
+_MOST_STATES = 16
+_LONGEST_TITLE = 40
+_DECADES = 6
+_RANKS = 120
+_SHORTEST_US = 0.1  # a logarithmic axis has no zero
+_DASHES: tuple[Any, ...] = ("-", (0, (6, 1.5)), (0, (2, 1.2)), (0, (6, 1.5, 1.5, 1.5)))
+
+
+@styled
+def paper_figure(
+    *,
+    mode: Literal["model", "zoh"],
+    t_s: Reals,
+    x: Reals,
+    x_s: Reals,
+    x_c: Reals,
+    state_names: Sequence[str],
+    broadcast_s: Reals,
+    dropped: Flags,
+    received_s: Reals,
+    forced: Flags,
+    title: str = "",
+    x_hat: Reals | None = None,
+) -> Figure:
+    """States above, broadcasting and receiving intervals below: the paper's Fig. 2 and 3.
+
+    Args:
+        mode: model is the paper's MB-ET (Fig. 2), zoh its ZOH-ET (Fig. 3).
+        t_s: (k,) times of the samples.
+        x: (k, n) the plant's state.
+        x_s: (k, n) the sensor's model.
+        x_c: (k, n) the controller's model; NaN where unknown.
+        state_names: n names; the first 16 states are drawn.
+        broadcast_s: (e,) times t_i of all transmissions.
+        dropped: (e,) which of them the network lost.
+        received_s: (d,) times t_i* of those that the controller received.
+        forced: (d,) which of them only the bound on successive dropouts let through.
+        title: what the run was, shown after "MB-ET" or "ZOH-ET".
+        x_hat: (k, n) what the sensor takes for x; None where that is x itself.
+    """
+    n = len(state_names)
+    drawn = min(n, _MOST_STATES)
+    columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
+    rows = math.ceil(drawn / columns)
+    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, head_in(())
+    width_in = (WIDTH_IN - RIGHT_IN) / columns - LEFT_IN
+    # A last row that is not full leaves room for the numbers of the time axes above its gap.
+    gaps_in = [0.22] * (rows - 2) + [0.22 if drawn % columns == 0 else BELOW_IN] * (rows > 1)
+    tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
+    above_in = tops_in[-1] + height_in + BELOW_IN + head
+    below_in = above_in + interval_in + head
+    figure = NotebookFigure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
+    for i in range(drawn):
+        row, column = divmod(i, columns)
+        left_in = LEFT_IN + column * (LEFT_IN + width_in)
+        axes = place(figure, left_in, tops_in[row], width_in, height_in)
+        known = None if x_hat is None else x_hat[:, i]
+        shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
+        axes.set_ylabel(plain(state_names[i]))
+        axes.tick_params(labelbottom=i + columns >= drawn)
+        axes.set_xlabel(TIME if i + columns >= drawn else "")
+        finish(axes, t_s)
+    _heading(figure, mode, title, f"{drawn} of {n} states" if drawn < n else "", shown)
+    whole_in = WIDTH_IN - LEFT_IN - RIGHT_IN
+    above = place(figure, LEFT_IN, above_in, whole_in, interval_in)
+    below = place(figure, LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above)
+    _broadcasts(above, broadcast_s, dropped)
+    _receptions(below, received_s, forced, broadcast_s[dropped])
+    above.tick_params(labelbottom=False)
+    for axes in (above, below):
+        axes.set_ylabel("interval [s]")
+        axes.set_ylim(bottom=0)
+        finish(axes, t_s)
+    below.set_xlabel(TIME)
+    figure.align_ylabels()
+    return figure
+
+
+def _state(
+    axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals, x_hat: Reals | None
+) -> list[Shown]:
+    """Draw one state; what comes later is thinner, so that curves that coincide stay visible."""
+    plant = line(axes, t_s, finite(x), "$x$ plant", color=_PLANT, linewidth=4.2)
+    controller = line(axes, t_s, finite(x_c), "$x_c$ controller", color=_CONTROLLER, linewidth=2.4)
+    sensor = line(axes, t_s, finite(x_s), "$x_s$ sensor", color=_SENSOR, linewidth=1.3)
+    known: list[Shown] = []
+    if x_hat is not None:
+        style: dict[str, Any] = {"color": _SENSOR, "linewidth": 1.0, "linestyle": (0, (1, 1))}
+        known = line(axes, t_s, finite(x_hat), r"$\hat{x}$ sensor", **style)
+    return [*plant, *known, *sensor, *controller]
+
+
+def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[Shown]) -> None:
+    """Write title and legend above all states, which may be too narrow to bear them."""
+    head = "MB-ET" if mode == "model" else "ZOH-ET"
+    text = ": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + (
+        f" ({note})" if note else ""
+    )
+    y = 1 - 0.09 / figure.get_figheight()
+    figure.text(LEFT_IN / WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
+    handles, labels = zip(*shown, strict=True)
+    corner = (1 - RIGHT_IN / WIDTH_IN, 1 - 0.06 / figure.get_figheight())
+    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=len(labels))
+
+
+def _broadcasts(axes: Axes, t_s: Reals, dropped: Flags) -> None:
+    interval_s = _intervals(t_s)
+    stems(axes, t_s, interval_s, color=_SENSOR)
+    lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 6.5, "markeredgewidth": 1.8}
+    shown = marks(axes, t_s[~dropped], interval_s[~dropped], "sent", color=_SENSOR, marker="o")
+    shown += marks(axes, t_s[dropped], interval_s[dropped], "sent, lost", **lost)
+    axes.set_title("Broadcasting intervals")
+    legend(axes, shown)
+
+
+def _receptions(axes: Axes, t_s: Reals, forced: Flags, dropped_s: Reals) -> None:
+    interval_s = _intervals(t_s)
+    stems(axes, t_s, interval_s, color=_CONTROLLER)
+    diamond: dict[str, Any] = {"color": _FORCED, "marker": "D", "size": 6.0}
+    lost: dict[str, Any] = {"color": _LOST, "marker": "x", "size": 5.0, "zorder": 3}
+    free = ~forced
+    shown = marks(axes, t_s[free], interval_s[free], "received", color=_CONTROLLER, marker="o")
+    shown += marks(axes, t_s[forced], interval_s[forced], "received, forced", **diamond)
+    shown += marks(axes, dropped_s, np.zeros(len(dropped_s)), "lost", **lost)
+    axes.set_title("Receiving intervals")
+    legend(axes, shown)
+
+
+def _intervals(t_s: Reals) -> Reals:
+    """Time since the one before, NaN for the first: (k,)."""
+    return np.diff(t_s, prepend=np.nan)
+
+
+@styled
+def error_figure(
+    t_s: Reals,
+    e_s_norm: Reals,
+    threshold: Reals,
+    e_c_norm: Reals,
+    envelopes: Sequence[Bound] = (),
+) -> Figure:
+    """‖e_s‖ with its threshold, and ‖e_c‖ with what bounds it, on a logarithmic axis.
+
+    Args:
+        t_s: (k,) times of the samples.
+        e_s_norm: (k,) ‖x_s − x‖ before a reset, as the trigger tested it.
+        threshold: (k,) what it was tested against.
+        e_c_norm: (k,) ‖x_c − x‖; NaN where unknown.
+        envelopes: certified bounds on ‖e_c‖.
+    """
+    labels = [*_ERRORS, *(label for label, *_ in envelopes)]
+    figure, (axes,) = single(2.7, labels)
+    logarithmic(axes, "y")
+    shown = []
+    for label, values, colour, width in zip(
+        _ERRORS,
+        (e_c_norm, e_s_norm, threshold),
+        (_CONTROLLER, _SENSOR, _THRESHOLD),
+        (2.6, 1.1, 1.8),
+        strict=True,
+    ):
+        style = {"color": colour, "linewidth": width}
+        shown += line(axes, t_s, finite(values, positive=True), label, **style)
+    shown += bounds(axes, envelopes)
+    measured = np.concatenate([e_s_norm, e_c_norm, threshold])
+    return _norms(figure, axes, t_s, measured, "Error norms", shown)
+
+
+@styled
+def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()) -> Figure:
+    """‖x‖ with what bounds it, on a logarithmic axis.
+
+    Args:
+        t_s: (k,) times of the samples.
+        x_norm: (k,) ‖x‖.
+        envelopes: certified bounds on ‖x‖.
+    """
+    figure, (axes,) = single(2.1, [_STATE, *(label for label, *_ in envelopes)])
+    logarithmic(axes, "y")
+    style = {"color": _PLANT, "linewidth": 2.4}
+    shown = line(axes, t_s, finite(x_norm, positive=True), _STATE, **style)
+    shown += bounds(axes, envelopes)
+    return _norms(figure, axes, t_s, x_norm, "Norm of the state", shown)
+
+
+def _norms(
+    figure: Figure, axes: Axes, t_s: Reals, measured: Reals, title: str, shown: list[Any]
+) -> Figure:
+    """Label a figure of norms; near what was measured, for a reset goes down to rounding."""
+    legend(axes, shown)
+    axes.set(title=title, xlabel=TIME, ylabel="norm")
+    finish(axes, t_s)
+    seen = finite(measured, positive=True)
+    seen = seen[np.isfinite(seen)]
+    if len(seen):
+        decade = math.floor(math.log10(seen.max()))
+        low, high = axes.get_ylim()
+        axes.set_ylim(max(low, 10.0 ** (decade - _DECADES)), min(high, 10.0 ** (decade + _DECADES)))
+    return figure
+
+
+@styled
+def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
+    """Control inputs, held from one to the next.
+
+    Args:
+        t_s: (k,) times from which each is held.
+        u: (k, m) inputs.
+        input_names: m names.
+    """
+    m = len(input_names)
+    names = [plain(name) for name in input_names]
+    figure, (axes,) = single(1.7, names)
+    shown = []
+    for i, name in enumerate(names):
+        style = {
+            "color": printed(palette.SERIES[i % len(palette.SERIES)]),
+            "linestyle": _DASHES[i // len(palette.SERIES) % len(_DASHES)],
+            # Inputs often coincide: the first ones, wider, stay visible beneath the last.
+            "linewidth": 1.3 + 2.6 * (m - 1 - i) / m,
+            "drawstyle": "steps-post",
+        }
+        shown += line(axes, t_s, finite(u[:, i]), name, **style)
+    legend(axes, shown)
+    axes.set(title=r"Control input $u = K x_c$", xlabel=TIME, ylabel="input")
+    finish(axes, t_s)
+    return figure
+
+
+@styled
+def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = None) -> Figure:
+    """Share of steps that were later than so much, per process.
+
+    Args:
+        lateness_us: by process, (k,) lateness of each of its steps in wall µs.
+        period_us: the plant's period in wall µs, beyond which a step counts as late.
+    """
+    figure, (axes,) = single(2.5, [*lateness_us, _PERIOD])
+    logarithmic(axes, "x")
+    logarithmic(axes, "y")
+    shown = []
+    for i, (process, late_us) in enumerate(lateness_us.items()):
+        colour = palette.PROCESSES.get(process, palette.SERIES[i % len(palette.SERIES)])
+        style = {"color": printed(colour), "linestyle": _DASHES[i % len(_DASHES)], "linewidth": 1.8}
+        (drawn,) = axes.plot(*_later_than(late_us), drawstyle="steps-pre", **style)
+        shown.append((drawn, plain(process)))
+    finish(axes)
+    if period_us is not None:
+        rule = axes.axvline(period_us, color=_THRESHOLD, linewidth=1.2, linestyle=(0, (4, 3)))
+        shown.append((rule, _PERIOD))
+    legend(axes, shown)
+    axes.set(
+        title="Lateness", xlabel="lateness [wall µs]", ylabel="share of steps at least as late"
+    )
+    return figure
+
+
+def _later_than(values: Reals) -> tuple[Reals, Reals]:
+    """Values, ascending, and the share of all that reach each of them."""
+    values = finite(values)
+    values = np.maximum(np.sort(values[np.isfinite(values)]), _SHORTEST_US)
+    k = len(values)
+    if not k:
+        return values, values
+    # The k-th largest is reached by k: as many points in every decade of shares, and the median's.
+    rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
+    rank = np.unique(rank.round().astype(np.intp))[::-1]
+    return values[k - rank], rank / k
+
+
+@styled
+def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) -> Figure:
+    """Time from the sensor's event to the controller's update, one way.
+
+    Args:
+        t_s: (d,) event times of the updates that arrived.
+        latency_us: (d,) wall µs until the controller had taken them.
+        until_s: the run's length, if the axis is to show all of it.
+    """
+    figure, axes = _over_time(t_s, latency_us, _CONTROLLER, [], until_s)
+    axes.set(title="Latency, event to update", ylabel="latency [wall µs]")
+    return figure
+
+
+@styled
+def inter_event_figure(
+    broadcast_s: Reals, lower_bounds: Sequence[Bound] = (), until_s: float | None = None
+) -> Figure:
+    """Inter-event times t_i − t_{i−1} over time, and how often each occurs.
+
+    Args:
+        broadcast_s: (e,) times t_i of all transmissions.
+        lower_bounds: certified or printed bounds on the inter-event time.
+        until_s: the run's length, if the axis is to show all of it.
+    """
+    intervals_s = np.diff(broadcast_s)
+    figure, axes = _over_time(broadcast_s[1:], intervals_s, _SENSOR, lower_bounds, until_s)
+    axes.set(title="Inter-event times", ylabel="inter-event time [s]")
+    return figure
+
+
+def _over_time(
+    t_s: Reals,
+    values: Reals,
+    colour: Any,
+    lower_bounds: Sequence[Bound],
+    until_s: float | None,
+) -> tuple[Figure, Axes]:
+    """Draw values over time, and beside it their histogram on the same logarithmic axis."""
+    values = finite(values, positive=True)
+    figure, (axes, beside) = single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
+    logarithmic(axes, "y")
+    shown = bounds(axes, lower_bounds)
+    marks(axes, t_s, values, color=colour, marker="o", markeredgecolor=PAPER, markeredgewidth=0.5)
+    legend(axes, shown)
+    seen = values[np.isfinite(values)]
+    if len(seen):
+        low, high = math.log10(seen.min()), math.log10(seen.max())
+        margin = max(0.05 * (high - low), 0.02)
+        bins = np.logspace(low - margin, high + margin, 31).tolist()
+        beside.hist(seen, bins, orientation="horizontal", color=colour, rwidth=0.9)
+    finish(axes, None if until_s is None else np.array([0.0, t_s.max(initial=until_s)]))
+    finish(beside)
+    for bound, style in zip(lower_bounds, bound_styles(lower_bounds), strict=True):
+        if len(bound.values):
+            beside.axhline(float(np.min(bound.values)), **style)
+    axes.set_xlabel(TIME)
+    beside.set_xlabel("count")
+    beside.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
+    return figure, axes

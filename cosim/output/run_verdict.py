@@ -1,0 +1,119 @@
+"""What a person sees at the end of a run: a verdict of three lines, a table, where the rest is."""
+
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
+
+from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import Summary
+from cosim.output.remarks import remarks
+from cosim.output.run_tables import number_table, print_details, short_numbers
+from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
+from noack.core.errors import ExitStatus
+from noack.runtime.process_life import HORIZON
+
+GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
+_CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
+"""What may become of a claim that did not hold, and how it looks; the worst first."""
+
+
+class Line(NamedTuple):
+    """A line of the verdict."""
+
+    text: str
+    style: str
+    """A style of rich."""
+
+
+def verdict(summary: Summary) -> tuple[Line, Line, Line]:
+    """How far the run came, its transmissions against the ideal loop's, its claims."""
+    return _ending(summary), Line(_transmissions(summary), NEUTRAL), _claims(summary)
+
+
+def _ending(summary: Summary) -> Line:
+    end, reached = summary["exit"], f"{summary['reached_s']:g} s"
+    if end["status"] == ExitStatus.OK:
+        return Line(
+            f"completed {reached}" + ("" if end["reason"] == HORIZON else f": {end['reason']}"),
+            GOOD,
+        )
+    style = BAD if end["status"] == ExitStatus.FAILED else DOUBTFUL
+    return Line(f"not completed: {end['reason']} ({reached} of {summary['horizon_s']:g} s)", style)
+
+
+def _transmissions(summary: Summary) -> str:
+    ideal = (summary.get("fidelity") or {}).get("events_ideal")
+    beside = "" if ideal is None else f" (ideal loop: {ideal})"
+    return f"{summary['events']} transmissions{beside}, {summary['deliveries']} delivered"
+
+
+def _claims(summary: Summary) -> Line:
+    """How many claims held; the others by what became of them, with the first reason."""
+    claims = summary.get("claims") or []
+    if not claims:
+        return Line("claims: none", NEUTRAL)
+    counts = Counter(claim["verdict"] for claim in claims)
+    parts, style = [f"claims: {counts['held']} of {len(claims)} held"], GOOD
+    for name, colour in _CLAIMS.items():
+        if counts[name]:
+            style = colour if style == GOOD else style
+            parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
+    return Line(", ".join(parts), style)
+
+
+def _reason(claims: list[dict[str, str]], name: str) -> str:
+    if name == "not applicable":
+        return " (assumption not met)"
+    why = next((claim["why"] for claim in claims if claim["verdict"] == name and claim["why"]), "")
+    return f" ({why})" if why else ""
+
+
+def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) -> None:
+    """Print the verdict, the key numbers, what else a person should know, where the rest is.
+
+    Args:
+        console: where to.
+        outcome: of the run.
+        verbose: print all tables instead of the key numbers.
+    """
+    summary = outcome.summary
+    for line in verdict(summary):
+        console.print(Text(line.text, line.style), soft_wrap=True)
+    if verbose:
+        print_details(console, summary)
+    else:
+        console.print(number_table(summary, short_numbers(summary)))
+    for remark in remarks(summary):
+        start = f"[{BAD}]" if remark.severe else "[bold yellow]warning:[/] "
+        console.print(start + escape(remark.text), highlight=False, soft_wrap=True)
+    for where in _where(outcome, verbose=verbose):
+        console.print(where, highlight=False, soft_wrap=True, markup=False)
+
+
+def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
+    """Where there is more: the files of a run, or one line with the nearest way to them."""
+    run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
+    if not verbose:
+        page = f"{report} and " if report.is_file() else ""
+        yield f"more: {page}{_program()} summary {run_dir} --verbose"
+        return
+    yield f"run directory  {run_dir}"
+    if report.is_file():
+        yield f"report         {report}"
+    yield f"view           {_program()} view {run_dir / RECORDING_FILE}"
+
+
+def _program() -> str:
+    """How the person called us, so that the next command can be typed alike."""
+    program = Path(sys.argv[0])
+    if shutil.which(program.name) == str(program):
+        return program.name
+    inside = program.is_absolute() and program.is_relative_to(Path.cwd())
+    return str(program.relative_to(Path.cwd()) if inside else program)

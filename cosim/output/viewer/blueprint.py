@@ -1,0 +1,247 @@
+"""The layout of a run's recording: which panels a person sees, in which order and colours.
+
+Entities of the recording, all on the timeline ``t`` (simulated time since the run's epoch):
+
+========================  =================================================================
+``about``                 Markdown text about the run (static)
+``state/<name>``          x, x_s, x_c of one coordinate (3 scalars)
+``error/norm``            bound of ‖e_c‖ from (I1), ‖e_s‖, threshold, ‖e_c‖ (4 scalars)
+``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
+``size/log10``            ‖x‖ and its certified bound as decimal logarithms (2 scalars)
+``input``                 u = K x_c (m scalars)
+``event/interval``        t_i − t_{i−1} in seconds, at every broadcast
+``event/stem``            its stem: 0, interval, NaN
+``event/certified``       the certified least interval, at the start and the end of the run
+``reception/interval``    the same between deliveries the loss model let through
+``reception/forced``      the same for deliveries forced by the bound on successive dropouts
+``reception/stem``        the stems of both
+``drop``                  0 at every dropped update
+``lateness/<process>``    lateness in microseconds
+``log``                   text
+``picture/…``             the plant, as a picture that moves (``cosim/output/viewer/pictures/``)
+``network/…``             the loop's processes, and packets under way
+``key/…``                 which colour is what
+========================  =================================================================
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+from uuid import UUID
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from cosim.output.palette import (
+    CERTIFIED,
+    CONTROLLER,
+    IDENTITY,
+    LOST,
+    PLANT,
+    PROCESSES,
+    SENSOR,
+    SERIES,
+    THRESHOLD,
+    Colour,
+)
+from cosim.output.palette import FORCED as FORCED_COLOUR
+from cosim.output.viewer.colour_key import ColourKey, input_colour
+from cosim.output.viewer.pictures.network_picture import Diagram
+from cosim.output.viewer.pictures.picture import TIMELINE, Picture, panel
+
+ABOUT = "about"
+ERROR = "error/norm"
+ERROR_LOG10 = "error/log10"
+SIZE_LOG10 = "size/log10"
+INPUT = "input"
+EVENT, EVENT_STEM, EVENT_CERTIFIED = "event/interval", "event/stem", "event/certified"
+RECEPTION, FORCED, RECEPTION_STEM = "reception/interval", "reception/forced", "reception/stem"
+DROP = "drop"
+LOG = "log"
+
+_PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
+_BEFORE, _AFTER = 0.02, 0.06
+"""Room beside the run on a time axis, as shares of its length."""
+_GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
+"""Id of rerun's own view that holds what linked views share."""
+
+
+def state_path(name: str) -> str:
+    """Entity of one state coordinate, its name escaped."""
+    return f"state/{rr.escape_entity_path_part(name)}"
+
+
+def lateness_path(process: str) -> str:
+    """Entity of one process's lateness, its name escaped."""
+    return f"lateness/{rr.escape_entity_path_part(process)}"
+
+
+def styles(
+    state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
+) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
+    """Name, colour and width of every series, by entity; logged once as static data."""
+    triple = rr.SeriesLines(
+        names=["x plant", "x_s sensor model", "x_c controller model"],
+        colors=[PLANT, SENSOR, CONTROLLER],
+        widths=[4.5, 1.5, 1.5],
+    )
+    # What comes later is drawn above: ‖e_c‖ is often equal to its bound, and stays visible on it.
+    errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
+    colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
+    widths = [3.5, 1.5, 2.0, 1.5, 2.0]
+    found: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
+        state_path(name): triple for name in state_names
+    }
+    found[ERROR] = rr.SeriesLines(names=errors[:4], colors=colours[:4], widths=widths[:4])
+    found[ERROR_LOG10] = rr.SeriesLines(names=errors, colors=colours, widths=widths)
+    found[SIZE_LOG10] = rr.SeriesLines(
+        names=["‖x‖ plant", "certified"], colors=[PLANT, CERTIFIED], widths=[2.5, 2.0]
+    )
+    found[EVENT_CERTIFIED] = rr.SeriesLines(
+        names="certified least interval", colors=CERTIFIED, widths=1.5
+    )
+    m = len(input_names)
+    found[INPUT] = rr.SeriesLines(
+        names=list(input_names),
+        colors=[input_colour(i) for i in range(m)],
+        # Inputs often coincide: the first ones, wider, stay visible beneath the last.
+        widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
+    )
+    found[EVENT_STEM] = _stem("broadcast", SENSOR)
+    found[EVENT] = _mark("broadcast", SENSOR, "circle", 4.0)
+    found[RECEPTION_STEM] = _stem("received", CONTROLLER)
+    found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
+    found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
+    found[DROP] = _mark("lost", LOST, "cross", 5.0)
+    for i, process in enumerate(processes):
+        found[lateness_path(process)] = rr.SeriesLines(
+            names=process,
+            colors=PROCESSES.get(process, SERIES[i % len(SERIES)]),
+            widths=1.5,
+            aggregation_policy="Max",
+        )
+    return found
+
+
+def _stem(name: str, colour: Colour) -> rr.SeriesLines:
+    return rr.SeriesLines(names=name, colors=colour, widths=1.5, aggregation_policy="Off")
+
+
+def _mark(
+    name: str,
+    colour: Colour,
+    marker: Literal["circle", "cross", "diamond"],
+    size: float,
+) -> rr.SeriesPoints:
+    return rr.SeriesPoints(names=name, colors=colour, markers=marker, marker_sizes=size)
+
+
+def layout(
+    state_names: Sequence[str],
+    input_names: Sequence[str],
+    processes: Sequence[str],
+    horizon_s: float,
+    *,
+    picture: Picture | None = None,
+    diagram: Diagram | None = None,
+) -> rrb.Blueprint:
+    """Lay out the panels: picture and packets on the left, above words; curves on the right.
+
+    Without a picture or diagram, the curves have the place to themselves. Plots have no legend of
+    their own, which would cover them: the colours are named in a panel beside them.
+    """
+    intervals = rrb.Horizontal(
+        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
+        _plot(
+            "Receiving intervals [s]",
+            "reception",
+            [RECEPTION_STEM, RECEPTION, FORCED, DROP],
+        ),
+    )
+    norms = rrb.Tabs(
+        _plot("log10 ‖e‖", ERROR_LOG10),
+        _plot("‖e‖", ERROR),
+        _plot("log10 ‖x‖", SIZE_LOG10),
+    )
+    inputs = _plot("Control input u = K x_c", INPUT)
+    words = rrb.Tabs(
+        ColourKey(input_names).panel(),
+        rrb.TextDocumentView(origin=ABOUT, name="About this run"),
+        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
+        rrb.TextLogView(
+            origin=LOG,
+            name="Log",
+            # The column of times is as narrow as its title, "t": the text says the time.
+            columns=rrb.TextLogColumns(
+                timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
+                text_log_columns=["loglevel", "body"],
+            ),
+            format_options=rrb.TextLogFormat(monospace_body=True),
+        ),
+    )
+    states = _states(state_names)
+    drawings = [
+        *([] if picture is None else [panel(picture)]),
+        *([] if diagram is None else [diagram.panel()]),
+    ]
+    if drawings:
+        shares = [4, 3, 3][: len(drawings)]
+        curves = rrb.Vertical(
+            states, rrb.Horizontal(norms, inputs), intervals, row_shares=[2, 1, 1]
+        )
+        whole = rrb.Horizontal(
+            rrb.Vertical(*drawings, words, row_shares=[*shares, 3.6]), curves, column_shares=[1, 1]
+        )
+    else:
+        whole = rrb.Horizontal(
+            rrb.Vertical(states, intervals, row_shares=[2, 1]),
+            rrb.Vertical(norms, inputs, words),
+            column_shares=[2, 1],
+        )
+    return rrb.Blueprint(
+        rrb.Horizontal(whole, _common_time_axis(horizon_s)),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        collapse_panels=True,
+    )
+
+
+def _states(names: Sequence[str]) -> rrb.Container:
+    """One panel for each coordinate: all at once up to four, in tabs of equal size beyond."""
+    most = _PAGE_OF_FEW if len(names) <= _MANY else _PAGE_OF_MANY
+    size = math.ceil(len(names) / math.ceil(len(names) / most))
+    pages = [names[i : i + size] for i in range(0, len(names), size)]
+    return _page(pages[0]) if len(pages) == 1 else rrb.Tabs(*map(_page, pages))
+
+
+def _page(names: Sequence[str]) -> rrb.Container:
+    title = names[0] if len(names) == 1 else f"{names[0]} … {names[-1]}"
+    crowded = len(names) > _PAGE_OF_FEW
+    panels = [_plot(f"State {name}", state_path(name)) for name in names]
+    if len(panels) < _PAGE_OF_FEW:
+        return rrb.Vertical(*panels, name=title)
+    return rrb.Grid(*panels, grid_columns=3 if crowded else 2, name=title)
+
+
+def _common_time_axis(horizon_s: float) -> rrb.View:
+    """Give what all plots show at first: the whole run, with room for marks and tick labels.
+
+    The viewer keeps the common range with a view of its own, which is known by its id.
+    """
+    start, end = (
+        rr.TimeRangeBoundary.absolute(seconds=share * horizon_s) for share in (-_BEFORE, 1 + _AFTER)
+    )
+    whole_run = rr.TimeRange(start=start, end=end)
+    view = rrb.TimeSeriesView(visible=False, axis_x=rrb.TimeAxis(view_range=whole_run))
+    view.id = _GLOBAL_VIEW
+    return view
+
+
+def _plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
+    """One time series; all share the time axis, so that zooming one zooms all."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=[path if path.startswith("$") else f"/{path}" for path in contents],
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend(visible=False),
+    )

@@ -1,0 +1,91 @@
+"""The key to the colours: one panel beside the plots, instead of a legend that covers each."""
+
+from collections.abc import Mapping, Sequence
+
+import rerun.blueprint as rrb
+
+from cosim.output.palette import (
+    CERTIFIED,
+    CONTROLLER,
+    FORCED,
+    IDENTITY,
+    LOST,
+    NETWORK,
+    PLANT,
+    SENSOR,
+    SERIES,
+    THRESHOLD,
+    Colour,
+)
+from cosim.output.viewer.pictures.picture import Shape, label, lines
+
+COLOUR_KEY = "key"
+"""What all entities of the key are below."""
+
+_WIDE, _HIGH = 18.0, 1.2
+_MOST_IN_A_ROW = 6
+_HALF, _THICK = 0.7, 0.16
+_DIAMOND = ((0.0, 0.3), (0.2, 0.1), (0.0, -0.1), (-0.2, 0.1), (0.0, 0.3))
+_CROSS = ((-0.16, 0.26), (0.16, -0.06), (0.0, 0.1), (0.16, 0.26), (-0.16, -0.06))
+_STROKE = ((-_HALF, 0.0), (_HALF, 0.0))
+_Entry = tuple[str, Colour, Sequence[tuple[float, float]]]
+"""Name, colour, line of the sample."""
+_ROWS: tuple[tuple[_Entry, ...], ...] = (
+    (
+        ("plant: x", PLANT, _STROKE),
+        ("sensor: x_s, ‖e_s‖, sent", SENSOR, _STROKE),
+        ("controller: x_c, ‖e_c‖, received", CONTROLLER, _STROKE),
+    ),
+    (
+        ("threshold", THRESHOLD, _STROKE),
+        ("bound from (I1)", IDENTITY, _STROKE),
+        ("certified bound", CERTIFIED, _STROKE),
+    ),
+    (
+        ("lost", LOST, _CROSS),
+        ("received, forced", FORCED, _DIAMOND),
+        ("network", NETWORK, _STROKE),
+    ),
+)
+
+
+def input_colour(i: int) -> Colour:
+    """Colour of the i-th control input."""
+    return SERIES[i % len(SERIES)]
+
+
+class ColourKey:
+    """Samples of lines and marks in rows, each above its name.
+
+    Args:
+        input_names: of the control inputs; a single one needs no entry.
+    """
+
+    def __init__(self, input_names: Sequence[str]) -> None:
+        names = input_names if len(input_names) > 1 else ()
+        inputs = [(name, input_colour(i), _STROKE) for i, name in enumerate(names)]
+        self._rows = [
+            *_ROWS,
+            *(inputs[i : i + _MOST_IN_A_ROW] for i in range(0, len(inputs), _MOST_IN_A_ROW)),
+        ]
+
+    def panel(self) -> rrb.Spatial2DView:
+        """The view of the key."""
+        return rrb.Spatial2DView(
+            origin=COLOUR_KEY,
+            name="Colours",
+            visual_bounds=rrb.VisualBounds2D(
+                x_range=[0.0, _WIDE], y_range=[-0.4, len(self._rows) * _HIGH]
+            ),
+        )
+
+    def scenery(self) -> Mapping[str, Shape]:
+        """The samples and names, by entity."""
+        found: dict[str, Shape] = {}
+        for i, row in enumerate(self._rows):
+            for j, (name, colour, sample) in enumerate(row):
+                x, y = (j + 0.5) * _WIDE / len(row), -i * _HIGH
+                moved = [(x + dx, y + dy) for dx, dy in sample]
+                found[f"{i}/{j}/sample"] = lines([moved], colour, _THICK)
+                found[f"{i}/{j}/name"] = label(name, (x, y - 0.2), colour)
+        return found

@@ -1,0 +1,235 @@
+"""The loop as a diagram, in which every update is seen to travel, to arrive, or to be lost.
+
+A real flight takes microseconds. It is drawn as if each leg took ``LEG_S`` of simulated time, so
+that it can be followed at the speed of the run: a dot leaves the sensor at the broadcast, and what
+is to be seen of the delivery in the states comes before the dot arrives.
+"""
+
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from cosim.output.palette import CONTROLLER, FORCED, LOST, NETWORK, PLANT, SENSOR
+from cosim.output.viewer.pictures.picture import STILL, Columns, Shape, label, lines, style, upright
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import Fate, effective
+
+DIAGRAM = "network"
+LEG_S = 0.15
+"""Simulated time that a packet is drawn to take from the sensor to the network, and onward."""
+_FALL_S = 0.45
+_APART_S = 0.025
+_LEG_NS, _FALL_NS, _APART_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _APART_S))
+_FRAME_NS = round(NS_PER_S / 60)
+
+_APART = 4.4
+_BOXES = {name: i * _APART for i, name in enumerate(("plant", "sensor", "network", "controller"))}
+_, _SENSOR, _NETWORK, _CONTROLLER = _BOXES.values()
+_HALF_WIDE, _HALF_HIGH = 1.6, 0.62
+_BACK = -0.4
+"""Acknowledgements go back a little below the updates."""
+_LOW = -2.5
+_SIZE = 0.17
+
+Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
+
+class Moving(NamedTuple):
+    """What becomes of one entity: columns of rows at times (r,)."""
+
+    t_ns: Times
+    columns: Columns
+
+
+class _Flying(NamedTuple):
+    """Packets that are under way, in the drawing (p,)."""
+
+    t_ns: Times
+    out_ns: Times
+    """When they leave the network; of those that are lost, when they begin to fall."""
+    fate: NDArray[np.int64]
+    back: NDArray[np.bool_]
+    """Whether they go from the controller to the sensor."""
+
+    @property
+    def end_ns(self) -> Times:
+        """When nothing more is to be seen of them."""
+        return self.out_ns + np.where(effective(self.fate), _LEG_NS, _FALL_NS)
+
+    def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "_Flying":
+        """Some of them."""
+        return _Flying(self.t_ns[which], self.out_ns[which], self.fate[which], self.back[which])
+
+
+_NONE = np.zeros(0, np.int64)
+
+
+class Diagram:
+    """Boxes, the ways between them, and packets.
+
+    Args:
+        acknowledged: whether packets also go back.
+    """
+
+    def __init__(self, *, acknowledged: bool = False) -> None:
+        self._acknowledged = acknowledged
+        self._flying = _Flying(_NONE, _NONE, _NONE, np.zeros(0, np.bool_))
+        self._drawn_ns = -1
+        self._last_ns = {False: -_APART_NS, True: -_APART_NS}
+        self._shown: dict[str, int] = {}
+
+    @staticmethod
+    def panel() -> rrb.Spatial2DView:
+        """The view of the diagram."""
+        return rrb.Spatial2DView(
+            origin=DIAGRAM,
+            name=f"Packets (drawn {LEG_S:g} s a leg)",
+            visual_bounds=rrb.VisualBounds2D(
+                x_range=[-1.9, _CONTROLLER + 1.9], y_range=[-1.7, -_LOW + 0.6]
+            ),
+        )
+
+    def scenery(self) -> Mapping[str, Shape]:
+        """Boxes, arrows, words, and how packets look."""
+        colours = [PLANT, SENSOR, NETWORK, CONTROLLER]
+        found: dict[str, Shape] = {}
+        words = ("plant x", "sensor x_s", "network", "controller x_c")
+        for text, (name, x), colour in zip(words, _BOXES.items(), colours, strict=True):
+            found[f"box/{name}"] = rr.Boxes2D(
+                centers=[[x, 0.0]], half_sizes=[[_HALF_WIDE, _HALF_HIGH]], radii=0.04,
+                colors=colour,
+            )  # fmt: skip
+            found[f"box/{name}/word"] = label(text, (x, 0.28), colour)
+        ways = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
+        if self._acknowledged:
+            ways += [
+                _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _BACK)
+                for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
+            ]
+        found["ways"] = lines([line for way in ways for line in way], STILL, 0.03)
+        home = [(_CONTROLLER, -_HALF_HIGH), (_CONTROLLER, _LOW), (0.0, _LOW), (0.0, -_HALF_HIGH)]
+        head = [(-0.14, -_HALF_HIGH - 0.2), (0.0, -_HALF_HIGH), (0.14, -_HALF_HIGH - 0.2)]
+        found["input"] = lines([home, head], STILL, 0.03)
+        found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
+        found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
+        found["forced/word"] = label("forced through", (_NETWORK + _APART / 2, 1.55), FORCED)
+        for entity, colour in (
+            ("broadcast", SENSOR), ("delivered", CONTROLLER), ("acknowledgement", NETWORK),
+        ):  # fmt: skip
+            found[entity] = rr.Points2D.from_fields(
+                radii=_SIZE if entity != "acknowledgement" else 0.6 * _SIZE,
+                colors=colour,
+                draw_order=5.0,
+            )
+        found["forced"] = style(FORCED, 0.1, order=6.0)
+        found["lost"] = style(LOST, 0.1, order=6.0)
+        return found
+
+    def add(
+        self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, back: bool = False
+    ) -> None:
+        """Take packets (p,) that follow those added before.
+
+        Args:
+            t_ns: their broadcasts, or of acknowledgements, when they reached the network.
+            release_ns: when they leave the network.
+            fate: what the network did with them.
+            back: they are acknowledgements.
+
+        Of packets that are closer to each other than a dot's size, the first is drawn.
+        """
+        drawn = np.zeros(len(t_ns), np.bool_)
+        for i, sent_ns in enumerate(t_ns.tolist()):
+            if sent_ns - self._last_ns[back] >= _APART_NS:
+                drawn[i] = True
+                self._last_ns[back] = sent_ns
+        t_ns, release_ns, fate = t_ns[drawn], release_ns[drawn], fate[drawn]
+        arrived_ns = t_ns + _LEG_NS
+        out_ns = np.where(effective(fate), np.maximum(arrived_ns, release_ns), arrived_ns)
+        before = self._flying
+        self._flying = _Flying(
+            np.concatenate([before.t_ns, t_ns]),
+            np.concatenate([before.out_ns, out_ns]),
+            np.concatenate([before.fate, fate]),
+            np.concatenate([before.back, np.full(len(t_ns), back)]),
+        )
+
+    def advance(self, until_ns: int) -> Mapping[str, Moving]:
+        """What moves up to a time by which all packets are in; nothing if nothing is under way."""
+        first, last = self._drawn_ns // _FRAME_NS + 1, until_ns // _FRAME_NS
+        if last < first:
+            return {}
+        self._drawn_ns = last * _FRAME_NS
+        flying = self._flying
+        begin = np.maximum(-(-flying.t_ns // _FRAME_NS), first)
+        end = np.minimum(-(-flying.end_ns // _FRAME_NS), last + 1)
+        counts = np.maximum(end - begin, 0)
+        packet = np.repeat(np.arange(len(counts)), counts)
+        frame = (
+            begin[packet] + np.arange(len(packet)) - np.repeat(np.cumsum(counts) - counts, counts)
+        )
+        order = np.argsort(frame, kind="stable")
+        pairs, frame = flying.of(packet[order]), frame[order]
+        self._flying = flying.of(flying.end_ns > self._drawn_ns)
+        return self._moving(pairs, frame, first, last)
+
+    def _moving(self, pairs: _Flying, frame: Times, first: int, last: int) -> Mapping[str, Moving]:
+        """Rows of all entities; ``pairs`` are packets, each at a frame (q,), in order of frames."""
+        now_ns = frame * _FRAME_NS
+        survives, leaves = effective(pairs.fate), now_ns >= pairs.out_ns
+        there = np.clip((now_ns - pairs.t_ns) / _LEG_NS, 0.0, 1.0)
+        onward = (now_ns - pairs.out_ns) / _LEG_NS
+        gap = _APART - 2 * _HALF_WIDE
+        x = _NETWORK - _HALF_WIDE - gap * (1.0 - there)
+        # What waits does so inside; what goes on begins at the other side.
+        x = np.where(there >= 1.0, _NETWORK, x)
+        x = np.where(leaves & survives, _NETWORK + _HALF_WIDE + gap * onward, x)
+        fall = (now_ns - pairs.out_ns) / _FALL_NS
+        y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
+        forced = pairs.fate == Fate.FORCED
+        x = np.where(pairs.back, 2 * _NETWORK - x, x)
+        y = np.where(pairs.back & (survives | ~leaves), _BACK, y)
+        places = upright(np.column_stack([x, y]))
+        what = {
+            "broadcast": ~leaves & ~pairs.back,
+            "delivered": leaves & survives & ~forced & ~pairs.back,
+            "acknowledgement": (survives | ~leaves) & pairs.back,
+            "forced": leaves & forced & ~pairs.back,
+            "lost": leaves & ~survives,
+        }
+        found: dict[str, Moving] = {}
+        for entity, which in what.items():
+            shapes = np.bincount(frame[which] - first, minlength=last - first + 1)
+            before = np.concatenate([[self._shown.get(entity, 0)], shapes[:-1]])
+            self._shown[entity] = int(shapes[-1])
+            rows = (shapes > 0) | (before > 0)  # one without any ends what was to be seen
+            if rows.any():
+                t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
+                found[entity] = Moving(t_ns, _shapes(entity, places[which], shapes[rows]))
+        return found
+
+
+_DIAMOND = 1.3 * _SIZE * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
+_CROSS = _SIZE * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]])
+"""One line, that goes over its middle twice."""
+
+
+def _shapes(entity: str, places: Reals, counts: NDArray[np.int64]) -> Columns:
+    """Shapes at places (q, 2), so many of them in each row."""
+    if entity in ("forced", "lost"):
+        shape = _DIAMOND if entity == "forced" else _CROSS
+        points = (places[:, None, :] + shape).astype(np.float32)
+        return rr.LineStrips2D.columns(strips=list(points)).partition(counts)
+    return rr.Points2D.columns(positions=places.astype(np.float32)).partition(counts)
+
+
+def _arrow(start: float, end: float, y: float) -> list[list[tuple[float, float]]]:
+    back = -0.2 if end > start else 0.2
+    head = [(end + back, y + 0.14), (end, y), (end + back, y - 0.14)]
+    return [[(start, y), (end, y)], head]

@@ -1,0 +1,124 @@
+"""A pendulum that stands upright on a pivot, or on a cart that runs on a rail; and a cart alone.
+
+The angle is measured from upright, in radians; positive is a lean to the right, towards +position.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from cosim.output.palette import Colour
+from cosim.output.viewer.pictures.picture import (
+    STILL,
+    WHO,
+    Columns,
+    Frames,
+    Reals,
+    Shape,
+    legend,
+    lines,
+    outline,
+    poses,
+)
+
+_CART, _CART_HIGH = 0.5, 0.22
+_WIDTHS: Mapping[str, float] = {"plant": 0.075, "sensor": 0.022, "controller": 0.03}
+_ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
+
+
+class Pendulum:
+    """Poles and carts: the plant's solid, the sensor model's in outline, the controller's dashed.
+
+    Args:
+        position: index of the cart's position in x, in metres; None for a fixed pivot.
+        angle: index of the pole's angle in x, in radians; None for a cart alone.
+        reach_m: how far the cart will go to either side.
+        pole_m: length of the pole; where the cart goes far, cart and pole are drawn larger.
+    """
+
+    rate_hz = 60.0
+    trails: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        position: int | None,
+        angle: int | None,
+        *,
+        reach_m: float = 0.0,
+        pole_m: float = 1.0,
+    ) -> None:
+        self._position, self._angle = position, angle
+        self.title = {
+            (False, True): "The pendulum",
+            (True, True): "The cart and its pole",
+            (True, False): "The cart on its rail",
+        }[position is not None, angle is not None]
+        # Of all lengths of the drawing, which are in units of the pole.
+        self._scale = max(reach_m / 1.8, pole_m)
+        self._wide = (2.3 if position is not None else 1.6) * self._scale
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The rail, as far as the cart is expected to go, and the pole's whole circle above it."""
+        high = 1.35 * self._scale
+        low = (-0.55 if self._position is not None else -0.4) * self._scale
+        return -self._wide, self._wide, low, high
+
+    def scenery(self) -> Mapping[str, Shape]:
+        """The rail or the pivot, three of what moves, and who is who."""
+        scale = self._scale
+        found: dict[str, Shape] = {}
+        if self._position is None:
+            foot = [(-0.16 * scale, -0.1 * scale), (0.0, 0.0), (0.16 * scale, -0.1 * scale)]
+            found["pivot"] = lines([foot], STILL, 0.04 * scale)
+            found["upright"] = lines([[(0.0, 0.0), (0.0, 1.15 * scale)]], STILL, 0.008 * scale)
+        else:
+            ground = -(_CART_HIGH / 2 + 0.03) * scale
+            ends = (-2 * self._wide, 2 * self._wide)
+            step = 10.0 ** np.floor(np.log10(self._wide))
+            ticks = (step * np.arange(-10, 11)).tolist()
+            found["rail"] = lines([[(ends[0], ground), (ends[1], ground)]], STILL, 0.03 * scale)
+            found["rail/ticks"] = lines(
+                [[(at, ground), (at, ground - 0.08 * scale)] for at in ticks], STILL, 0.02 * scale
+            )
+            found["rail/zero"] = lines(
+                [[(0.0, ground), (0.0, ground - 0.2 * scale)]], STILL, 0.03 * scale
+            )
+        for who, colour in WHO.items():
+            if self._position is not None:
+                found[f"{who}/cart"] = self._cart(who, colour)
+            if self._angle is not None:
+                found[f"{who}/pole"] = self._pole(who, colour)
+        left, _, _, top = self.bounds()
+        return found | legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
+
+    def frames(self, frames: Frames) -> Mapping[str, Columns]:
+        """Where carts and poles are."""
+        found: dict[str, Columns] = {}
+        for who in WHO:
+            x = frames.of(who)
+            zero: Reals = np.zeros(len(x))
+            if self._position is not None:
+                found[who] = poses(x[:, self._position], zero)
+            if self._angle is not None:
+                found[f"{who}/pole"] = poses(zero, zero, -x[:, self._angle])
+        return found
+
+    def _cart(self, who: str, colour: Colour) -> Shape:
+        x, y = _CART / 2 * self._scale, _CART_HIGH / 2 * self._scale
+        if who == "plant":
+            inner = y * 0.5
+            rows = [[(-x + inner, at), (x - inner, at)] for at in (-inner, 0.0, inner)]
+            return lines(rows, colour, 2 * inner, order=_ORDERS[who])
+        corners = [(-x, -y), (x, -y), (x, y), (-x, y)]
+        dash = None if who == "sensor" else 0.05 * self._scale
+        return lines(outline(corners, dash), colour, _WIDTHS[who] * self._scale, order=_ORDERS[who])
+
+    def _pole(self, who: str, colour: Colour) -> Shape:
+        high, width = self._scale, _WIDTHS[who] * self._scale
+        pole = [(0.0, 0.0), (0.0, high)]
+        bob = [(0.07 * self._scale * np.cos(a), high + 0.07 * self._scale * np.sin(a))
+               for a in np.linspace(0, 2 * np.pi, 13).tolist()]  # fmt: skip
+        if who == "controller":
+            pieces = [[(0.0, high * a), (0.0, high * (a + 0.06))] for a in np.arange(0, 0.95, 0.1)]
+            return lines([*pieces, bob], colour, 1.4 * width, order=_ORDERS[who])
+        return lines([pole, bob], colour, width, order=_ORDERS[who])

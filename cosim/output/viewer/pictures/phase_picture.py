@@ -1,0 +1,103 @@
+"""A phase plot for a plant of which no picture is known: one state against another.
+
+Both axes are scaled to what the model's closed loop goes through from x(0). A plant of one state
+has a line of its own for each of the three.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from cosim.output.viewer.pictures.picture import (
+    STILL,
+    WHO,
+    Columns,
+    Frames,
+    Reals,
+    Shape,
+    label,
+    legend,
+    lines,
+    outline,
+    poses,
+    strips,
+    style,
+)
+
+_RING = 0.035
+_ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
+_WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
+
+
+class Phase:
+    """The first state to the right, the second up, with a trail of the last seconds.
+
+    Args:
+        names: of the states.
+        reach: how far each of them will go, (n,), above 0.
+    """
+
+    rate_hz = 60.0
+
+    def __init__(self, names: Sequence[str], reach: Reals) -> None:
+        self._names = list(names[:2])
+        self._reach = np.asarray(reach, dtype=float)[:2]
+        self.title = " against ".join(reversed(self._names)) + ": phase plot"
+        if len(self._names) == 1:
+            self.title = f"{self._names[0]} of plant and models"
+        self.trails = tuple(f"{who}/trail" for who in WHO) if len(self._names) == 2 else ()
+        self._last: dict[str, Reals] = {}
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Both axes, and room for words on the right."""
+        return -1.25, 2.8, -1.5, 1.25
+
+    def scenery(self) -> Mapping[str, Shape]:
+        """Axes with the values at their ends, three points, and who is who."""
+        square = outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+        found: dict[str, Shape] = {
+            "axes": lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], STILL, 0.006)
+        }
+        ends: list[tuple[str, float, tuple[float, float]]] = [
+            (self._names[0], self._reach[0], (1.0, -1.0))
+        ]
+        if len(self._names) == 2:
+            ends.append((self._names[1], self._reach[1], (0.0, 1.17)))
+        for i, (name, reach, at) in enumerate(ends):
+            found[f"axes/{i}"] = label(f"{name} = {reach:.3g}", at, STILL)
+        for who, colour in WHO.items():
+            width, order = _WIDTHS[who], _ORDERS[who]
+            if who == "plant":  # filled by its own width
+                found[f"{who}/point"] = lines([[(-1e-3, 0), (1e-3, 0)]], colour, 0.06, order=order)
+            else:
+                around = np.linspace(0, 2 * np.pi, 17)[:-1]
+                radius = _RING if who == "sensor" else 1.6 * _RING
+                ring = np.column_stack([radius * np.cos(around), radius * np.sin(around)])
+                dash = None if who == "sensor" else 0.01
+                found[f"{who}/point"] = lines(
+                    outline(ring.tolist(), dash), colour, 1.4 * width, order=order
+                )
+            if self.trails:
+                found[f"{who}/trail"] = style(colour, width, order=order - 2)
+        return found | legend(1.95, 1.0, 0.3)
+
+    def frames(self, frames: Frames) -> Mapping[str, Columns]:
+        """The three points, and the piece by which each trail grows."""
+        found: dict[str, Columns] = {}
+        for i, who in enumerate(WHO):
+            points = self._scaled(frames.of(who), 0.3 - 0.3 * i)
+            found[f"{who}/point"] = poses(points[:, 0], points[:, 1])
+            if self.trails:
+                before = np.vstack([self._last.get(who, points[:1]), points[:-1]])
+                # No line to or from where there is no state.
+                whole = np.isfinite(before + points).all(axis=1, keepdims=True)
+                before = np.where(whole, before, points)
+                found[f"{who}/trail"] = strips(np.stack([before, points], axis=1))
+                self._last[who] = points[-1:]
+        return found
+
+    def _scaled(self, states: Reals, row: float) -> Reals:
+        if len(self._names) == 1:
+            x = states[:, 0] / self._reach[0]
+            return np.column_stack([x, np.full_like(x, row)])
+        return np.asarray(states[:, :2] / self._reach)

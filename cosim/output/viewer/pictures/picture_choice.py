@@ -1,0 +1,78 @@
+"""Which picture a plant has, by its kind or by the names of its states."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosim.output.viewer.pictures.lane_picture import Lane, Place
+from cosim.output.viewer.pictures.pendulum_picture import Pendulum
+from cosim.output.viewer.pictures.phase_picture import Phase
+from cosim.output.viewer.pictures.picture import Picture, Reals
+from cosim.output.viewer.pictures.quadrotor_picture import Quadrotor
+from cosim.output.viewer.pictures.tanks_picture import Tanks
+from noack.config.plant_systems import CartPole
+from noack.config.resolution import Loop, loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Propagator
+
+_LEVELS = ("level_1", "level_2", "level_3", "level_4")
+_SAMPLES = 400
+_ROOM = 1.25
+
+
+def picture_of(scenario: Scenario) -> Picture:
+    """The picture of a resolved scenario's plant: one of its kind, or a phase plot."""
+    loop, system = loop_of(scenario), scenario.plant.system
+    kind: str = system.kind
+    own = system.internal_names
+    reach = reach_of(loop, scenario.horizon_ns)
+    if isinstance(system, CartPole):
+        return Pendulum(0, 2, reach_m=float(reach[0]), pole_m=2 * system.length_m)
+    if kind == "quadrotor":
+        return Quadrotor(range(6), float(reach[:3].max()))
+    if kind == "four_tank" and (at := _places(own, _LEVELS)):
+        return Tanks(range(4), at)
+    if kind == "vehicle" and (at := _places(own, Place._fields)):
+        # x is that of the lane models: V, r, psi, Y_g.
+        return Lane(3, 2, forward_mps=float(loop.A_model[3, 2]), place=Place(*at))
+    return _of_states(loop, reach)
+
+
+def reach_of(loop: Loop, horizon_ns: int) -> Reals:
+    """How far each state goes from 0 in the model's closed loop from x(0), and some room, (n,).
+
+    Where a state stays at 0, it is given 1.
+    """
+    step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(
+        max(horizon_ns // _SAMPLES, 1)
+    )
+    at_rest = np.zeros(loop.n) if loop.setpoint is None else loop.setpoint
+    deviation, reach = loop.x0 - at_rest, np.abs(loop.x0)
+    with np.errstate(all="ignore"):
+        for _ in range(_SAMPLES):
+            deviation = step @ deviation
+            reach = np.fmax(reach, np.abs(at_rest + deviation))
+    known = np.isfinite(reach) & (reach > 0)
+    return np.where(known, _ROOM * reach, 1.0)
+
+
+def _of_states(loop: Loop, reach: Reals) -> Picture:
+    """The picture of a plant that is known by what its states are called."""
+    names = loop.state_names
+    if at := _places(names, ("psi", "Y_g")):
+        # The paper's dY_g/dt = V + U ψ.
+        return Lane(at[1], at[0], forward_mps=float(loop.A_model[at[1], at[0]]))
+    if at := _places(names, ("position", "angle")):
+        return Pendulum(at[0], at[1], reach_m=float(reach[at[0]]))
+    if at := _places(names, ("angle",)):
+        return Pendulum(None, at[0])
+    if at := _places(names, ("position", "velocity")):
+        return Pendulum(at[0], None, reach_m=float(reach[at[0]]))
+    return Phase(names, reach)
+
+
+def _places(names: Sequence[str], wanted: Sequence[str]) -> tuple[int, ...]:
+    """Where the wanted names are, if all of them are there."""
+    if not set(wanted) <= set(names):
+        return ()
+    return tuple(names.index(name) for name in wanted)

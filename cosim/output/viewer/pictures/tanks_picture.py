@@ -1,0 +1,96 @@
+"""Four tanks, of which two empty into the others: the levels, and what the models believe."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from cosim.output.viewer.pictures.picture import (
+    STILL,
+    WHO,
+    Columns,
+    Frames,
+    Reals,
+    Shape,
+    label,
+    legend,
+    lines,
+    strips,
+    style,
+)
+
+_WIDE, _HIGH = 1.0, 1.6
+_PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
+"""Left and lower corner of the tanks 1 to 4: the upper two are 3 and 4."""
+_HATCH, _TALLEST_CM = 7, 20.0
+_STYLES: Mapping[str, tuple[float, float]] = {
+    "plant": (0.07, 2.0), "sensor": (0.06, 4.0), "controller": (0.09, 3.0),
+}  # fmt: skip
+
+
+class Tanks:
+    """Levels as bars; the models' as a line each, which goes beyond the tank on its own side.
+
+    Args:
+        levels: index in x of the four levels' deviations from the operating point, in centimetres.
+        own: index in z of the four levels, in centimetres.
+    """
+
+    title = "The tanks"
+    rate_hz = 10.0
+    trails: tuple[str, ...] = ()
+
+    def __init__(self, levels: Sequence[int], own: Sequence[int]) -> None:
+        self._levels, self._own = list(levels), list(own)
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """All four, and room for words on the left."""
+        return -3.6, 2.6, -0.35, 4.25
+
+    def scenery(self) -> Mapping[str, Shape]:
+        """Walls, spouts, and how levels look."""
+        walls = [
+            [(left, low + _HIGH), (left, low), (left + _WIDE, low), (left + _WIDE, low + _HIGH)]
+            for left, low in _PLACES
+        ]
+        spouts = [[(left + _WIDE / 2, low), (left + _WIDE / 2, low - 0.3)] for left, low in _PLACES]
+        found: dict[str, Shape] = {
+            "walls": lines(walls, STILL, 0.06),
+            "spouts": lines(spouts, STILL, 0.06),
+        }
+        for i, (left, low) in enumerate(_PLACES):
+            for who, (width, order) in _STYLES.items():
+                found[f"{who}/{i + 1}"] = style(WHO[who], width, order=order)
+            found[f"number/{i + 1}"] = label(
+                f"tank {i + 1}", (left + _WIDE / 2, low + _HIGH), STILL
+            )
+        return found | legend(-2.6, 4.1, 0.45)
+
+    def frames(self, frames: Frames) -> Mapping[str, Columns]:
+        """The levels, by what of each the sensor and the controller believe."""
+        found: dict[str, Columns] = {}
+        if frames.z is None:
+            return found
+        at_rest = frames.z[:, self._own] - frames.x[:, self._levels]
+        for who in WHO:
+            levels_cm = frames.of(who)[:, self._levels] + at_rest
+            for i, (left, low) in enumerate(_PLACES):
+                height = low + np.maximum(levels_cm[:, i], 0.0) / _TALLEST_CM * _HIGH
+                found[f"{who}/{i + 1}"] = strips(_level(who, left, low, height))
+        return found
+
+
+def _level(who: str, left: float, low: float, height: Reals) -> Reals:
+    """The line that is a level (k, p, 2): a hatched bar, or a stroke."""
+    k = len(height)
+    if who == "plant":
+        across = np.repeat(np.linspace(left + 0.09, left + _WIDE - 0.09, _HATCH), 2)
+        points = np.empty((k, 2 * _HATCH, 2))
+        points[:, :, 0] = across
+        up = np.tile([True, False, False, True], _HATCH)[: 2 * _HATCH]
+        points[:, :, 1] = np.where(up, height[:, None], low + 0.09)
+        return points
+    ends = (left - 0.22, left + 0.6) if who == "sensor" else (left + 0.4, left + _WIDE + 0.22)
+    points = np.empty((k, 2, 2))
+    points[:, :, 0] = ends
+    points[:, :, 1] = height[:, None]
+    return points

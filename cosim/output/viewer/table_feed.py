@@ -1,0 +1,276 @@
+"""Feeds the view of a run from the tables of its record, as they grow or all at once."""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.output.viewer.pictures.picture import Frames
+from cosim.output.viewer.recording import RunView
+from cosim.record.align import (
+    ControllerTrack,
+    Joined,
+    controller_track,
+    in_common,
+    initial_track,
+    join,
+)
+from cosim.record.estimation_error import true_states
+from cosim.record.recorded_changes import claimed_until_s, model_flow
+from cosim.record.run_record import Rows, updates_in
+from noack.config.resolution import loop_of, tables_of
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_SETTING,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+    effective,
+)
+from noack.protocol.wire_format import Flow
+from noack.theory.error_bounds import ErrorMonitor
+from noack.theory.run_conditions import allowed_conditions
+from noack.theory.scenario_certificates import Certificate, certify
+from noack.trigger.policy_from_settings import policy_of
+
+_LAG_S = 0.2
+"""Wall time by which the joined view trails, so that all processes' batches are in."""
+_PATIENCE_S = 1.0
+"""Wall time that it waits for a controller that is silent."""
+
+_SHOWN = (
+    CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)  # fmt: skip
+
+Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
+
+class ViewFeed:
+    """Joins growing tables and passes what is complete to the view.
+
+    Args:
+        scenario: the resolved scenario.
+        view: takes the joined batches.
+    """
+
+    def __init__(self, scenario: Scenario, view: RunView) -> None:
+        self._scenario = scenario
+        self._loop = loop_of(scenario)
+        self._view = view
+        # What is not shown is not kept.
+        self._pending: dict[str, list[Rows]] = {table: [] for table in _SHOWN}
+        self._types = tables_of(scenario)
+        self._track: ControllerTrack = initial_track(scenario)
+        self._undrawn: list[Rows] = []
+        self._forced: set[int] = set()
+        self._monitor = ErrorMonitor(self._loop.H, policy_of(scenario))
+        own = dict(self._types[PLANT_STEP].fields or {}).get("z")
+        self._own = None if own is None else (np.zeros(0, np.int64), np.zeros((0, *own[0].shape)))
+        self._told = np.zeros(0, self._types[CONTROLLER_SETTING])
+        self._flow = model_flow(scenario, self._told)
+        self._claimed_until_s = np.inf
+        # Where the sensor does not know x, the plant's own is shown.
+        self._plant: Rows | None = None
+        if not scenario.knows_state:
+            self._plant = np.zeros(0, self._types[PLANT_STEP])
+        self._last_event_ns: int | None = None
+        self._last_delivery_ns: int | None = None
+
+    def add(self, table: str, rows: Rows) -> None:
+        """Take rows that follow those added before."""
+        if table in self._pending and len(rows):
+            self._pending[table].append(rows)
+
+    def log(self, notice: Mapping[str, Any]) -> None:
+        """Take a line of the run's log."""
+        text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
+        level = "WARN" if notice["level"] in ("failed", "violation", "void", "watchdog") else "INFO"
+        self._view.log(int(notice["t_ns"]), level, str(text))
+
+    @np.errstate(all="ignore")  # a run may diverge
+    def advance(self, *, final: bool = False) -> None:
+        """Pass on what is complete; at the end, everything."""
+        if len(told := self._take(CONTROLLER_SETTING, None)):
+            self._told = np.concatenate([self._told, told])
+            self._flow = model_flow(self._scenario, self._told)
+            self._claimed_until_s = claimed_until_s(self._told)
+        steps = self._take(CONTROLLER_STEP, None)
+        deliveries = self._take(CONTROLLER_DELIVERY, None)
+        if len(steps) or len(deliveries):
+            self._track = controller_track(self._track, steps, deliveries)
+        reach_ns = int(self._track.model_ns[-1])
+        if final:
+            until_ns = None
+            reach_ns += self._scenario.controller_period_ns
+        else:
+            waiting = self._pending[SENSOR_MEASUREMENT]
+            newest_ns = int(waiting[-1]["t_ns"][-1]) if waiting else reach_ns
+            wall_ns = NS_PER_S * self._scenario.speed
+            until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
+            until_ns -= int(_LAG_S * wall_ns)
+        self._packets(self._take(NETEM_PACKET, None))
+        self._view.travel(self._scenario.horizon_ns if until_ns is None else until_ns)
+        self._inputs(steps)
+        self._undrawn.append(deliveries)
+        self._deliveries(until_ns)
+        taken = self._take(PLANT_STEP, None)
+        if self._plant is not None:
+            self._plant = np.concatenate([self._plant, taken])
+        self._lateness("plant", taken)
+        self._systems(taken)
+        self._measurements(self._take(SENSOR_MEASUREMENT, until_ns), reach_ns)
+        self._view.flush()
+
+    def _take(self, table: str, until_ns: int | None) -> Rows:
+        waiting = self._pending[table]
+        rows = np.concatenate(waiting) if waiting else np.zeros(0, self._types[table])
+        if until_ns is None:
+            self._pending[table] = []
+            return rows
+        ready = int(np.searchsorted(rows["t_ns"], until_ns, side="right"))
+        self._pending[table] = [rows[ready:]] if ready < len(rows) else []
+        return rows[:ready]
+
+    def _systems(self, steps: Rows) -> None:
+        """Keep the system's own states until the measurements at their times are shown."""
+        if self._own is not None and len(steps):
+            t_ns, z = self._own
+            self._own = np.concatenate([t_ns, steps["t_ns"]]), np.vstack([z, steps["z"]])
+
+    def _own_at(self, times_ns: Times) -> Reals | None:
+        """The system's own state at ascending times (k,), NaN where it is not in; (k, N)."""
+        if self._own is None:
+            return None
+        t_ns, z = self._own
+        found = np.full((len(times_ns), z.shape[1]), np.nan)
+        if len(t_ns):
+            at = np.minimum(np.searchsorted(t_ns, times_ns), len(t_ns) - 1)
+            known = t_ns[at] == times_ns
+            found[known] = z[at[known]]
+            self._own = t_ns[at[-1] :], z[at[-1] :]
+        return found
+
+    def _measurements(self, rows: Rows, reach_ns: int) -> None:
+        if not len(rows):
+            return
+        acknowledged = self._scenario.is_acknowledged
+        joined = join(
+            self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
+        )
+        if self._plant is not None:
+            joined = joined._replace(x=true_states(self._plant, joined.t_ns))
+            self._plant = self._plant[self._plant["t_ns"] > joined.t_ns[-1]]
+        t_s = np.asarray(joined.t_ns * 1e-9)
+        bounds = np.column_stack(
+            [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
+        )
+        if not self._scenario.is_acknowledged:
+            bounds[~in_common(self._scenario, joined)] = np.nan
+        self._view.samples(
+            joined.t_ns,
+            joined.x,
+            joined.x_s,
+            joined.x_c,
+            joined.e_s_norm,
+            joined.threshold,
+            joined.e_c_norm,
+            bounds,
+            self._certified(t_s, "state"),
+        )
+        z = self._own_at(joined.t_ns)
+        self._view.move(joined.t_ns, Frames(t_s, joined.x, joined.x_s, joined.x_c, z))
+        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
+        if len(event_ns):
+            self._view.broadcasts(event_ns, _intervals_s(event_ns, self._last_event_ns))
+            self._last_event_ns = int(event_ns[-1])
+        self._lateness("sensor", rows)
+        keep = max(int(np.searchsorted(self._track.model_ns, rows["t_ns"][-1], "right")) - 1, 0)
+        self._track = self._track.since(keep)
+
+    @cached_property
+    def _certificate(self) -> Certificate | None:
+        """The certificate of the run, made when the run is under way: it takes its time.
+
+        None of what is beyond the theory.
+        """
+        if not self._scenario.is_certifiable or self._loop.setpoint is not None:
+            return None  # at a set-point it would be of the deviations
+        certificate = certify(self._scenario, allowed_conditions(self._scenario))
+        if certificate.inter_event_s is not None:
+            self._view.certified_interval(certificate.inter_event_s, self._scenario.horizon_ns)
+        return certificate
+
+    def _certified(
+        self, t_s: NDArray[np.float64], what: Literal["controller_error", "state"]
+    ) -> NDArray[np.float64]:
+        if self._certificate is None:
+            return np.full(len(t_s), np.nan)
+        bound = getattr(self._certificate, what)(t_s)
+        return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
+
+    def _bounds(self, rows: Rows, joined: Joined) -> NDArray[np.float64]:
+        """The bound of ‖e_c‖ that (I1) gives, (k,); none where updates are acknowledged."""
+        if self._scenario.is_acknowledged:
+            return np.full(len(rows), np.nan)
+        samples = zip(
+            rows["t_ns"].tolist(), rows["x_s"] - rows["x"], rows["event"].tolist(),
+            joined.received.tolist(), strict=True,
+        )  # fmt: skip
+        return np.array([self._monitor.sample(*sample).identity for sample in samples])
+
+    def _deliveries(self, until_ns: int | None) -> None:
+        """Draw deliveries once the network's word on them, from another process, must be in."""
+        waiting = np.concatenate(self._undrawn)
+        ready = np.full(len(waiting), True) if until_ns is None else waiting["t_ns"] <= until_ns
+        self._undrawn = [waiting[~ready]]
+        rows = waiting[ready]
+        if not len(rows):
+            return
+        forced = np.array([int(sequence) in self._forced for sequence in rows["sequence"]])
+        newest = int(rows["sequence"][-1])
+        self._forced = {sequence for sequence in self._forced if sequence > newest}
+        event_ns = rows["t_ns"]
+        self._view.receptions(event_ns, _intervals_s(event_ns, self._last_delivery_ns), forced)
+        self._last_delivery_ns = int(event_ns[-1])
+
+    def _packets(self, rows: Rows) -> None:
+        if not len(rows):
+            return
+        if self._scenario.is_acknowledged:
+            back = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
+            self._view.packets(back["t_ns"], back["release_ns"], back["fate"], back=True)
+        rows, sequence, event_ns = updates_in(rows)
+        self._view.packets(event_ns, rows["release_ns"], rows["fate"])
+        self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
+        dropped = ~effective(rows["fate"])
+        if dropped.any():
+            self._view.drops(event_ns[dropped])
+        self._view.lateness("netem", event_ns, self._wall_us(rows["now_ns"] - event_ns))
+
+    def _inputs(self, steps: Rows) -> None:
+        if len(steps):
+            self._view.inputs(steps["t_ns"], steps["u"])
+            self._lateness("controller", steps)
+
+    def _lateness(self, process: str, rows: Rows) -> None:
+        if len(rows):
+            late_us = self._wall_us(rows["now_ns"] - rows["t_ns"])
+            self._view.lateness(process, rows["t_ns"], late_us)
+
+    def _wall_us(self, simulated_ns: Times) -> NDArray[np.float64]:
+        return np.asarray(simulated_ns / (1e3 * self._scenario.speed), dtype=np.float64)
+
+
+def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:
+    """Time since the one before, NaN for the first of all."""
+    first = np.nan if before_ns is None else (t_ns[0] - before_ns) * 1e-9
+    return np.concatenate([[first], np.diff(t_ns) * 1e-9])

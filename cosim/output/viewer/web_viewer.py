@@ -1,0 +1,70 @@
+"""The web viewer's files, which rerun's program contains and serves on a port of its own.
+
+Any user of the machine could listen on that port once the program has ended. So the port is the
+one that the kernel gave to the program, and an answer is used only if it comes from a process of
+this user.
+"""
+
+import contextlib
+import http.client
+import os
+import re
+import tempfile
+from collections.abc import Iterator
+
+from cosim.output.viewer.peer_user import peer_user
+from cosim.output.viewer.rerun_program import end_process, logged_port, start_rerun
+from noack.core.errors import MachineError, PeerError
+
+HOST = "127.0.0.1"
+
+_START_S = 10.0
+_TIMEOUT_S = 10.0
+_SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
+
+
+class WebViewer:
+    """Serves the web viewer's files while it lasts.
+
+    Raises:
+        MachineError: rerun's program does not start.
+    """
+
+    def __init__(self) -> None:
+        # Named a recording that a page can load by itself, the program serves the page and no
+        # more; named a file it spins, and named nothing it opens another port for data. The page
+        # is told elsewhere where the recording is: everybody can read a command line.
+        arguments = ["--serve-web", "--bind", HOST, "--web-viewer-port", "0"]
+        with tempfile.TemporaryFile() as output:
+            self.process = start_rerun([*arguments, f"http://{HOST}/recording.rrd"], output=output)
+            port = logged_port(self.process, output, _SERVED_AT, _START_S)
+        if port is None:
+            self.close()
+            raise MachineError("rerun's web viewer did not start")
+        self.port = port
+
+    @contextlib.contextmanager
+    def file(self, name: str) -> Iterator[http.client.HTTPResponse]:
+        """Give the answer to a request for a file, while the context lasts.
+
+        Raises:
+            PeerError: the program has ended, or what answers is not a process of this user.
+        """
+        source = http.client.HTTPConnection(HOST, self.port, timeout=_TIMEOUT_S)
+        with contextlib.closing(source):
+            try:
+                source.connect()
+                connection = source.sock
+                source.request("GET", f"/{name}")
+                answer = source.getresponse()
+            except (OSError, http.client.HTTPException):
+                raise PeerError("rerun's web viewer does not answer") from None
+            # Asked now, as a connection has no user before it is accepted. The answer comes over
+            # this very connection, whoever may listen on the port meanwhile.
+            if self.process.poll() is not None or peer_user(connection) != os.getuid():
+                raise PeerError("rerun's web viewer has ended, or another user's program answers")
+            yield answer
+
+    def close(self) -> None:
+        """End the program."""
+        end_process(self.process)

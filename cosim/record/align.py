@@ -1,0 +1,265 @@
+"""Joins the tables of a run on the measurements' time grid.
+
+Nobody in the loop sees x, x_s and x_c together; the record does. At each measurement time t:
+
+* x(t) and x_s(t) are the sensor's own; at an event x_s is shown after its reset. x is what the
+  sensor takes for the state: where it is measured with noise, or estimated, not quite the plant's,
+  and e_c is the controller's error against that (:mod:`cosim.record.estimation_error` has the
+  rest);
+* x_c(t) is the controller's last state whose model time is at most t, propagated by e^{H(t−t')}.
+
+Where a controller has died there is none, until the one that took its place has its first update.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record.recorded_changes import model_flow_of
+from cosim.record.run_record import Rows, RunRecord
+from noack.config.resolution import Loop, loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import row_norms
+from noack.core.model_flow import ModelFlow
+from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NO_SEQUENCE,
+    SENSOR_MEASUREMENT,
+)
+from noack.theory.identities import MissedJumps
+
+Times = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
+
+class Joined(NamedTuple):
+    """Samples on the measurement grid; k samples, n states."""
+
+    t_ns: Times
+    """(k,)"""
+    x: Reals
+    """(k, n), as the sensor knows it."""
+    x_s: Reals
+    """(k, n), after a reset."""
+    x_c: Reals
+    """(k, n); NaN where the controller's record does not reach."""
+    e_s_norm: Reals
+    """(k,) ‖e_s‖_W before a reset: what the trigger tested."""
+    threshold: Reals
+    """(k,) What ‖e_s‖_W would have to exceed for an event."""
+    e_c_norm: Reals
+    """(k,) ‖e_c‖_W."""
+    received: NDArray[np.int64]
+    """(k,) sequence number of the controller's newest update at t, −1 for none."""
+    sensor: NDArray[np.int64]
+    """(k,) incarnation of the sensor."""
+
+    def since_delivery(self, scenario: Scenario) -> NDArray[np.bool_]:
+        """Where the controller's error is on record, from its first update on, (k,)."""
+        known = scenario.network.initial_sync == "known_state"
+        delivered = known | (self.received != NO_SEQUENCE)
+        return np.asarray(np.isfinite(self.e_c_norm) & delivered)
+
+
+class ControllerTrack(NamedTuple):
+    """The controller's states in the order in which it went through them."""
+
+    model_ns: Times
+    x_c: Reals
+    received: NDArray[np.int64]
+    incarnation: int = 0
+    """Of the controller that was in the last of them."""
+
+    def since(self, index: int) -> "ControllerTrack":
+        """The track from its ``index``-th state on."""
+        return self._replace(
+            model_ns=self.model_ns[index:], x_c=self.x_c[index:], received=self.received[index:]
+        )
+
+
+def in_common(scenario: Scenario, joined: Joined) -> NDArray[np.bool_]:
+    """Where x_c is on record, and sensor and controller have something in common, (k,).
+
+    What that was is lost with the sensor, until an update of the one in its place is delivered.
+    """
+    known = scenario.network.initial_sync == "known_state"
+    first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * INCARNATION)
+    return np.asarray(~np.isnan(joined.x_c).any(axis=1) & (joined.received >= first))
+
+
+def initial_track(scenario: Scenario) -> ControllerTrack:
+    """The controller's state before its first input."""
+    loop = loop_of(scenario)
+    known = scenario.network.initial_sync == "known_state"
+    x_c = loop.x0 if known else np.zeros(loop.n)
+    return ControllerTrack(np.zeros(1, np.int64), x_c[None, :], np.full(1, NO_SEQUENCE))
+
+
+def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> ControllerTrack:
+    """Continue a track by ticks and deliveries."""
+    inputs = np.concatenate([steps["input"], deliveries["input"]])
+    order = np.argsort(inputs, kind="stable")
+    newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
+    model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
+    x_c = np.concatenate([steps["x_c"], deliveries["x_c"]])[order]
+    lives = inputs[order] // INCARNATION
+    track = before
+    for life in np.unique(lives):
+        which = lives == life
+        track = _continued(track, int(life), model_ns[which], x_c[which], newest[which])
+    return track
+
+
+def _continued(
+    track: ControllerTrack, life: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
+) -> ControllerTrack:
+    """Continue a track by states of one controller."""
+    if life != track.incarnation:  # from where the one before left off, there is none
+        track = ControllerTrack(
+            np.append(track.model_ns, track.model_ns[-1] + 1),
+            np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
+            np.append(track.received, NO_SEQUENCE),
+            life,
+        )
+    received = np.maximum.accumulate(np.concatenate([track.received[-1:], newest]))[1:]
+    unknown = (received == NO_SEQUENCE) & (life > 0)
+    return ControllerTrack(
+        np.concatenate([track.model_ns, model_ns]),
+        np.concatenate([track.x_c, np.where(unknown[:, None], np.nan, x_c)]),
+        np.concatenate([track.received, received]),
+        life,
+    )
+
+
+@np.errstate(over="ignore", invalid="ignore")  # a run may diverge
+def join(
+    loop: Loop,
+    measurements: Rows,
+    track: ControllerTrack,
+    until_ns: int,
+    *,
+    flow: ModelFlow | None = None,
+    acknowledged: bool = False,
+) -> Joined:
+    """Join measurements with the controller's track.
+
+    Args:
+        loop: matrices of the run.
+        measurements: rows of ``sensor_measurement``, ordered.
+        track: the controller's states, at least from the first measurement on.
+        until_ns: x_c is known up to here.
+        flow: what x_c follows; by default what it does in a run in which nothing is changed.
+        acknowledged: an event does not reset x_s; it shows in the next sample if one did that was
+            acknowledged.
+    """
+    t_ns = measurements["t_ns"]
+    reset = (measurements["event"] != NO_SEQUENCE) & (not acknowledged)
+    x_s = np.where(reset[:, None], measurements["x"], measurements["x_s"])
+    flow = ModelFlow(loop.H, (), loop.setpoint) if flow is None else flow
+    x_c, received = _at(flow, track, t_ns, until_ns)
+    e_c = x_c - measurements["x"]
+    if loop.weight is not None:
+        e_c = e_c @ loop.weight.T
+    return Joined(
+        t_ns,
+        measurements["x"],
+        x_s,
+        x_c,
+        measurements["e_s_norm"],
+        _threshold(measurements),
+        row_norms(e_c),
+        received,
+        measurements["input"] // INCARNATION,
+    )
+
+
+def _threshold(measurements: Rows) -> Reals:
+    """Where ‖e_s‖_W would be an event, if the sides of the comparison grew with it alike.
+
+    For a trigger that compares ‖e_s‖_W itself, as the paper's does, this is its threshold.
+    """
+    left, right = measurements["compared"], measurements["threshold"]
+    norms = measurements["e_s_norm"]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(left == norms, right, right * (norms / left)))
+
+
+def _at(
+    flow: ModelFlow, track: ControllerTrack, t_ns: Times, until_ns: int
+) -> tuple[Reals, NDArray[np.int64]]:
+    x_c = np.full((len(t_ns), track.x_c.shape[1]), np.nan)
+    received = np.full(len(t_ns), NO_SEQUENCE, dtype=np.int64)
+    index = np.searchsorted(track.model_ns, t_ns, side="right") - 1
+    known = (index >= 0) & (t_ns <= until_ns)
+    received[known] = track.received[index[known]]
+    dt_ns = t_ns - track.model_ns[index]
+    if flow.moved:
+        for i in np.flatnonzero(known):
+            state = int(index[i])
+            x_c[i] = flow(track.x_c[state], int(track.model_ns[state]), int(t_ns[i]))
+        return x_c, received
+    propagate = flow.propagate
+    for step_ns in np.unique(dt_ns[known]):
+        which = known & (dt_ns == step_ns)
+        states = track.x_c[index[which]]
+        x_c[which] = states @ propagate.transition(int(step_ns)).T if step_ns else states
+    return x_c, received
+
+
+def join_all(record: RunRecord) -> Joined:
+    """Join a whole run."""
+    steps = record[CONTROLLER_STEP]
+    track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
+    reach_ns = int(track.model_ns[-1]) + record.scenario.controller_period_ns
+    acknowledged = record.scenario.is_acknowledged
+    return join(
+        record.loop, record[SENSOR_MEASUREMENT], track, reach_ns,
+        flow=model_flow_of(record), acknowledged=acknowledged,
+    )  # fmt: skip
+
+
+class IdentityResidual:
+    """Evaluates (I1) along a run, batch after batch of its measurements.
+
+    Args:
+        scenario: the resolved scenario, without acknowledgements: (I1) presupposes that x_s is
+            reset at every event.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._missed = MissedJumps(loop_of(scenario).H)
+
+    def of(self, measurements: Rows, joined: Joined) -> Reals:
+        """Largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
+
+        Args:
+            measurements: rows of ``sensor_measurement``, which follow those given before.
+            joined: the same, joined.
+        """
+        missed = self._missed
+        residual = np.full(len(measurements), np.nan)
+        common = in_common(self._scenario, joined)
+        for i, row in enumerate(measurements):
+            missed.advance_to(int(row["t_ns"]))
+            if row["event"] != NO_SEQUENCE:
+                missed.event(int(row["event"]), row["x_s"] - row["x"])
+            missed.received(int(joined.received[i]))
+            if common[i]:
+                residual[i] = np.max(np.abs(joined.x_c[i] - joined.x_s[i] - missed.total()))
+        return residual
+
+
+def identity_residual(record: RunRecord, joined: Joined) -> Reals:
+    """(I1)'s residual over a whole run, (k,); see :class:`IdentityResidual`.
+
+    Zero to rounding on every run, whatever was lost. NaN where x_c is not recorded, and as long as
+    sensor and controller have nothing in common: before the first delivery, unless x(0) is known.
+    NaN throughout where updates are acknowledged.
+    """
+    if record.scenario.is_acknowledged:
+        return np.full(len(joined.t_ns), np.nan)
+    return IdentityResidual(record.scenario).of(record[SENSOR_MEASUREMENT], joined)

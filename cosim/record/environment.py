@@ -1,0 +1,73 @@
+"""Where a run was made: versions, machine, command; kept with the run."""
+
+import json
+import os
+import platform
+import sys
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from cosim.record.run_directory import ENVIRONMENT_FILE, read_object
+
+Kind = Literal["live", "simulated"]
+"""Whether a run took place between processes, or in virtual time."""
+
+_PACKAGES = ("noack", "numpy", "scipy", "eclipse-zenoh", "rerun-sdk", "pyarrow", "pydantic")
+_ARITHMETIC = ("noack", "numpy", "scipy")
+
+
+def environment(kind: Kind) -> dict[str, Any]:
+    """Return the content of ``environment.json``."""
+    return {
+        "kind": kind,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "python": platform.python_version(),
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "system": platform.platform(),
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
+    }
+
+
+def write_environment(run_dir: Path, kind: Kind) -> None:
+    """Write ``environment.json`` into a run directory."""
+    content = json.dumps(environment(kind), indent=2)
+    (run_dir / ENVIRONMENT_FILE).write_text(content, encoding="utf-8")
+
+
+def kind_of(run_dir: Path) -> Kind:
+    """Return of which kind a run is: what its environment says, which in old runs is nothing."""
+    said = read_object(run_dir / ENVIRONMENT_FILE)
+    return "simulated" if said.get("kind") == "simulated" else "live"
+
+
+def changed_since(run_dir: Path) -> list[str]:
+    """Return what the arithmetic of a run may depend on and is not what it was, in words."""
+    then, now = read_object(run_dir / ENVIRONMENT_FILE), environment("live")
+    said = then.get("packages")
+    packages = said if isinstance(said, dict) else {}
+    pairs = [
+        *((key, then.get(key), now[key]) for key in ("python", "machine", "processor")),
+        *((name, packages.get(name), now["packages"][name]) for name in _ARITHMETIC),
+    ]
+    return [f"{name} was {old}, is {new}" for name, old, new in pairs if old != new]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor()

@@ -1,0 +1,60 @@
+"""How the updates of a run crossed the network emulator."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record.run_record import Rows, RunRecord, updates_in
+from noack.protocol.record_tables import (
+    ACKNOWLEDGEMENTS,
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    UPDATES,
+    effective,
+)
+from noack.protocol.wire_format import Flow
+
+
+class Crossing(NamedTuple):
+    """What became of k updates on their way through the network emulator."""
+
+    rows: Rows
+    """Their rows of ``netem_packet``, (k,)."""
+    sequence: NDArray[np.int64]
+    event_ns: NDArray[np.int64]
+    lost: NDArray[np.bool_]
+    """Dropped, corrupted, or overtaken by a newer one."""
+    under_way: NDArray[np.bool_]
+    """Had not left when the run ended."""
+
+    @property
+    def left(self) -> NDArray[np.bool_]:
+        """Left intact, and before every newer one."""
+        return ~self.lost & ~self.under_way
+
+    def longest_run(self) -> int:
+        """Most successive updates that were lost."""
+        longest = run = 0
+        for lost in self.lost.tolist():
+            run = run + 1 if lost else 0
+            longest = max(longest, run)
+        return longest
+
+
+def crossing(record: RunRecord, flow: Flow = Flow.UPDATE) -> Crossing:
+    """Say what became of the updates, or acknowledgements, that reached the network emulator."""
+    rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
+    releases = record[NETEM_RELEASE]
+    if record.scenario.is_acknowledged:
+        way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
+        releases = releases[releases["flow"] == way]
+    # The first intact one of a datagram and its copy is what counts: the copy, if that is it.
+    which = (rows["bit"] >= 0).astype(np.int64)
+    numbers = 2 * rows["sequence"] + which
+    left = 2 * releases["sequence"] + releases["copy"]
+    effectively = effective(rows["fate"])
+    stale = np.isin(numbers, left[releases["stale"] != 0])
+    delayed = np.where(which == 1, rows["copy_ns"], rows["release_ns"]) > rows["now_ns"]
+    under_way = effectively & delayed & ~np.isin(numbers, left)
+    return Crossing(rows, sequence, event_ns, ~effectively | stale, under_way)

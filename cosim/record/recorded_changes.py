@@ -1,0 +1,125 @@
+"""What was changed during a run, as its record has it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.record.run_record import Rows, RunRecord
+from noack.config.parameter_changes import Change, Schedule, settings_of
+from noack.config.resolution import loop_of
+from noack.config.runtime_parameters import is_of_loss_alone
+from noack.config.scenario import Scenario
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.model_flow import ModelFlow
+from noack.protocol.record_tables import CONTROLLER_SETTING, OWNER, SETTINGS
+from noack.protocol.topology import CHANGEABLE
+
+NEVER_NS = 2**63 - 1
+
+
+class Made(NamedTuple):
+    """A change of a run, and what became of it."""
+
+    change: Change
+    since_ns: Mapping[str, int]
+    """From when on it was in force, by process; one that never heard of it is not there."""
+    scenario: Scenario
+    """The scenario from then on."""
+
+    @property
+    def first_ns(self) -> int:
+        """From when on it was in force somewhere, or was to be."""
+        return min(self.change.t_ns, *self.since_ns.values())
+
+    @property
+    def everywhere_ns(self) -> int:
+        """From when on it was in force everywhere."""
+        return max(self.since_ns.get(role, NEVER_NS) for role in CHANGEABLE)
+
+    @property
+    def late(self) -> dict[str, int]:
+        """Processes that applied it after its time, and when."""
+        return {role: ns for role, ns in self.since_ns.items() if ns > self.change.t_ns}
+
+    @property
+    def touches_claims(self) -> bool:
+        """Whether anything is claimed of a run that rests on what was changed."""
+        return not is_of_loss_alone(self.change.settings)
+
+
+def changes_of(record: RunRecord) -> list[Made]:
+    """The changes of a run, in the order in which they came into force.
+
+    What a damaged record says of changes that its scenario could not have is left out.
+    """
+    since: dict[int, dict[str, int]] = {}
+    found: dict[int, Change] = {}
+    for table in SETTINGS:
+        for change, since_ns in _told(record[table]):
+            found.setdefault(change.number, change)
+            since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
+    made: list[Made] = []
+    scenario = record.scenario
+    schedule = Schedule(scenario)
+    for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
+        if _add(schedule, change, change.t_ns):
+            taken = schedule.take(change.t_ns)
+            assert taken is not None
+            made.append(Made(change, since[number], taken.scenario))
+    return made
+
+
+def model_flow(scenario: Scenario, told: Rows) -> ModelFlow:
+    """What the controller's model followed in a run.
+
+    Args:
+        scenario: the resolved scenario.
+        told: rows of ``controller_setting``.
+    """
+    loop, schedule = loop_of(scenario), Schedule(scenario)
+    flow, known = ModelFlow(loop.H, (), loop.setpoint), set()
+    for change, since_ns in _told(told):
+        if change.number not in known:  # one that is started anew is told once more
+            known.add(change.number)
+            _add(schedule, change, since_ns)
+    while (taken := schedule.take(NEVER_NS)) is not None:
+        flow.change(taken.since_ns, loop_of(taken.scenario).setpoint)
+    return flow
+
+
+def claimed_until_s(told: Rows) -> float:
+    """When what was claimed of a run at its start ends, as a process was told; infinite if never.
+
+    Args:
+        told: rows of one of the tables of changes.
+    """
+    ends_ns = [change.t_ns for change, _ in _told(told) if not is_of_loss_alone(change.settings)]
+    return min(ends_ns, default=np.inf) / NS_PER_S
+
+
+def model_flow_of(record: RunRecord) -> ModelFlow:
+    """What the controller's model followed in a run."""
+    return model_flow(record.scenario, record[CONTROLLER_SETTING])
+
+
+def _told(rows: Rows) -> list[tuple[Change, int]]:
+    found = []
+    for row in rows[np.argsort(rows["input"], kind="stable")]:
+        try:
+            settings = settings_of(row["change"].tobytes())
+        except ValueError:
+            continue
+        found.append(
+            (Change(int(row["sequence"]), int(row["t_ns"]), settings), int(row["since_ns"]))
+        )
+    return found
+
+
+def _add(schedule: Schedule, change: Change, since_ns: int) -> bool:
+    try:
+        schedule.announce("", change, 0, 0, since_ns - 1)
+    except CallerError:
+        return False
+    return True

@@ -1,0 +1,187 @@
+"""The run directory: the names of what it holds, and where the newest one is."""
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Any, TextIO
+
+from noack.config.plant_systems import Fmu, Python
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps
+from noack.config.system_files import unchanged
+from noack.core.errors import CallerError, MachineError, why
+from noack.core.regular_file import read_regular
+
+DEFAULT_RUNS = Path("runs")
+"""Where run directories are made, in the folder where a person stands."""
+SCENARIO_FILE = "scenario.toml"
+ENVIRONMENT_FILE = "environment.json"
+REPORTS_FILE = "reports.json"
+RECORDING_FILE = "recording.rrd"
+ENDING_FILE = "ending.json"
+SUMMARY_FILE = "summary.json"
+REPORT_FILE = "report.html"
+SPOOL = "spool"
+RECORD = "record"
+PLANT = "plant"
+"""The folder of the file that the plant is made of, if it is of one."""
+LATEST = "latest"
+_LOCK = ".lock"
+_MOST_JSON_BYTES = 64 * 2**20
+LEAST_FREE_BYTES = 16 * 1024 * 1024
+
+
+def new_run_dir(runs: Path, name: str) -> Path:
+    """Create a fresh run directory below ``runs``.
+
+    Raises:
+        MachineError: the directory cannot be created.
+    """
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+        free_bytes = shutil.disk_usage(runs).free
+        if free_bytes < LEAST_FREE_BYTES:
+            raise MachineError(
+                f"{runs}: only {free_bytes // 1024} KiB are free on the disk; a run wants "
+                f"{LEAST_FREE_BYTES // 2**20} MiB at the least"
+            )
+        for attempt in range(1000):
+            run_dir = runs / (f"{stamp}-{name}" + (f"-{attempt}" if attempt else ""))
+            with contextlib.suppress(FileExistsError):
+                run_dir.mkdir()
+                (run_dir / "logs").mkdir()
+                return run_dir
+    except OSError as error:
+        raise MachineError(f"{runs}: no run directory can be created: {why(error)}") from None
+    raise MachineError(f"{runs}: too many runs named {stamp}-{name}")
+
+
+def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
+    """Write the scenario of a run into its directory, with the file that its plant is made of.
+
+    So the run can be replayed when that file has changed, and the directory be taken elsewhere.
+
+    Returns:
+        The scenario for the run's processes, who use the kept file.
+
+    Raises:
+        CallerError: the plant's file is not what it was when the scenario was loaded.
+        OSError: the directory cannot be written.
+    """
+    system, here = resolved.plant.system, resolved
+    if isinstance(system, Fmu | Python) and system.file is not None:
+        file = unchanged(system)
+        kept = run_dir / PLANT / file.name
+        kept.parent.mkdir()
+        shutil.copyfile(file, kept)
+        resolved = _with_file(resolved, f"{PLANT}/{file.name}")
+        here = _with_file(resolved, str(kept.absolute()))
+    (run_dir / SCENARIO_FILE).write_text(dumps(resolved), encoding="utf-8")
+    return here
+
+
+def _with_file(scenario: Scenario, file: str) -> Scenario:
+    system = scenario.plant.system.model_copy(update={"file": file})
+    plant = scenario.plant.model_copy(update={"system": system})
+    return scenario.model_copy(update={"plant": plant})
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file of a run; empty if there is none, or a damaged one."""
+    try:
+        found = json.loads(read_regular(path, _MOST_JSON_BYTES))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def point_to_latest(run_dir: Path) -> None:
+    """Let ``latest`` beside the run directory lead to it; if it cannot, warn."""
+    latest = run_dir.parent / LATEST
+    scratch = run_dir.parent / f".{LATEST}.{os.getpid()}"
+    try:  # a convenience, not worth a run
+        scratch.unlink(missing_ok=True)
+        scratch.symlink_to(run_dir.name)
+        scratch.replace(latest)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        print(
+            f"noack: warning: {latest} cannot be replaced: {why(error)}; this run is in {run_dir}",
+            file=sys.stderr,
+        )
+
+
+def latest_run(runs: Path) -> Path:
+    """Return the newest run directory below ``runs``.
+
+    Raises:
+        CallerError: there is none, or the link or the directory is another user's: to open a run
+            may execute the code of its plant.
+    """
+    link = runs / LATEST
+    if not link.is_symlink() or not link.is_dir():
+        raise CallerError(f"{runs}: no run yet; `noack demo` makes one")
+    run_dir = link.resolve()
+    if {link.lstat().st_uid, run_dir.stat().st_uid} != {os.geteuid()}:
+        raise CallerError(
+            f"{link}: the link, or the run that it leads to, is another user's; "
+            "name the run directory, or a folder of your own by --runs"
+        )
+    return run_dir
+
+
+def chosen_run(run_dir: Path | None, runs: Path) -> Path:
+    """Return the run directory that was named, or the newest below ``runs`` if none was.
+
+    Raises:
+        CallerError: as :func:`latest_run`, which follows a ``latest`` that was named, too.
+    """
+    if run_dir is None:
+        return latest_run(runs)
+    if run_dir.name == LATEST and run_dir.is_symlink():
+        return latest_run(run_dir.parent)
+    return run_dir
+
+
+@contextmanager
+def under_way(run_dir: Path) -> Iterator[None]:
+    """Mark a run as under way; the launcher and the recorder do, each for as long as it lives.
+
+    Raises:
+        MachineError: the directory cannot be written.
+    """
+    with _lock_file(run_dir) as lock:
+        fcntl.flock(lock, fcntl.LOCK_SH)
+        yield
+
+
+@contextmanager
+def concluded(run_dir: Path) -> Iterator[None]:
+    """Have a run directory to oneself.
+
+    Raises:
+        CallerError: the run is still under way.
+        MachineError: the directory cannot be written.
+    """
+    with _lock_file(run_dir) as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CallerError(f"{run_dir}: the run is still under way") from None
+        yield
+
+
+def _lock_file(run_dir: Path) -> TextIO:
+    try:
+        return (run_dir / _LOCK).open("a")
+    except OSError as error:
+        raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None

@@ -1,0 +1,73 @@
+"""How a run ended, stored in its directory as soon as it is known.
+
+The file is made when the run begins, and blank until the end is known: so its place on the disk is
+taken, and the reason can be stored when the disk is full, or may no longer be written.
+"""
+
+import contextlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from cosim.record.run_directory import ENDING_FILE
+from noack.core.errors import ExitStatus, MachineError, NoackError, why
+
+_ROOM_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended."""
+
+    run_dir: Path
+    run_id: int
+    status: ExitStatus
+    reason: str
+    startup_s: float | None = None
+    """Wall time from the launch to simulated time 0; None if nobody saw it."""
+
+
+class EndingFile:
+    """The file in which a run's launcher stores how the run ends.
+
+    As a context it also stores the error that leaves it, unless an end is stored.
+
+    Args:
+        run_dir: the run's directory.
+
+    Raises:
+        MachineError: the file cannot be written.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._is_blank = True
+        try:
+            self._file = (run_dir / ENDING_FILE).open("wb", buffering=0)
+            self._file.write(b" " * _ROOM_BYTES)
+        except OSError as error:
+            raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        error: BaseException | None,
+        _traceback: TracebackType | None,
+    ) -> None:
+        if self._is_blank and isinstance(error, NoackError):
+            self.store(error.exit_status, str(error))
+        self._file.close()
+
+    def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
+        """Store how the run ended, in the words of its summary."""
+        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        self._is_blank = False
+        text = json.dumps(found).encode().ljust(_ROOM_BYTES)
+        with contextlib.suppress(OSError):  # the terminal shows it all the same
+            self._file.seek(0)
+            self._file.write(text)
+            self._file.truncate()

@@ -1,0 +1,90 @@
+"""Files that come with noack, found by name: scenarios and campaigns."""
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from noack.config import toml_file
+from noack.core.errors import CallerError
+
+KINDS = ("scenarios", "campaigns")
+"""And the folders in which they lie."""
+
+_SCHEMA = "#:schema"
+"""The line that tells an editor where the schema lies, which is not beside a copy."""
+
+
+class Shipped(NamedTuple):
+    """A file that comes with noack."""
+
+    name: str
+    description: str
+    path: Path
+
+
+def find_shipped(name: str, folder: str) -> Path:
+    """Return the path of a TOML file given by path, or by the name of a shipped one.
+
+    Args:
+        name: as the user gave it.
+        folder: scenarios or campaigns.
+
+    Raises:
+        CallerError: a bare name that is none of the shipped ones.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix == ".toml":
+        return path
+    names = shipped_names(folder)
+    if name in names:
+        return _path_of(name, folder)
+    if path.parent.name or not names:
+        return path
+    kind = folder.removesuffix("s")
+    for other in KINDS:
+        if name in shipped_names(other):
+            raise CallerError(f"{name}: that is a shipped {other.removesuffix('s')}, no {kind}")
+    raise CallerError(f"{name}: no such file, nor a shipped {kind}; {_hint(name, names)}")
+
+
+def shipped_names(folder: str) -> list[str]:
+    """Return the names of the scenarios or campaigns that come with noack."""
+    return sorted(file.stem for file in _place(folder).glob("*.toml"))
+
+
+def all_shipped(folder: str) -> list[Shipped]:
+    """Return the scenarios or campaigns that come with noack, by name."""
+    paths = (_path_of(name, folder) for name in shipped_names(folder))
+    return [Shipped(path.stem, toml_file.read(path)["description"], path) for path in paths]
+
+
+def text_of(name: str) -> str:
+    """Return what a shipped scenario or campaign says, to be copied.
+
+    Raises:
+        CallerError: there is none of this name.
+    """
+    for folder in KINDS:
+        if name in shipped_names(folder):
+            lines = _path_of(name, folder).read_text(encoding="utf-8").splitlines(keepends=True)
+            return "".join(line for line in lines if not line.startswith(_SCHEMA))
+    names = [known for folder in KINDS for known in shipped_names(folder)]
+    raise CallerError(f"{name}: nothing of that name is shipped; {_hint(name, names)}")
+
+
+def _hint(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f"{f'did you mean {close[0]}? There' if close else 'there'} are {', '.join(names)}"
+
+
+def _path_of(name: str, folder: str) -> Path:
+    """Where a shipped file lies; relative to the working directory if that is around it."""
+    path = _place(folder) / f"{name}.toml"
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _place(folder: str) -> Path:
+    """Where they lie: in the package that was installed, or beside it in the repository."""
+    here = Path(__file__).parent
+    return here / folder if (here / folder).is_dir() else here.parent / folder

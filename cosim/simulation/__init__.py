@@ -1,0 +1,1 @@
+"""Runs without processes: in virtual time, in exact continuous time, and compiled in batches."""

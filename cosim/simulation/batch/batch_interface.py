@@ -1,0 +1,289 @@
+"""What a batch is, and what comes of it.
+
+Everything is in SI units and in the paper's notation; k runs, n states, m inputs.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.simulation.continuous.continuous_run import MAX_EVENTS
+from cosim.simulation.continuous.network_fates import timeless
+from netem.link_machine import UPDATE_LINK
+from netem.rule_program import empty_state, program_of, stream_names
+from netem.rule_records import Verdict, dtype_of
+from noack.config.impairments import LinkSettings
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.random_streams import stream_keys
+from noack.trigger import self_triggered_interval
+from noack.trigger.policy_from_settings import policy_of
+from noack.trigger.trigger_policy import Policy
+
+_SMALLEST_THRESHOLD = 1e-140
+"""Its square, and the square's share that counts, must be numbers."""
+
+ROW = np.dtype(
+    [
+        ("transmissions", np.int64),
+        ("deliveries", np.int64),
+        ("inter_event_min_s", np.float64),
+        ("inter_event_mean_s", np.float64),
+        ("settling_s", np.float64),
+        ("cost", np.float64),
+        ("sup_e_c_scaled", np.float64),
+        ("final_norm", np.float64),
+        ("diverged_at_s", np.float64),
+        ("status", np.int64),
+    ]
+)
+"""The row of a run; NaN where a number is not defined.
+
+transmissions, deliveries: events, and those whose update arrived, until the end or the failure.
+inter_event_min_s, inter_event_mean_s: of the times between successive events; NaN below two events.
+settling_s: the last time at which ‖x‖ > settle ‖x(0)‖; NaN if it is so at the horizon.
+cost: ∫ xᵀQx + uᵀRu dt over the horizon, u = K x_c.
+sup_e_c_scaled: the supremum over the horizon of ‖W e_c‖ e^{αt}, the left limits at events included,
+to within 1e-10 of it (certified: no sample). Without a known start, e_c counts from event 0 on. α
+is that of a threshold that decays from the run's start on; of other policies it is 0.
+final_norm: ‖x‖ at the horizon.
+diverged_at_s: where a diverged run ends, as in :mod:`cosim.simulation.continuous.continuous_loop`.
+status: of :mod:`cosim.simulation.batch.batch_status`; if it is not OK, the measures of the whole
+run are NaN.
+"""
+
+
+class Population(NamedTuple):
+    """What is each run's own."""
+
+    A: NDArray[np.float64]
+    """True plants, (k, n, n), per second."""
+    B: NDArray[np.float64]
+    """True plants, (k, n, m)."""
+    x0: NDArray[np.float64]
+    """x(0), (k, n)."""
+    loss_seeds: NDArray[np.uint64]
+    """Seeds of the network's losses, (k,)."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What all runs of a batch share."""
+
+    H: Matrix
+    """What both models integrate between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
+    K: Matrix
+    """Gain, (m, n)."""
+    trigger: Policy
+    link: LinkSettings
+    """Losses, corruption, and the cap; ``network_fates`` has the same."""
+    horizon_s: float
+    known_start: bool
+    """Sensor and controller know x(0). Otherwise x_c = 0, and event 0 happens at t = 0."""
+    Q: Matrix | None = None
+    """Symmetric, (n, n); None: the identity."""
+    R: Matrix | None = None
+    """Symmetric, (m, m); None: the identity."""
+    settle: float = 0.02
+    """A run has settled when ‖x‖ stays at or below ``settle`` ‖x(0)‖."""
+    most_events: int = MAX_EVENTS
+
+
+class Events(NamedTuple):
+    """The events of a run."""
+
+    event_s: Vector
+    """(k,)"""
+    delivered: NDArray[np.bool_]
+    """(k,)"""
+
+
+def setting_of(resolved: Scenario) -> Setting:
+    """Return what the runs of a resolved scenario share; its plant, x(0) and seeds play no part.
+
+    Raises:
+        CallerError: the scenario is one that exact simulation cannot take.
+    """
+    resolved.require_unacknowledged()
+    resolved.require_unchanging()
+    resolved.require_exact()
+    loop = loop_of(resolved)
+    return Setting(
+        H=loop.H,
+        K=loop.K,
+        trigger=policy_of(resolved),
+        link=timeless(resolved.network.link),
+        horizon_s=resolved.horizon_s,
+        known_start=resolved.network.initial_sync == "known_state",
+    )
+
+
+def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
+    """Run every draw; a run's row depends on the setting and its own draw only, bit for bit.
+
+    Returns:
+        Rows of :data:`ROW`, (k,).
+
+    Raises:
+        CallerError: the threshold decays to nothing before the horizon, or the link does more than
+            to lose.
+        ValueError: matrices whose shapes do not fit.
+    """
+    rows, _ = _run(setting, population, 0)
+    return rows
+
+
+def run_events(setting: Setting, population: Population) -> Events:
+    """Run one draw, and return its events; raises as :func:`run_batch`.
+
+    Args:
+        setting: what runs share.
+        population: of one run.
+    """
+    if len(population.A) != 1:
+        raise ValueError(f"one run is wanted, not {len(population.A)}")
+    rows, log = _run(setting, population, setting.most_events)
+    events = int(rows["transmissions"][0])
+    return Events(log.event_s[:events], log.delivered[:events])
+
+
+def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[np.void], Any]:
+    from cosim.simulation.batch import batch_run, vector_lanes
+    from cosim.simulation.batch.batch_rule import rule_of
+    from cosim.simulation.batch.quadratic_crossing import squares_of
+    from cosim.simulation.batch.taylor import DEGREES, HIGHEST
+
+    _check(setting, population)
+    n, m = len(setting.H), len(setting.K)
+    guards, terms = setting.trigger.guards(n), HIGHEST + 1
+    system = batch_run.System(
+        H=_columns(setting.H),
+        K=_columns(setting.K),
+        weight=_columns(setting.trigger.weight),
+        Q=_columns(setting.Q),
+        R=_columns(setting.R),
+        inverse=np.append(0.0, 1.0 / np.arange(1.0, 2 * terms + 1)),
+        H_k=np.empty((terms + 1) * n * n),
+        rule=rule_of(guards),
+        fading_per_s=float(guards.fading_per_s),
+        horizon_s=float(setting.horizon_s),
+        known_start=bool(setting.known_start),
+        first_delivered=setting.link.first_delivered,
+        settle=float(setting.settle),
+        most_events=int(setting.most_events),
+    )
+    names = stream_names(setting.link, UPDATE_LINK)
+    keys = np.zeros((len(population.A), len(names), 2), np.int64)
+    for stage, name in enumerate(names):
+        keys[:, stage] = stream_keys(population.loss_seeds, *name)
+    draws = batch_run.Draws(
+        A=_columns(population.A), B=_columns(population.B), x0=_flat(population.x0), keys=keys
+    )
+    states = ("x_c", "e_c", "d", "x", "error", "weighted", "x_scaled")
+    space = batch_run.Space(
+        E=np.empty(n * n),
+        A_k=np.empty((terms + 1) * n * n),
+        X_k=np.empty((terms + 1) * n * n),
+        reach_s=np.empty(len(DEGREES)),
+        measured_s=np.empty(len(DEGREES)),
+        u=np.empty(terms * m),
+        u_scaled=np.empty(terms * m),
+        squares=np.empty(2 * terms),
+        sizes=np.empty(terms + 1),
+        **{name: np.empty(terms * max(n, m)) for name in states},
+    )
+    rows = np.zeros(len(population.A), ROW)
+    log = batch_run.Log(np.empty(room), np.empty(room, np.bool_))
+    _compiled()(
+        vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
+        squares_of(setting.trigger, n), rows, log,
+    )  # fmt: skip
+    return rows, log
+
+
+def _network(link: LinkSettings) -> Any:
+    """The link's rules, compiled, with room for one flow."""
+    from cosim.simulation.batch.batch_run import Network
+    from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
+
+    program = program_of(link, 0, UPDATE_LINK)
+    state = compiled_state(program, empty_state(program), 1, 1)
+    set_flow(state, 0, 0, link.first_delivered)
+    return Network(compiled_program(program), state, np.zeros(1, dtype_of(Verdict)))
+
+
+@cache
+def _compiled() -> Any:
+    from cosim.simulation.batch import (
+        batch_rule,
+        batch_run,
+        batch_status,
+        level_crossing,
+        norm_crossing,
+        piece_measures,
+        quadratic_crossing,
+        taylor,
+        vector_lanes,
+    )
+    from netem.engine.compiled_rules import compile_kept, prepare
+
+    modules: tuple[ModuleType, ...] = (
+        self_triggered_interval, batch_status, vector_lanes, taylor, norm_crossing,
+        level_crossing, batch_rule, quadratic_crossing, piece_measures, batch_run,
+    )  # fmt: skip
+    return compile_kept(batch_run.run_many, prepare("batch", modules))
+
+
+def _flat(array: NDArray[Any]) -> NDArray[np.float64]:
+    return np.ascontiguousarray(array, dtype=np.float64).ravel()
+
+
+def _columns(matrices: NDArray[Any] | None) -> NDArray[np.float64]:
+    """Matrices by columns, one after the other; nothing for None."""
+    return np.empty(0) if matrices is None else _flat(np.swapaxes(matrices, -1, -2))
+
+
+def _check(setting: Setting, population: Population) -> None:
+    k, n, m = len(population.loss_seeds), len(setting.H), len(setting.K)
+    wanted = {
+        "H": (setting.H, (n, n)),
+        "K": (setting.K, (m, n)),
+        "trigger.weight": (setting.trigger.weight, (n, n)),
+        "Q": (setting.Q, (n, n)),
+        "R": (setting.R, (m, m)),
+        "A": (population.A, (k, n, n)),
+        "B": (population.B, (k, n, m)),
+        "x0": (population.x0, (k, n)),
+        "loss_seeds": (population.loss_seeds, (k,)),
+    }
+    for name, (array, shape) in wanted.items():
+        if array is not None and array.shape != shape:
+            raise ValueError(f"{name}: expected the shape {shape}, found {array.shape}")
+    if population.loss_seeds.dtype != np.uint64:
+        raise ValueError(f"loss_seeds: expected uint64, found {population.loss_seeds.dtype}")
+    if timeless(setting.link) != setting.link:
+        raise CallerError(
+            "network.impairments: a batch knows losses and corruption only; "
+            "leave out what takes time"
+        )
+    guards = setting.trigger.guards(n)
+    for form in (guards.form, *([guards.reserve.gain] if guards.reserve else [])):
+        for part in form:
+            if part.shape[1] != 2 * n:
+                raise ValueError(f"trigger: expected {2 * n} columns, found {part.shape[1]}")
+    if guards.from_event or guards.rate_per_s == 0 or guards.floor >= _SMALLEST_THRESHOLD:
+        return
+    vanishes_s = math.log(guards.level / _SMALLEST_THRESHOLD) / guards.rate_per_s
+    if vanishes_s < setting.horizon_s:
+        raise CallerError(
+            f"trigger: from {vanishes_s:g} s on the threshold is below "
+            f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
+            "give trigger.floor or a shorter horizon"
+        )

@@ -1,0 +1,125 @@
+"""When a policy looks at its comparison, and against what: its guards' times and thresholds.
+
+The numbers are those of :class:`noack.trigger.trigger_rule.Guards`, and so are the meanings.
+"""
+
+import math
+from typing import NamedTuple
+
+from noack.trigger.self_triggered_interval import Forecast, interval_ns
+from noack.trigger.trigger_rule import Guards
+
+_GRID_SLACK = 1e-9
+"""Of a period: rounding of an event's time on the grid, as in ``continuous_loop``."""
+_NS = 1e-9
+_PER_S = 1e9
+
+
+class Rule(NamedTuple):
+    """A policy's guards but for their forms."""
+
+    compares: bool
+    """Whether there is a form."""
+    level: float
+    rate_per_s: float
+    floor: float
+    from_event: bool
+    grid_s: float
+    idle_ns: float
+    longest_ns: float
+    shortest_ns: float
+    forecasts: bool
+    forecast: Forecast
+
+
+def rule_of(guards: Guards) -> Rule:
+    """Return the numbers of a policy's guards."""
+    return Rule(
+        compares=len(guards.form.up) > 0,
+        level=float(guards.level),
+        rate_per_s=float(guards.rate_per_s),
+        floor=float(guards.floor),
+        from_event=guards.from_event,
+        grid_s=guards.grid_ns * _NS,
+        idle_ns=float(guards.idle_ns),
+        longest_ns=float(guards.longest_ns),
+        shortest_ns=float(guards.shortest_ns),
+        forecasts=guards.forecast is not None,
+        forecast=Forecast(*map(float, guards.forecast or (0.0,) * len(Forecast._fields))),
+    )
+
+
+class Span(NamedTuple):
+    """What an event makes of the rule; seconds since the run's start."""
+
+    since_s: float
+    """t₀."""
+    level: float
+    """c."""
+    floor_from_s: float
+    """From when on the floor is the threshold."""
+    begin_s: float
+    """The comparison counts from here on."""
+    due_s: float
+    """The next event is due."""
+    point: int
+    """The next of the grid."""
+
+
+def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
+    """The rule after an event, or from the start on.
+
+    Args:
+        rule: the rule.
+        t_s: time of the event.
+        left: ‖P z‖ just after it, if the rule is ``from_event``.
+        size: ‖x‖_W, if it has a forecast.
+    """
+    level, since_s, due_ns, point = rule.level, 0.0, rule.longest_ns, 0
+    if rule.from_event:
+        level, since_s = left, t_s
+    if rule.forecasts:
+        due_ns = interval_ns(rule.forecast, size, t_s, rule.shortest_ns, rule.longest_ns)
+    floor_from_s = -math.inf
+    if level > rule.floor:
+        floor_from_s = math.inf
+        if rule.floor > 0.0 and rule.rate_per_s > 0.0:
+            floor_from_s = since_s + math.log(level / rule.floor) / rule.rate_per_s
+    # In nanoseconds, as the rule is: what falls on the horizon does so in every engine.
+    due_s = (t_s * _PER_S + due_ns) * _NS
+    begin_s = min((t_s * _PER_S + rule.idle_ns) * _NS, due_s)
+    if rule.grid_s > 0.0:
+        point = math.floor(t_s / rule.grid_s + _GRID_SLACK) + 1
+        if begin_s > t_s:
+            point = max(point, math.ceil(begin_s / rule.grid_s - _GRID_SLACK))
+    return Span(since_s, level, floor_from_s, begin_s, due_s, point)
+
+
+class Phase(NamedTuple):
+    """What holds of the rule from a time on."""
+
+    until_s: float
+    """So long."""
+    compares: bool
+    """The comparison counts."""
+    threshold: float
+    """It is this at the phase's beginning; 0: there is none."""
+    rate_per_s: float
+    """At which it decays."""
+
+
+def phase_at(rule: Rule, span: Span, t_s: float) -> Phase:
+    """What holds from ``t_s`` on: the comparison counts or not, its threshold decays or not."""
+    if t_s < span.begin_s:
+        return Phase(span.begin_s, False, 0.0, 0.0)
+    if not rule.compares:
+        return Phase(span.due_s, False, 0.0, 0.0)
+    if t_s < span.floor_from_s:
+        threshold = span.level * math.exp(-rule.rate_per_s * (t_s - span.since_s))
+        return Phase(min(span.due_s, span.floor_from_s), True, threshold, rule.rate_per_s)
+    return Phase(span.due_s, True, rule.floor, 0.0)
+
+
+def last_point(rule: Rule, t_s: float) -> int:
+    """The last point of the grid up to a time."""
+    return math.floor(t_s / rule.grid_s + _GRID_SLACK)

@@ -1,0 +1,173 @@
+"""Where a polynomial first meets a level that decays, by steps that cannot pass it.
+
+h(s) = g(s) − c e^{−rs} is followed from where it is negative, as in
+:mod:`cosim.simulation.batch.norm_crossing`, but g is a number. With |g̈| ≤ b on [s, a] and c ≥ 0,
+
+    h(s + δ) ≤ φ(δ) = h(s) + ḣ(s) δ + ½ b δ²,    as ḧ = g̈ − r² c e^{−rs} ≤ b,
+
+and a step of length δ up to φ's positive root passes no crossing, however short: φ is convex, and
+negative in between. As ḧ ≥ −(b + r² c e^{−rs}) =: −L, h ascends on all of [s, a] if
+ḣ(s) > L (a − s): it has one root there, or none, and Newton's method may take any steps that stay
+within a bracket.
+
+b = Σ k(k−1) |g_k| a^{k−2} belongs to [0, a], and is made anew where a nearer a makes it much
+smaller. Nothing is sampled. What remains is rounding: where h is below 0 by no more than that, a
+tangency is passed or met.
+
+h may begin at 0, as an envelope does that begins at the event, and go down from there: then the
+step is −2ḣ/b. It is an event at once if it begins above 0, or at 0 and goes up.
+
+How it ends. Each step leads on, or is too short to be one in floating point, which ends it; so does
+MOST_STEPS. Newton's method may take NEWTON_STEPS; then its bracket is halved, to the last bit.
+"""
+
+import math
+
+from cosim.simulation.batch.norm_crossing import (
+    CLOSE,
+    MOST_STEPS,
+    NEWTON_STEPS,
+    NONE,
+    TURNS,
+    UNRESOLVED,
+    bracketed,
+)
+from cosim.simulation.batch.taylor import Array
+
+_AHEAD = 3.0
+_NEARER = 0.6
+
+
+def first_root(
+    g: Array, degree: int, level: float, rate: float, grain: float, end_s: float
+) -> float:
+    """The first s in [0, ``end_s``) from which g(s) ≥ ``level`` e^{−``rate`` s}.
+
+    Args:
+        g: coefficients g_k.
+        degree: the highest k.
+        level: c ≥ 0.
+        rate: r ≥ 0, per second.
+        grain: h(0) is known to within so much, by rounding.
+        end_s: where to stop.
+
+    Returns:
+        The time; NONE; or UNRESOLVED after MOST_STEPS.
+    """
+    s, ahead_s = 0.0, end_s
+    most = bend_of(g, degree, end_s)
+    limit = level
+    value, slope = g[0] - level, g[1] + rate * level
+    if value > grain or (value >= -grain and slope > 0.0):
+        return 0.0
+    if end_s <= 0.0:
+        return NONE
+    value = min(value, 0.0)
+    for _ in range(MOST_STEPS):
+        if slope > (most + rate * rate * limit) * (ahead_s - s):
+            s = ascending_root(g, degree, level, rate, s, value, slope, ahead_s)
+            if s != NONE or ahead_s == end_s:
+                return s
+            s = ahead_s
+        else:
+            step = safe_step(value, slope, most, ahead_s - s)
+            if s + step >= end_s:
+                return NONE
+            if s + step <= s:
+                return s
+            s = min(s + step, ahead_s)
+            if s + _AHEAD * step < _NEARER * ahead_s:
+                ahead_s = s + _AHEAD * step
+                most = bend_of(g, degree, ahead_s)
+        if s == ahead_s:
+            ahead_s = end_s
+            most = bend_of(g, degree, ahead_s)
+        limit = level * math.exp(-rate * s) if rate > 0.0 else level
+        value, slope = number_and_slope(g, degree, s)
+        value, slope = value - limit, slope + rate * limit
+        if value >= 0.0:
+            return s
+    return UNRESOLVED
+
+
+def safe_step(value: float, slope: float, most: float, span: float) -> float:
+    """φ's positive root, where φ(0) ≤ 0; or ``span`` if that is nearer.
+
+    Args:
+        value: φ(0) = h(s).
+        slope: ḣ(s).
+        most: b.
+        span: a − s.
+    """
+    if value + span * (slope + 0.5 * most * span) <= 0.0:
+        return span
+    root = math.sqrt(slope * slope - 2.0 * most * value)
+    if slope > 0.0:
+        return min(-2.0 * value / (slope + root), span)
+    return min((root - slope) / most, span)
+
+
+def ascending_root(
+    g: Array, degree: int, level: float, rate: float, s: float, value: float, slope: float,
+    ahead_s: float,
+) -> float:  # fmt: skip
+    """The root of h in (``s``, ``ahead_s``), where h ascends; or NONE.
+
+    Args:
+        g: as of :func:`first_root`, and so are degree, level and rate.
+        degree: degree.
+        level: c.
+        rate: r.
+        s: where h is negative.
+        value: h(s).
+        slope: ḣ(s).
+        ahead_s: a.
+    """
+    low_s, high_s, beyond = s, ahead_s, False
+    for turn in range(TURNS):
+        following = s - value / slope if slope > 0.0 else math.inf
+        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
+            return following if following < ahead_s or beyond else NONE
+        following = bracketed(following, turn, low_s, high_s, beyond)
+        if following == s:
+            return s
+        s = following
+        limit = level * math.exp(-rate * s) if rate > 0.0 else level
+        value, slope = number_and_slope(g, degree, s)
+        value, slope = value - limit, slope + rate * limit
+        if value >= 0.0:
+            high_s, beyond = s, True
+        elif s == ahead_s:
+            return NONE
+        else:
+            low_s = s
+    return s
+
+
+def estimate(g: Array, level: float, rate: float) -> float:
+    """Where h meets 0 if it is what its first three coefficients say; infinite if nowhere."""
+    value, slope = g[0] - level, g[1] + rate * level
+    half = g[2] - 0.5 * rate * rate * level
+    square = slope * slope - 4.0 * half * min(value, 0.0)
+    if square < 0.0:
+        return math.inf
+    if slope > 0.0:
+        return -2.0 * min(value, 0.0) / (slope + math.sqrt(square))
+    return (math.sqrt(square) - slope) / (2.0 * half) if half > 0.0 else math.inf
+
+
+def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
+    """The polynomial and its derivative."""
+    total, slope = g[degree], 0.0
+    for k in range(degree - 1, -1, -1):
+        slope = slope * s + total
+        total = total * s + g[k]
+    return total, slope
+
+
+def bend_of(g: Array, degree: int, s: float) -> float:
+    """A bound on |g̈| in [0, s]: the second derivative of Σ |g_k| s^k."""
+    total = 0.0
+    for k in range(degree, 1, -1):
+        total = total * s + k * (k - 1.0) * abs(g[k])
+    return total * (1.0 + 1e-9)

@@ -1,0 +1,210 @@
+"""Where a polynomial curve first meets a threshold, by steps that cannot pass it.
+
+h(s) = |y(s)| − c e^{−rs} is followed from where it is negative. With |ÿ| ≤ b on the way ahead, up
+to a,
+
+    h(s + δ) ≤ φ(δ) = |y(s) + ẏ(s) δ| + ½ b δ² − c_s (1 − r δ),    c_s = c e^{−rs},
+
+and φ is convex: where φ(0) < 0 and φ(δ) ≤ 0, φ and h are negative in between, and a step of length
+δ passes no crossing, however short. Newton's method from the right stays right of φ's root, and
+the chord from there to (0, φ(0)) meets 0 left of it: that is the step.
+
+Where y ≠ 0, ḧ = (|ẏ|² − (y·ẏ/|y|)² + y·ÿ)/|y| − r² c e^{−rs} ≥ −(b + r² c_s) =: −L, and where
+y = 0, |y| has an edge that bends h upward only. So if ḣ(s) > L (a − s), h ascends on all of
+[s, a]: it has one root there, or none, and Newton's method may take any steps that stay within the
+interval.
+
+b is :func:`cosim.simulation.batch.taylor.bend`; it belongs to [0, a], and is made anew where a
+nearer a makes it much smaller. Nothing is sampled. What remains is rounding: where h is below 0 by
+no more than that, steps have about 1e-8 of the curve's own time, and a tangency in floating point
+is passed or met. Backwards from the end the same holds for s ↦ y(end − s).
+
+How it ends. Each step leads on, or is too short to be one in floating point, which ends it. A curve
+that stays just below its threshold may still take very many; after MOST_STEPS it is UNRESOLVED. A
+chord of φ is above φ, so that Newton's method may be left at any time, for a step that is shorter
+and as safe. Where h ascends it may take NEWTON_STEPS; then its bracket is halved, to the last bit.
+
+Only |y| is known here. Other quadratic event functions are
+:mod:`cosim.simulation.batch.quadratic_crossing`.
+"""
+
+import math
+
+from cosim.simulation.batch.taylor import Array, bend, value_and_slope
+from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load
+
+NONE = -1.0
+UNRESOLVED = -2.0
+MOST_STEPS = 1_000_000
+"""Some 50 ms."""
+CLOSE = 1e-8
+"""Newton's last step, as a share of the way; its square is below rounding."""
+_AHEAD = 3.0
+_NEARER = 0.6
+NEWTON_STEPS = 60
+TURNS = NEWTON_STEPS + 1100
+"""More halvings than there are between any two numbers."""
+
+
+def first_exit(
+    curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, most_steps: int,
+    n: Width,
+) -> float:  # fmt: skip
+    """The first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
+
+    Args:
+        curve: coefficients of y.
+        p: the degree.
+        level: c > 0.
+        rate: r ≥ 0, per second; 0 if ``backward``.
+        end_s: where to stop.
+        backward: look at y(``end_s`` − s) instead.
+        most_steps: give up after so many.
+        n: how many numbers y has.
+
+    Returns:
+        The time; NONE; or UNRESOLVED.
+    """
+    s, ahead_s = 0.0, end_s
+    most = bend(curve, p, end_s, n)
+    if backward:
+        y, dy = look(curve, p, s, end_s, backward, n)
+    else:
+        y, dy = load(curve, 0, n), load(curve, len(n), n)
+    for _ in range(most_steps):
+        square, mixed, speed = dot(y, y), dot(y, dy), dot(dy, dy)
+        limit = level * math.exp(-rate * s) if rate > 0.0 else level
+        size = math.sqrt(square)
+        if size >= limit:
+            return s
+        if s >= end_s:
+            return NONE
+        slope = rate * limit + (mixed / size if size > 0.0 else math.sqrt(speed))
+        if slope > (most + rate * rate * limit) * (ahead_s - s):
+            s = ascent(curve, p, level, rate, s, size - limit, slope, ahead_s, end_s, backward, n)
+            if s != NONE or ahead_s == end_s:
+                return s
+            s = ahead_s
+        else:
+            step = safe(square, mixed, speed, limit, rate, most, ahead_s - s)
+            if s + step >= end_s:
+                return NONE
+            if s + step <= s:
+                return s
+            s = min(s + step, ahead_s)
+            if s + _AHEAD * step < _NEARER * ahead_s and not backward:
+                ahead_s = s + _AHEAD * step
+                most = bend(curve, p, ahead_s, n)
+        if s == ahead_s:
+            ahead_s = end_s
+            most = bend(curve, p, ahead_s, n)
+        y, dy = look(curve, p, s, end_s, backward, n)
+    return UNRESOLVED
+
+
+def safe(
+    square: float, mixed: float, speed: float, limit: float, rate: float, most: float, span: float
+) -> float:
+    """The length of a step that passes no crossing; ``span`` if there is none so far.
+
+    Args:
+        square: |y|².
+        mixed: y·ẏ.
+        speed: |ẏ|².
+        limit: c_s.
+        rate: r.
+        most: b.
+        span: a − s.
+    """
+    length, below = span, limit - math.sqrt(square)
+    above = 0.0
+    for _ in range(NEWTON_STEPS):
+        straight = math.sqrt(max(square + length * (2.0 * mixed + length * speed), 0.0))
+        above = straight + limit * (rate * length - 1.0) + 0.5 * most * length * length
+        if above <= 0.0:
+            return length
+        slope = limit * rate + most * length
+        if straight > 0.0:
+            slope += (mixed + length * speed) / straight
+        if above <= below:
+            return length * (below / (below + above))
+        following = length - above / slope
+        if not 0.0 < following < length:
+            return 0.0
+        length = following
+    return length * (below / (below + above))
+
+
+def ascent(
+    curve: Array, p: int, level: float, rate: float, s: float, excess: float, slope: float,
+    ahead_s: float, end_s: float, backward: bool, n: Width,
+) -> float:  # fmt: skip
+    """The root of h in (``s``, ``ahead_s``), where h ascends; or NONE.
+
+    Args:
+        curve: as of :func:`first_exit`, and so are p, level, rate, end_s, backward and n.
+        p: degree.
+        level: c.
+        rate: r.
+        s: where h is negative.
+        excess: h(s).
+        slope: ḣ(s).
+        ahead_s: a.
+        end_s: the end.
+        backward: the sense.
+        n: how many numbers.
+    """
+    low_s, high_s, beyond = s, ahead_s, False
+    for turn in range(TURNS):
+        following = s - excess / slope if slope > 0.0 else math.inf
+        if abs(following - s) <= CLOSE * s and turn < NEWTON_STEPS:
+            return following if following < ahead_s or beyond else NONE
+        following = bracketed(following, turn, low_s, high_s, beyond)
+        if following == s:
+            return s
+        s = following
+        y, dy = look(curve, p, s, end_s, backward, n)
+        limit = level * math.exp(-rate * s) if rate > 0.0 else level
+        size = math.sqrt(dot(y, y))
+        excess = size - limit
+        slope = rate * limit + (dot(y, dy) / size if size > 0.0 else 0.0)
+        if excess >= 0.0:
+            high_s, beyond = s, True
+        elif s == ahead_s:
+            return NONE
+        else:
+            low_s = s
+    return s
+
+
+def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
+    """Newton's next point if it is within the bracket, and not too many came before; or a safe one.
+
+    Args:
+        following: Newton's.
+        turn: how many came before.
+        low_s: below the root, if there is one.
+        high_s: above it, if ``beyond``; else the end.
+        beyond: there is one.
+    """
+    if turn < NEWTON_STEPS and low_s < following < high_s:
+        return following
+    if not beyond and (turn >= NEWTON_STEPS or following >= high_s):
+        return high_s
+    return 0.5 * (low_s + high_s)
+
+
+def look(
+    curve: Array, p: int, s: float, end_s: float, backward: bool, n: Width
+) -> tuple[Lanes, Lanes]:
+    """Y and ẏ, forward or backward."""
+    if backward:
+        y, dy = value_and_slope(curve, p, end_s - s, n)
+        return y, filled(0.0, n) - dy
+    return value_and_slope(curve, p, s, n)
+
+
+def last_entry(curve: Array, p: int, level: float, end_s: float, n: Width) -> float:
+    """The last s in [0, ``end_s``] up to which |y(s)| ≥ ``level``; or NONE, or UNRESOLVED."""
+    back_s = first_exit(curve, p, level, 0.0, end_s, True, MOST_STEPS, n)
+    return back_s if back_s < 0.0 else end_s - back_s

@@ -1,0 +1,204 @@
+"""What is measured of a piece of a run in which nothing is reset, from its Taylor polynomials.
+
+The cost integrates the polynomials' products exactly. The supremum and the settling time look for
+crossings with a level (:mod:`cosim.simulation.batch.norm_crossing`), so that nothing between two
+times is missed.
+"""
+
+import math
+
+from cosim.simulation.batch.level_crossing import first_root
+from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED, first_exit, last_entry
+from cosim.simulation.batch.taylor import Array, largest, squared, value, value_and_slope
+from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, fma, load, store, times
+
+CERTAINTY = 1e-10
+"""The true supremum is at most by this share above the one that is returned."""
+_SMALL_SHARE = 1e-27
+_LEAST = 1e-150
+_LARGEST = 1e150
+_CLIMBS = 12
+_HALVINGS = 60
+_FEW_STEPS = 50
+_RISES = 10_000
+"""Each passes a maximum, of which a polynomial of degree 24 has few, or rises by CERTAINTY."""
+
+
+def square_integrals(
+    x: Array, u: Array, p: int, s: float, Q: Array, R: Array, inverse: Array,
+    x_scaled: Array, u_scaled: Array, n: Width, m: Width,
+) -> float:  # fmt: skip
+    """∫₀ˢ xᵀQx + uᵀRu of polynomials, exactly but for rounding.
+
+    With v_k = c_k s^k the part of x is s Σ_{i,j} v_iᵀ Q v_j/(i + j + 1).
+
+    Args:
+        x: coefficients c_k.
+        u: likewise.
+        p: the degree.
+        s: where to stop.
+        Q: symmetric, n² numbers; or none, for the identity.
+        R: likewise, m².
+        inverse: 1/k at place k, up to 2p + 1.
+        x_scaled: scratch, (p + 1) n numbers.
+        u_scaled: scratch, (p + 1) m numbers.
+        n: how many states.
+        m: how many inputs.
+    """
+    size, inputs, power = len(n), len(m), 1.0
+    for k in range(p + 1):
+        store(x_scaled, k * size, load(x, k * size, n) * power)
+        store(u_scaled, k * inputs, load(u, k * inputs, m) * power)
+        power *= s
+    # What the last coefficients add is known, and often nothing.
+    v, w = load(x_scaled, 0, n), load(u_scaled, 0, m)
+    negligible = _SMALL_SHARE * (dot(v, v) + dot(w, w))
+    while p > 1:
+        v, w = load(x_scaled, p * size, n), load(u_scaled, p * inputs, m)
+        if dot(v, v) + dot(w, w) > negligible:
+            break
+        p -= 1
+    x_total, u_total = filled(0.0, n), filled(0.0, m)
+    for i in range(p + 1):
+        # Two sums at a time: one alone would wait for its own last addition.
+        v, w = load(x_scaled, i * size, n), load(u_scaled, i * inputs, m)
+        x_sum, u_sum = v * (0.5 * inverse[2 * i + 1]), w * (0.5 * inverse[2 * i + 1])
+        x_more, u_more = filled(0.0, n), filled(0.0, m)
+        for j in range(i + 1, p, 2):
+            x_sum = fma(load(x_scaled, j * size, n), inverse[i + j + 1], x_sum)
+            u_sum = fma(load(u_scaled, j * inputs, m), inverse[i + j + 1], u_sum)
+            x_more = fma(load(x_scaled, (j + 1) * size, n), inverse[i + j + 2], x_more)
+            u_more = fma(load(u_scaled, (j + 1) * inputs, m), inverse[i + j + 2], u_more)
+        if i < p and (p - i) % 2 == 1:
+            x_more = fma(load(x_scaled, p * size, n), inverse[i + p + 1], x_more)
+            u_more = fma(load(u_scaled, p * inputs, m), inverse[i + p + 1], u_more)
+        x_sum, u_sum = x_sum + x_more, u_sum + u_more
+        x_total = fma(x_sum if len(Q) == 0 else times(Q, 0, x_sum, n), v, x_total)
+        u_total = fma(u_sum if len(R) == 0 else times(R, 0, u_sum, m), w, u_total)
+    return 2.0 * s * (dot(x_total, filled(1.0, n)) + dot(u_total, filled(1.0, m)))
+
+
+def raised(
+    best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, squares: Array,
+    n: Width,
+) -> float:  # fmt: skip
+    """The larger of ``best`` and the supremum of |y(s)| e^{rate s} ``growth`` in [0, ``end_s``].
+
+    It is a value that is taken, and the true supremum is larger by a share of CERTAINTY at most
+    (or below 1e-150, or infinite beyond 1e150). A curve that stays close to one level, as an
+    oscillation does, is looked at once more as |y|², a number, where terms that cancel are gone.
+    UNRESOLVED if that does not help (:mod:`cosim.simulation.batch.level_crossing`), or the curve
+    rises again and again.
+
+    Args:
+        best: a value.
+        curve: coefficients of y.
+        p: the degree.
+        end_s: where to stop.
+        rate: per second.
+        growth: a factor.
+        squares: scratch, 2p + 1 numbers.
+        n: how many numbers y has.
+    """
+    for _ in range(_RISES):
+        if best >= _LARGEST:
+            return best
+        level = max(best * (1.0 + CERTAINTY), _LEAST) / growth
+        s = first_exit(curve, p, level, rate, end_s, False, _FEW_STEPS, n)
+        if s == UNRESOLVED:
+            squared(curve, p, filled(1.0, n), squares, n)
+            s = first_root(squares, 2 * p, level * level, 2.0 * rate, 0.0, end_s)
+        if s == NONE:
+            return best
+        if s == UNRESOLVED:
+            return UNRESOLVED
+        found = _climbed(curve, p, s, end_s, rate, n)
+        best = max(best * (1.0 + CERTAINTY), found * growth)
+    return UNRESOLVED
+
+
+def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: Width) -> float:
+    """|y(s)| e^{rate s} at, or near, a maximum to the right of ``low_s``."""
+    y, dy = value_and_slope(curve, p, low_s, n)
+    low = dot(y, dy) + rate * dot(y, y)
+    best = math.sqrt(dot(y, y)) * math.exp(rate * low_s)
+    y, dy = value_and_slope(curve, p, high_s, n)
+    high = dot(y, dy) + rate * dot(y, y)
+    for _ in range(_CLIMBS):
+        # Regula falsi where the slope falls through 0, and halves elsewhere.
+        s = 0.5 * (low_s + high_s)
+        if low > 0.0 > high:
+            s = low_s + (high_s - low_s) * (low / (low - high))
+        y, dy = value_and_slope(curve, p, s, n)
+        slope = dot(y, dy) + rate * dot(y, y)
+        found = math.sqrt(dot(y, y)) * math.exp(rate * s)
+        rises = slope > 0.0 and found >= best
+        best = max(best, found)
+        if rises:
+            low_s, low, high = s, slope, 0.5 * high
+        else:
+            high_s, high, low = s, slope, 0.5 * low
+    return best
+
+
+def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n: Width) -> float:
+    """The last s in [0, ``end_s``] at which |y(s)| > ``level``; or NONE, or UNRESOLVED.
+
+    Args:
+        curve: coefficients of y.
+        p: the degree.
+        end_s: where to stop.
+        level: the level.
+        ended: y(``end_s``).
+        n: how many numbers y has.
+    """
+    square = level * level
+    if dot(ended, ended) > square:
+        return end_s
+    if largest(curve, p, end_s, n) <= square:
+        return NONE
+    return last_entry(curve, p, level, end_s, n)
+
+
+def passed_at(
+    x_c: Array, e_c: Array, d: Array, p: int, end_s: float, limit: float, level: float,
+    rate: float, n: Width,
+) -> float:  # fmt: skip
+    """When the size of the loop passes a limit, for it is below it at 0 and beyond at ``end_s``.
+
+    Args:
+        x_c: coefficients.
+        e_c: coefficients.
+        d: coefficients.
+        p: the degree.
+        end_s: a time.
+        limit: of the size.
+        level: and so many times ``limit``, e^{−rate s} of it; 0: this does not count.
+        rate: per second.
+        n: how many states.
+    """
+    low_s, high_s = 0.0, end_s
+    for _ in range(_HALVINGS):
+        s = 0.5 * (low_s + high_s)
+        model, error, apart = value(x_c, p, s, n), value(e_c, p, s, n), value(d, p, s, n)
+        if is_within(model, error, apart, limit, level * math.exp(-rate * s)):
+            low_s = s
+        else:
+            high_s = s
+    return high_s
+
+
+def is_within(x_c: Lanes, e_c: Lanes, d: Lanes, limit: float, level: float) -> bool:
+    """Whether ‖(x, e_s, e_c)‖ is below a limit, and below so many times a threshold if it has one.
+
+    Args:
+        x_c: the controller's model.
+        e_c: its error.
+        d: x_s − x_c.
+        limit: the limit.
+        level: the threshold, or 0.
+    """
+    x, e_s = x_c - e_c, e_c + d
+    if level > 0.0:
+        limit *= min(level, 1.0)
+    return dot(x, x) + dot(e_s, e_s) + dot(e_c, e_c) < limit * limit

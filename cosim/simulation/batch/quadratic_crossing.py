@@ -1,0 +1,215 @@
+"""A policy's quadratic comparison between two events, as a polynomial in time.
+
+With z = (x, e_s), a policy compares ‖P z‖² − ‖N z‖² − η with a squared threshold
+(:mod:`noack.trigger.trigger_condition`). On a piece of a run z is a Taylor polynomial of degree p
+(:mod:`cosim.simulation.batch.taylor`), hence the squares are one of degree 2p: the coefficients of
+y_i² add up to Σ_{i+j=k} y_i · S y_j, y = [P; N] z, S the signs. η̇ = −λη + ψ has the Taylor
+coefficients
+
+    η_{k+1} = (ψ_k − λ η_k)/(k + 1),
+
+and from degree D = 2p + 1 on η_{k+1} = −λ η_k/(k + 1), as ψ is a polynomial of degree 2p. What is
+left out after degree q ≥ D is at most |η_q| s^q (λs/(q+1))/(1 − λs/(q+2)). Pieces are so short that
+λs ≤ 2; then each further coefficient counts for 2/(q + 1) of the last one or less, and _MORE of
+them, D ≥ 9, bring this below 2⁻⁵³ of |η_D| s^D: 2²⁰ 9!/29! < 1e-19.
+
+All is divided by the square of a number of the size of the state, so that what has decayed to
+1e-150 keeps its relative accuracy.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.simulation.batch.batch_rule import Rule, last_point
+from cosim.simulation.batch.level_crossing import estimate, first_root, number_and_slope
+from cosim.simulation.batch.norm_crossing import NONE
+from cosim.simulation.batch.taylor import HIGHEST, Array, squared
+from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, load, store, times, width
+from noack.trigger.trigger_condition import Form, of_error
+from noack.trigger.trigger_policy import Policy
+
+_MORE = 20
+MOST_TERMS = 2 * HIGHEST + 2 + _MORE
+"""Coefficients of the comparison."""
+_LEAST_SCALE = 1e-150
+_GRAIN = 16 * 2.0**-52
+SLOWEST = 2.0
+"""λs on a piece."""
+
+
+class Squares(NamedTuple):
+    """The comparison's form, and that of its reserve; matrices by columns."""
+
+    rows: Width
+    """How many P and N have; rows of zeros fill them up."""
+    form: Array
+    """[P; N], for x above, then for e_s."""
+    form_signs: Array
+    gain: Array
+    """[P_η; N_η]; empty: there is no η."""
+    gain_signs: Array
+    decay_per_s: float
+    """λ."""
+    first_reserve: float
+    y: Array
+    """Scratch: coefficients of [P; N] z."""
+    w: Array
+    """Scratch: likewise of η's."""
+    g: Array
+    """Scratch: of the comparison."""
+    eta: Array
+    """Scratch: of η."""
+
+
+def squares_of(policy: Policy, n: int) -> Squares | None:
+    """Return a policy's comparison; None if it has none, or that of ‖W e_s‖ with a threshold.
+
+    Args:
+        policy: the policy.
+        n: how many states.
+    """
+    guards = policy.guards(n)
+    form, reserve = guards.form, guards.reserve
+    if not len(form.up):
+        return None
+    plain = np.array_equal(form.up, of_error(n, policy.weight)) and not len(form.down)
+    if plain and reserve is None and not guards.from_event and not guards.grid_ns:
+        return None
+    gain = Form(form.up[:0], form.down[:0]) if reserve is None else reserve.gain
+    rows = max(2 * n, *(len(one.up) + len(one.down) for one in (form, gain)))
+    both, signs = _stacked(form, rows)
+    gains, gain_signs = _stacked(gain, rows)
+    return Squares(
+        rows=width(rows),
+        form=both,
+        form_signs=signs,
+        gain=np.empty(0) if reserve is None else gains,
+        gain_signs=gain_signs,
+        decay_per_s=0.0 if reserve is None else float(reserve.decay_per_s),
+        first_reserve=float(policy.first_reserve),
+        y=np.empty((HIGHEST + 1) * rows),
+        w=np.empty((HIGHEST + 1) * rows),
+        g=np.empty(MOST_TERMS),
+        eta=np.empty(MOST_TERMS),
+    )
+
+
+def _stacked(form: Form, rows: int) -> tuple[Array, Array]:
+    """[P; N] by columns, filled up with zeros, and the signs of its rows."""
+    signs = np.zeros(rows)
+    signs[: len(form.up)], signs[len(form.up) :] = 1.0, -1.0
+    both = np.vstack([form.up, form.down])
+    filled_up = np.zeros((rows, both.shape[1]))
+    filled_up[: len(both)] = both
+    return np.ascontiguousarray(filled_up.T).ravel(), signs
+
+
+def scale_of(largest: float, threshold: float, reserve: float) -> float:
+    """A number of the size of what is compared."""
+    return max(largest, threshold, math.sqrt(abs(reserve)), _LEAST_SCALE)
+
+
+def put(squares: Squares, k: int, x: Lanes, e_s: Lanes, factor: float) -> None:
+    """Take a coefficient of the state, times a factor."""
+    size, area = len(squares.rows), len(squares.form) // 2
+    y = times(squares.form, 0, x, squares.rows) + times(squares.form, area, e_s, squares.rows)
+    store(squares.y, k * size, y * factor)
+    if len(squares.gain) > 0:
+        w = times(squares.gain, 0, x, squares.rows) + times(squares.gain, area, e_s, squares.rows)
+        store(squares.w, k * size, w * factor)
+
+
+def compare(squares: Squares, p: int, reserve: float) -> int:
+    """Make the comparison's coefficients of those of the state, up to degree p.
+
+    Args:
+        squares: the forms.
+        p: the degree.
+        reserve: η at the start, over the square of the scale.
+
+    Returns:
+        Their degree.
+    """
+    degree = 2 * p
+    signs = load(squares.form_signs, 0, squares.rows)
+    squared(squares.y, p, signs, squares.g, squares.rows)
+    if len(squares.gain) == 0:
+        return degree
+    signs = load(squares.gain_signs, 0, squares.rows)
+    squared(squares.w, p, signs, squares.eta, squares.rows)
+    # From the gain's coefficients to those of η, in the same place.
+    last = reserve
+    for k in range(degree + 1 + _MORE):
+        gain = squares.eta[k] if k <= degree else 0.0
+        squares.eta[k] = last
+        last = (gain - squares.decay_per_s * last) / (k + 1)
+    squares.eta[degree + 1 + _MORE] = last
+    for k in range(degree + 1):
+        squares.g[k] -= squares.eta[k]
+    for k in range(degree + 1, degree + 2 + _MORE):
+        squares.g[k] = -squares.eta[k]
+    return degree + 1 + _MORE
+
+
+def left_side(squares: Squares, x: Lanes) -> float:
+    """‖P z‖ where e_s = 0."""
+    y = times(squares.form, 0, x, squares.rows)
+    return math.sqrt(max(dot(y * load(squares.form_signs, 0, squares.rows), y), 0.0))
+
+
+def first_look(squares: Squares, level: float, rate: float, reserve: float) -> float:
+    """About when the comparison may hold, from the first three coefficients of the state.
+
+    Args:
+        squares: the forms.
+        level: squared threshold, over the square of the scale.
+        rate: at which it decays, per second.
+        reserve: η, over the square of the scale.
+    """
+    compare(squares, 2, reserve)
+    return estimate(squares.g, level, rate)
+
+
+def first_event(
+    squares: Squares, rule: Rule, degree: int, level: float, rate: float, point: int,
+    t_s: float, end_s: float,
+) -> tuple[float, int]:  # fmt: skip
+    """When the comparison first holds on a piece, as seconds from its start; or NONE.
+
+    Args:
+        squares: the forms.
+        rule: the rule.
+        degree: of the comparison.
+        level: squared threshold at the start, over the square of the scale.
+        rate: at which it decays, per second.
+        point: the next point of the grid, if there is one.
+        t_s: when the piece starts.
+        end_s: its length.
+
+    Returns:
+        This; and the next point of the grid.
+    """
+    if rule.grid_s == 0.0:
+        start = load(squares.y, 0, squares.rows)
+        grain = dot(start, start) + level
+        if len(squares.gain) > 0:
+            grain += abs(squares.eta[0])
+        return first_root(squares.g, degree, level, rate, _GRAIN * grain, end_s), point
+    last = last_point(rule, t_s + end_s)
+    while point <= last:
+        s = min(max(point * rule.grid_s - t_s, 0.0), end_s)
+        number, _ = number_and_slope(squares.g, degree, s)
+        if number > level * math.exp(-rate * s):
+            return s, point
+        point += 1
+    return NONE, point
+
+
+def reserve_at(squares: Squares, p: int, s: float) -> float:
+    """η, over the square of the scale."""
+    if len(squares.gain) == 0:
+        return 0.0
+    number, _ = number_and_slope(squares.eta, 2 * p + 1 + _MORE, s)
+    return number

@@ -1,0 +1,364 @@
+"""The paper's loop between events, and the exact time of the next one.
+
+In the coordinates z = (x, e_s, e_c), e_s = x_s − x, e_c = x_c − x, the loop between events is
+linear and autonomous, and its errors keep their relative accuracy while everything decays:
+
+    ẋ   = (A+BK) x + BK e_c
+    ė_s = H e_s − E x − BK e_c          E = A + BK − H  (eq:miet_errdyn)
+    ė_c = (H−BK) e_c − E x
+
+with H = Â+B̂K in model mode and H = 0 under zero-order hold. An event is the first t > t_i at which
+‖W e_s(t)‖ exceeds max(βe^{−αt}, ε) (eq:thre). There e_s ← 0, and e_c ← 0 if the update arrives.
+
+Why no crossing is skipped. While the threshold is βe^{−αt}, the scaled error
+y(t) = W e_s(t) / (βe^{−αt}) is the output of a linear system, too: it is [0 W 0] e^{(G+αI)(t−t₀)}
+z(t₀) over the threshold at t₀. The event is where the curve y leaves the unit ball. With the floor
+ε in place of βe^{−αt} the same holds for α = 0. Time is cut into cells of a width on which a
+polynomial of degree 18 equals y to rounding (:mod:`cosim.simulation.continuous.exact_flow`). The
+control points of all cells of a window are one matrix-vector product. A cell whose control points
+are in the ball does not leave it (convex hull); in every other one the roots of 1 − |y|² are
+isolated (:mod:`cosim.simulation.continuous.bernstein`).
+Nothing is sampled. What remains is rounding: an excursion above the threshold by less than about
+1e-15 ‖z‖/threshold of it may be taken for a tangency, which is no event.
+
+When a run has diverged: when ‖z‖ passes 1e100, or so many times the threshold that e_s or x is
+compared with. This is looked at where windows and the time up to an event end, and the time of the
+passing is found by bisection between there and the last event.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.simulation.continuous.event_detector import (
+    LARGEST,
+    BallWatch,
+    DivergedError,
+    FormWatch,
+    Reached,
+)
+from cosim.simulation.continuous.exact_flow import Flow, growth_rate
+from noack.config.resolution import Loop, loop_of
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.policy_from_settings import policy_of
+from noack.trigger.trigger_condition import Form, Guard
+from noack.trigger.trigger_policy import Policy
+
+_SMALLEST_THRESHOLD = 1e-200
+_LONGEST_CELL_S = 1e3
+_GRID_SLACK = 1e-9
+"""Of a period: so far may an event be off the grid for rounding."""
+_GRID_BLOCK = 256
+_BISECTIONS = 60
+
+
+class LoopState(NamedTuple):
+    """The loop at a time: plant state and both models' errors, each of shape (n,)."""
+
+    t_s: float
+    x: Vector
+    e_s: Vector
+    e_c: Vector
+
+
+class Samples(NamedTuple):
+    """The loop at k times; states of shape (k, n)."""
+
+    t_s: Vector
+    x: Matrix
+    e_s: Matrix
+    e_c: Matrix
+
+    @property
+    def x_s(self) -> Matrix:
+        """The sensor's model."""
+        return self.x + self.e_s
+
+    @property
+    def x_c(self) -> Matrix:
+        """The controller's model."""
+        return self.x + self.e_c
+
+
+class ContinuousLoop:
+    """The loop in continuous time, under any policy.
+
+    Args:
+        loop: the matrices.
+        trigger: the event-triggering policy; its weight is W.
+    """
+
+    def __init__(self, loop: Loop, trigger: Policy) -> None:
+        self.loop = loop
+        self.trigger = trigger
+        n, H, BK = loop.n, loop.H, loop.B @ loop.K
+        mismatch = loop.A + BK - H
+        self.generator: Matrix = np.zeros((3 * n, 3 * n))
+        """G of dz/dt = G z, per second, shape (3n, 3n)."""
+        self.generator[:n, :n] = loop.A + BK
+        self.generator[:n, 2 * n :] = BK
+        self.generator[n : 2 * n, :n] = -mismatch
+        self.generator[n : 2 * n, n : 2 * n] = H
+        self.generator[n : 2 * n, 2 * n :] = -BK
+        self.generator[2 * n :, :n] = -mismatch
+        self.generator[2 * n :, 2 * n :] = H - BK
+        self._guards = trigger.guards(n)
+        guard = self._guards.after(0.0, loop.x0)
+        scaled = self.generator + guard.rate_per_s * np.eye(3 * n)
+        rate_per_s = max(growth_rate(self.generator), growth_rate(scaled))
+        if guard.reserve is not None:
+            rate_per_s = max(rate_per_s, guard.reserve.decay_per_s)
+        self.flow = Flow(self.generator, 1.0 / max(rate_per_s, 1.0 / _LONGEST_CELL_S))
+        self._watches: dict[tuple[bytes, float], BallWatch | FormWatch] = {}
+
+    @property
+    def decaying(self) -> DecayingTrigger:
+        """The trigger, if it is the paper's.
+
+        Raises:
+            CallerError: it is another.
+        """
+        if not isinstance(self.trigger, DecayingTrigger):
+            raise CallerError('trigger.policy: this is for the paper\'s trigger, "decaying", only')
+        return self.trigger
+
+    def threshold(self, t_s: float) -> float:
+        """max(βe^{−αt}, ε) of the paper's trigger."""
+        return self.decaying.threshold(t_s * 1e9)
+
+    def norms(self, errors: Matrix) -> Vector:
+        """‖W e‖ of k errors, shape (k, n) → (k,)."""
+        W = self.trigger.weight
+        norms: Vector = np.linalg.norm(errors if W is None else errors @ W.T, axis=-1)
+        return norms
+
+    def next_event(
+        self, state: LoopState, until_s: float, guard: Guard | None = None
+    ) -> LoopState | None:
+        """The state just before the reset at the next event in [``state.t_s``, ``until_s``].
+
+        Args:
+            state: where the loop is.
+            until_s: how far to look.
+            guard: the rule until then; if ``state`` is just after an event, or at the start, the
+                policy's unless given.
+
+        Returns:
+            None if there is no event until then. A state that is beyond the rule's threshold
+            already, or on it and growing, is an event itself.
+
+        Raises:
+            DivergedError: the state outgrows what can be computed with before.
+            CallerError: the threshold decays below 1e-200 before, where nothing is left to resolve.
+        """
+        found = self.next_crossing(state, until_s, guard or self.guard(state))
+        return None if found is None else found[0]
+
+    def guard(self, state: LoopState) -> Guard:
+        """The rule after an event at a state."""
+        return self._guards.after(state.t_s * 1e9, state.x)
+
+    @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
+    def next_crossing(
+        self, state: LoopState, until_s: float, guard: Guard, reserve: float = 0.0
+    ) -> tuple[LoopState, float] | None:
+        """The same as :meth:`next_event`, with the η that a dynamic policy has there.
+
+        Args:
+            state: where the loop is.
+            until_s: how far to look.
+            guard: the rule until then.
+            reserve: η at ``state``.
+
+        Raises:
+            DivergedError: with the time of the passing.
+        """
+        try:
+            found = self._next_crossing(state, until_s, guard, reserve)
+        except DivergedError as error:
+            raise DivergedError(self._passed_s(state, error.t_s, guard)) from None
+        end = self.propagate(state, max(until_s, state.t_s)) if found is None else found[0]
+        if not self._is_within(end, guard):
+            raise DivergedError(self._passed_s(state, end.t_s, guard))
+        return found
+
+    def _is_within(self, state: LoopState, guard: Guard) -> bool:
+        """Whether a state is one that can be computed with."""
+        threshold, begins_ns = 0.0, min(guard.earliest_ns, guard.latest_ns)
+        if len(guard.form.up) and state.t_s * 1e9 >= begins_ns:
+            threshold = guard.threshold(state.t_s * 1e9)
+        limit = LARGEST * (min(threshold, 1.0) if threshold > 0 else 1.0)
+        return float(np.linalg.norm(np.concatenate(state[1:]))) < limit
+
+    def _passed_s(self, state: LoopState, until_s: float, guard: Guard) -> float:
+        """When the loop passes what can be computed with, for it has at ``until_s``."""
+        low_s, high_s = state.t_s, until_s
+        if not self._is_within(state, guard):
+            return low_s
+        for _ in range(_BISECTIONS):
+            middle_s = (low_s + high_s) / 2
+            if self._is_within(self.propagate(state, middle_s), guard):
+                low_s = middle_s
+            else:
+                high_s = middle_s
+        return high_s
+
+    def _next_crossing(
+        self, state: LoopState, until_s: float, guard: Guard, reserve: float
+    ) -> tuple[LoopState, float] | None:
+        t_s, z = state.t_s, np.concatenate(state[1:])
+        latest_s = guard.latest_ns * 1e-9
+        begin_s = min(guard.earliest_ns * 1e-9, latest_s)
+        end_s = max(min(until_s, latest_s), t_s)
+        if begin_s > t_s:
+            if begin_s > until_s:
+                return None
+            z, reserve = self._advance(z, begin_s - t_s, guard, reserve)
+            t_s = begin_s
+        if len(guard.form.up):
+            if guard.grid_ns:
+                found = self._on_grid(z, t_s, state.t_s, end_s, guard)
+            else:
+                found = self._exit(z, t_s, end_s, guard, reserve)
+            if found.exceeds:
+                return self._state(t_s + found.after_s, found.z), found.reserve
+            z, reserve = found.z, found.reserve
+        else:
+            z, reserve = self._advance(z, end_s - t_s, guard, reserve)
+        return (self._state(end_s, z), reserve) if latest_s <= until_s else None
+
+    def _exit(self, z: Vector, t_s: float, end_s: float, guard: Guard, reserve: float) -> Reached:
+        """Follow the loop until the comparison holds, or to ``end_s``; first decay, then floor."""
+        begin_s, since_s = t_s, guard.since_ns * 1e-9
+        floor_from_s, vanishes_s = -math.inf, math.inf
+        if guard.level > guard.floor and guard.rate_per_s > 0:
+            rate = guard.rate_per_s
+            floor_from_s = vanishes_s = math.inf
+            if guard.floor > 0:
+                floor_from_s = since_s + math.log(guard.level / guard.floor) / rate
+            vanishes_s = since_s + max(math.log(guard.level / _SMALLEST_THRESHOLD) / rate, 0.0)
+        if t_s < floor_from_s:
+            phase_s = min(end_s, floor_from_s, vanishes_s)
+            found = self._watched(
+                z, t_s, guard.threshold(t_s * 1e9), phase_s - t_s, guard.rate_per_s, guard, reserve
+            )
+            if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
+                return found
+            if vanishes_s < floor_from_s:
+                raise CallerError(
+                    f"trigger: from {vanishes_s:g} s on the threshold is below "
+                    f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
+                    "give trigger.floor or a shorter horizon"
+                )
+            z, reserve, t_s = found.z, found.reserve, floor_from_s
+        level = guard.floor if guard.rate_per_s > 0 else max(guard.floor, guard.level)
+        found = self._watched(z, t_s, level, end_s - t_s, 0.0, guard, reserve)
+        return found._replace(after_s=found.after_s + t_s - begin_s)
+
+    def _watched(
+        self,
+        z: Vector,
+        t_s: float,
+        threshold: float,
+        span_s: float,
+        rate_per_s: float,
+        guard: Guard,
+        reserve: float,
+    ) -> Reached:
+        form = guard.form
+        plain = threshold > 0 and not len(form.down) and guard.reserve is None
+        if not plain and threshold == 0:
+            rate_per_s = 0.0
+        key = (form.up.tobytes() + form.down.tobytes() + bytes([plain]), rate_per_s)
+        watch = self._watches.get(key)
+        if watch is None:
+            watch = self._watches[key] = self._watch(guard, rate_per_s, plain=plain)
+        if isinstance(watch, FormWatch):
+            return watch.first_exit(z, t_s, threshold, span_s, reserve)
+        exit_at = watch.first_exit(z, t_s, threshold, span_s)
+        if exit_at is not None:
+            return Reached(exit_at[0], exit_at[1], reserve, exceeds=True)
+        return Reached(span_s, self.flow.advance(z, span_s), reserve, exceeds=False)
+
+    def _watch(self, guard: Guard, rate_per_s: float, *, plain: bool) -> BallWatch | FormWatch:
+        if plain:
+            output = np.zeros((len(guard.form.up), len(self.generator)))
+            output[:, : guard.form.up.shape[1]] = guard.form.up
+            return BallWatch(self.flow, self.generator, output, rate_per_s)
+        gain = None if guard.reserve is None else guard.reserve.gain
+        decay = 0.0 if guard.reserve is None else guard.reserve.decay_per_s
+        return FormWatch(self.flow, self.generator, guard.form, rate_per_s, gain, decay)
+
+    def _advance(
+        self, z: Vector, dt_s: float, guard: Guard, reserve: float
+    ) -> tuple[Vector, float]:
+        """State and η after a time in which the comparison does not count."""
+        if guard.reserve is None:
+            return self.flow.advance(z, dt_s), reserve
+        nothing = np.zeros((0, guard.form.up.shape[1]))
+        idle = FormWatch(
+            self.flow, self.generator, Form(nothing, nothing), 0.0, guard.reserve.gain,
+            guard.reserve.decay_per_s,
+        )  # fmt: skip
+        found = idle.first_exit(z, 0.0, 0.0, dt_s, reserve)
+        return found.z, found.reserve
+
+    def _on_grid(
+        self, z: Vector, t_s: float, event_s: float, end_s: float, guard: Guard
+    ) -> Reached:
+        """Look at the comparison at the grid's points from ``t_s`` on, later than ``event_s``."""
+        grid_s = guard.grid_ns * 1e-9
+        first = max(
+            math.ceil(t_s / grid_s - _GRID_SLACK), math.floor(event_s / grid_s + _GRID_SLACK) + 1
+        )
+        last = math.floor(end_s / grid_s + _GRID_SLACK)
+        n = self.loop.n
+        for begin in range(first, last + 1, _GRID_BLOCK):
+            points_s = np.arange(begin, min(begin + _GRID_BLOCK, last + 1)) * grid_s
+            states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
+            beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
+            known = len(states) if not len(beyond) else int(beyond[0])
+            seen = states[:known, : 2 * n]
+            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, seen))
+            if len(exceeds):
+                k = int(exceeds[0])
+                return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
+            if len(beyond):
+                raise DivergedError(float(points_s[beyond[0]]))
+        return Reached(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
+
+    def propagate(self, state: LoopState, t_s: float) -> LoopState:
+        """The state at ``t_s`` ≥ ``state.t_s``, no event happening in between."""
+        return self._state(t_s, self.flow.advance(np.concatenate(state[1:]), t_s - state.t_s))
+
+    def sample(self, state: LoopState, t_s: Vector) -> Samples:
+        """The states at many times ≥ ``state.t_s``, no event happening in between."""
+        t_s = np.asarray(t_s, dtype=np.float64)
+        states = self.flow.sample(np.concatenate(state[1:]), t_s - state.t_s)
+        return Samples(t_s, *np.split(states, 3, axis=1))
+
+    def _state(self, t_s: float, z: Vector) -> LoopState:
+        n = self.loop.n
+        return LoopState(t_s, z[:n], z[n : 2 * n], z[2 * n :])
+
+
+def reset(state: LoopState, delivered: bool) -> LoopState:
+    """The state after an event: e_s = 0, and e_c = 0 if the update arrives."""
+    nothing = np.zeros_like(state.e_s)
+    return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
+
+
+def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
+    """Return the exact loop of a resolved scenario.
+
+    Raises:
+        CallerError: it is a scenario that exact simulation cannot take.
+    """
+    resolved.require_unacknowledged()
+    resolved.require_unchanging()
+    resolved.require_exact()
+    return ContinuousLoop(loop_of(resolved), policy_of(resolved))

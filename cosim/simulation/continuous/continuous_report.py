@@ -1,0 +1,160 @@
+"""What ``noack simulate --trigger continuous`` says of a run."""
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.record.divergence import Divergence, divergence
+from cosim.simulation.continuous.continuous_loop import Samples, continuous_loop_of
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from noack.config.scenario import Scenario
+from noack.core.errors import ExitStatus
+from noack.core.linear_systems import Vector
+from noack.trigger.decaying import DecayingTrigger
+
+POINTS = 501
+"""States are told at so many times, evenly over the run."""
+_EVENTS_SHOWN = 40
+
+
+def run_continuous(resolved: Scenario) -> ContinuousRun:
+    """Run a resolved scenario in exact continuous time, with the losses of its own network.
+
+    Raises:
+        CallerError: the events accumulate, or the threshold decays to nothing.
+    """
+    return simulate_continuous(
+        continuous_loop_of(resolved),
+        horizon_s=resolved.horizon_s,
+        delivered=network_fates(resolved),
+        known_start=resolved.network.initial_sync == "known_state",
+    )
+
+
+@np.errstate(all="ignore")  # a run may diverge
+def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+    """The run as JSON: its summary, every event, and the states at 501 times."""
+    samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    before = run.before
+    return {
+        "summary": summary(run, resolved),
+        "events": [
+            {
+                "t_s": state.t_s,
+                "delivered": bool(delivered),
+                "x": state.x.tolist(),
+                "e_s": state.e_s.tolist(),
+                "e_c": state.e_c.tolist(),
+            }
+            for state, delivered in zip(before, run.delivered, strict=True)
+        ],
+        "state_names": list(run.system.loop.state_names),
+        "samples": {
+            "t_s": samples.t_s.tolist(),
+            "x": samples.x.tolist(),
+            "x_s": samples.x_s.tolist(),
+            "x_c": samples.x_c.tolist(),
+            "e_s_norm": run.e_s_norm(samples).tolist(),
+            "e_c_norm": run.e_c_norm(samples).tolist(),
+            "threshold": _thresholds(run, samples),
+        },
+    }
+
+
+def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
+    if not isinstance(run.system.trigger, DecayingTrigger):
+        return None
+    return [run.system.threshold(t_s) for t_s in samples.t_s.tolist()]
+
+
+def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
+    """The run's figures, under the names that they have in a run's ``summary.json``."""
+    samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
+    diverged = _divergence(run, samples, resolved)
+    arrived = np.flatnonzero(run.delivered)
+    drop_runs = np.diff(arrived, prepend=-1, append=len(run.delivered)) - 1
+    return {
+        "kind": "continuous",
+        "scenario": resolved.name,
+        "mode": resolved.mode,
+        "mansd": resolved.network.mansd,
+        "horizon_s": resolved.horizon_s,
+        "reached_s": run.reached_s,
+        "events": len(run.delivered),
+        "deliveries": int(run.delivered.sum()),
+        "drops": int((~run.delivered).sum()),
+        "longest_drop_run": int(drop_runs.max()),
+        "inter_event_min_s": _or_none(np.min, np.diff(run.event_s)),
+        "inter_event_median_s": _or_none(np.median, np.diff(run.event_s)),
+        "inter_delivery_median_s": _or_none(np.median, np.diff(run.event_s[run.delivered])),
+        "initial_state_norm": float(np.linalg.norm(samples.x[0])),
+        "final_state_norm": float(np.linalg.norm(samples.x[-1])),
+        "diverged_at_s": None if diverged is None else diverged.at_s,
+        "exit": {
+            "status": int(ExitStatus.OK if diverged is None else ExitStatus.FAILED),
+            "reason": "horizon" if diverged is None else diverged.text,
+        },
+    }
+
+
+def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Divergence | None:
+    if run.diverged_at_s is not None:
+        return Divergence(run.diverged_at_s, f"diverged at {run.diverged_at_s:g} s")
+    return divergence(samples.t_s, samples.x, [resolved])
+
+
+@np.errstate(all="ignore")
+def print_run(console: Console, run: ContinuousRun, resolved: Scenario) -> None:
+    """Print the run's figures, and its events."""
+    figures = summary(run, resolved)
+    mode = "model-based" if resolved.mode == "model" else "zero-order hold"
+    table = Table(title=f"{resolved.name}, {mode}, M − 1 = {resolved.network.mansd}, continuous")
+    table.add_column("quantity")
+    table.add_column("value", justify="right")
+    for what, value in (
+        ("transmissions", str(figures["events"])),
+        ("deliveries", str(figures["deliveries"])),
+        ("dropped by the network", str(figures["drops"])),
+        (f"longest loss burst (cap M − 1 = {figures['mansd']})", str(figures["longest_drop_run"])),
+        ("shortest inter-event time", _seconds(figures["inter_event_min_s"])),
+        ("median inter-event time", _seconds(figures["inter_event_median_s"])),
+        ("median time between deliveries", _seconds(figures["inter_delivery_median_s"])),
+        ("‖x‖ at the start", f"{figures['initial_state_norm']:.3g}"),
+        ("‖x‖ at the end", f"{figures['final_state_norm']:.3g}"),
+    ):
+        table.add_row(what, value)
+    console.print(table)
+    console.print(_event_table(run))
+    if len(run.before) > _EVENTS_SHOWN:
+        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
+    if figures["exit"]["status"]:
+        console.print(f"[bold red]the run failed:[/] {escape(figures['exit']['reason'])}")
+
+
+def _event_table(run: ContinuousRun) -> Table:
+    table = Table(title="events")
+    for heading in ("event", "t, s", "since the last, s", "fate", "‖x‖", "‖e_c‖ before"):
+        table.add_column(heading, justify="right")
+    since_s = np.diff(run.event_s, prepend=0.0)
+    for i, state in enumerate(run.before[:_EVENTS_SHOWN]):
+        table.add_row(
+            str(i),
+            f"{state.t_s:.9f}",
+            f"{since_s[i]:.9f}" if i else "",
+            "delivered" if run.delivered[i] else "[red]lost[/]",
+            f"{np.linalg.norm(state.x):.4g}",
+            f"{run.system.norms(state.e_c[None])[0]:.4g}",
+        )
+    return table
+
+
+def _or_none(statistic: Any, values: Vector) -> float | None:
+    return float(statistic(values)) if len(values) else None
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.6f} s"

@@ -1,0 +1,270 @@
+"""When a guard's comparison first holds, while the loop follows ``dz/dt = G z``.
+
+Nothing is sampled: time is cut into cells of a width on which a polynomial of degree 18 equals z to
+rounding (:mod:`cosim.simulation.continuous.exact_flow`), and the roots of the comparison's
+polynomial are isolated in the Bernstein basis (:mod:`cosim.simulation.continuous.bernstein`).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.simulation.continuous.bernstein import curve_basis
+from cosim.simulation.continuous.exact_flow import CELLS, DEGREE, Flow, taylor_terms
+from noack.core.linear_systems import Matrix, Vector
+from noack.trigger.trigger_condition import Form
+
+LARGEST = 1e100
+"""Beyond, a state is said to have diverged: squares and ratios must stay finite."""
+_SLACK = 1e-13
+
+
+class DivergedError(ArithmeticError):
+    """The state has grown beyond 1e100, or by that factor beyond the threshold, at ``t_s``."""
+
+    def __init__(self, t_s: float) -> None:
+        super().__init__(f"the loop diverges: the state passes 1e100 at {t_s:g} s")
+        self.t_s = t_s
+
+
+class BallWatch:
+    """Finds where an output of the loop, over a threshold that decays, leaves the unit ball.
+
+    Args:
+        flow: of the state z.
+        generator: G, shape (N, N).
+        output: what is compared with the threshold, as a function of z, shape (r, N).
+        rate_per_s: rate at which the threshold decays; 0 for a constant one.
+    """
+
+    def __init__(self, flow: Flow, generator: Matrix, output: Matrix, rate_per_s: float) -> None:
+        n, size = output.shape
+        terms = taylor_terms(generator + rate_per_s * np.eye(size), flow.width_s)
+        self._flow = flow
+        self._rate_per_s = rate_per_s
+        self._basis = curve_basis(DEGREE)
+        self._growth = np.exp(rate_per_s * flow.width_s * np.arange(CELLS))
+        self._taylor: Matrix = output @ terms
+        """Taylor coefficients of y from z at the start of a cell, shape (p + 1, r, N)."""
+        control = np.tensordot(self._basis.from_taylor, self._taylor, 1).reshape(-1, size)
+        starts = flow.powers[:CELLS] * self._growth[:, None, None]
+        self._control = (control @ starts).reshape(-1, size)
+        """Control points of y in all cells of a window, one below the other."""
+        self._shape = (-1, DEGREE + 1, n)
+        self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=1).max()), 1.0)
+
+    def first_exit(
+        self, z: Vector, t_s: float, threshold: float, span_s: float
+    ) -> tuple[float, Vector] | None:
+        """Time and state of the first exit in [0, ``span_s``] after ``t_s``, or None.
+
+        Args:
+            z: state at ``t_s``, shape (N,).
+            t_s: time.
+            threshold: at ``t_s``.
+            span_s: how far to look.
+
+        Raises:
+            DivergedError: the state outgrows what can be computed with.
+        """
+        width_s, window_s = self._flow.width_s, self._flow.window_s
+        rows, window = len(self._control) // CELLS, 0
+        while True:
+            begin_s = window * window_s
+            scale = math.exp(self._rate_per_s * begin_s) / threshold
+            largest = float(np.linalg.norm(z))
+            if not largest * max(scale, 1.0) < LARGEST:
+                raise DivergedError(t_s + begin_s)
+            cells = max(min(CELLS, math.ceil((span_s - begin_s) / width_s)), 1)
+            control = (self._control[: cells * rows] @ (z * scale)).reshape(self._shape)
+            reach = np.einsum("cki,cki->ck", control, control).max(axis=1)
+            for cell in np.flatnonzero(reach > 1.0 - self._slack * (1.0 + largest * scale)):
+                start = self._flow.powers[cell] @ z
+                u = self._basis.first_exit(self._taylor @ (start * (scale * self._growth[cell])))
+                if u is not None:
+                    after_s = begin_s + (cell + u) * width_s
+                    if after_s > span_s:
+                        return None
+                    return float(after_s), self._flow.within_cell(start, u)
+            window += 1
+            if window * window_s >= span_s:
+                return None
+            z = self._flow.powers[CELLS] @ z
+
+
+class Reached(NamedTuple):
+    """Where a watch has come to."""
+
+    after_s: float
+    z: Vector
+    reserve: float
+    """η."""
+    exceeds: bool
+    """Whether the comparison holds from there on for a while; else it is the end of the span."""
+
+
+class FormWatch:
+    """Finds where ‖P z‖² − ‖N z‖² − η first exceeds c², of a threshold c that decays, or 0.
+
+    On a cell all of these are polynomials: those of z have degree p, their squares 2p, and η, of
+    which η̇ = −λη + ‖P_η z‖² − ‖N_η z‖², is that of its Taylor series, cut after degree 2p = 36.
+
+    Args:
+        flow: of the state z, with cells of at most 1/(λ + ρ).
+        generator: G, shape (N, N).
+        form: P and N, on the first 2n entries of z; without P nothing is looked at, and η goes on.
+        rate_per_s: ρ of the threshold c e^{−ρt}; 0 where there is an η.
+        gain: P_η and N_η, if there is an η.
+        decay_per_s: λ.
+    """
+
+    def __init__(
+        self,
+        flow: Flow,
+        generator: Matrix,
+        form: Form,
+        rate_per_s: float = 0.0,
+        gain: Form | None = None,
+        decay_per_s: float = 0.0,
+    ) -> None:
+        if gain is not None and rate_per_s:
+            raise ValueError("a threshold that decays goes without a reserve")
+        size = len(generator)
+        self._flow, self._rate_per_s = flow, rate_per_s
+        self._basis = curve_basis(DEGREE)
+        self._growth = np.exp(rate_per_s * flow.width_s * np.arange(CELLS))
+        terms = taylor_terms(generator + rate_per_s * np.eye(size), flow.width_s)
+        self._cells = terms[None] @ (flow.powers[:CELLS] * self._growth[:, None, None])[:, None]
+        """Taylor coefficients of the scaled z in all cells of a window, (cells, p + 1, N, N)."""
+        self._form = _Squares(form, self._cells)
+        self._looks = len(form.up) > 0
+        self._gain = None if gain is None else _Squares(gain, self._cells)
+        self._faded, self._gathered = _reserve_series(decay_per_s, flow.width_s)
+
+    def first_exit(
+        self, z: Vector, t_s: float, threshold: float, span_s: float, reserve: float = 0.0
+    ) -> Reached:
+        """Follow the loop until the comparison holds, or to the end of a span.
+
+        Args:
+            z: state at ``t_s``, shape (N,).
+            t_s: time.
+            threshold: c at ``t_s``, or 0.
+            span_s: how far to look.
+            reserve: η at ``t_s``.
+
+        Raises:
+            DivergedError: the state outgrows what can be computed with.
+        """
+        width_s, begin_s = self._flow.width_s, 0.0
+        while True:
+            largest = float(np.linalg.norm(z))
+            level = threshold * math.exp(-self._rate_per_s * begin_s)
+            if not largest < LARGEST or (level > 0 and not largest / level < LARGEST):
+                raise DivergedError(t_s + begin_s)
+            scale = 1.0 / max(level if level > 0 else largest, math.sqrt(abs(reserve)), 1e-300)
+            inside = (level * scale) ** 2 - self._form.bernstein(z * scale)
+            saved = self._saved(z * scale, reserve * scale**2)
+            if saved is not None:
+                inside += saved @ curve_basis(2 * DEGREE).from_taylor.T
+            last = min(int((span_s - begin_s) / width_s), CELLS)
+            for cell in np.flatnonzero(inside.min(axis=1) < 0) if self._looks else ():
+                u = self._basis.first_negative(inside[cell]) if cell <= last else None
+                if u is not None and begin_s + (cell + u) * width_s <= span_s:
+                    return self._reached(begin_s, z, int(cell), u, saved, scale, exceeds=True)
+            if last < CELLS:
+                u = min((span_s - begin_s) / width_s - last, 1.0)
+                return self._reached(begin_s, z, last, u, saved, scale, exceeds=False)
+            if saved is not None:
+                reserve = float(saved[-1].sum()) / scale**2
+            z = self._flow.powers[CELLS] @ z
+            begin_s += self._flow.window_s
+
+    def _saved(self, z: Vector, reserve: float) -> Matrix | None:
+        """Taylor coefficients of η in all cells of a window, scaled, shape (cells, 2p + 1)."""
+        if self._gain is None:
+            return None
+        saved = self._gain.taylor(z) @ self._gathered.T
+        for cell in range(CELLS):
+            saved[cell] += reserve * self._faded
+            reserve = float(saved[cell].sum())
+        return saved
+
+    def _reached(
+        self,
+        begin_s: float,
+        z: Vector,
+        cell: int,
+        u: float,
+        saved: Matrix | None,
+        scale: float,
+        *,
+        exceeds: bool,
+    ) -> Reached:
+        reserve = 0.0
+        if saved is not None:
+            reserve = float(u ** np.arange(saved.shape[1]) @ saved[cell]) / scale**2
+        return Reached(
+            begin_s + (cell + u) * self._flow.width_s,
+            self._flow.within_cell(self._flow.powers[cell] @ z, u),
+            reserve,
+            exceeds,
+        )
+
+
+class _Squares:
+    """A form on the first entries of z, in all cells of a window at once.
+
+    Args:
+        form: the form.
+        cells: Taylor coefficients of z in the cells, from z at the window's start.
+    """
+
+    def __init__(self, form: Form, cells: Matrix) -> None:
+        rows = np.vstack([form.up, form.down])
+        output = np.zeros((len(rows), cells.shape[-1]))
+        output[:, : rows.shape[1]] = rows
+        self._signs = np.concatenate([np.ones(len(form.up)), -np.ones(len(form.down))])
+        self._taylor: Matrix = output @ cells
+        """(cells, p + 1, r, N)."""
+        basis = curve_basis(DEGREE)
+        self._control: Matrix = np.einsum("ik,ckrn->cirn", basis.from_taylor, self._taylor)
+        self._square = basis.square
+        self._convolve = _convolution(DEGREE)
+
+    def taylor(self, z: Vector) -> Matrix:
+        """Taylor coefficients of the form, shape (cells, 2p + 1)."""
+        return self._products(self._taylor @ z) @ self._convolve.T
+
+    def bernstein(self, z: Vector) -> Matrix:
+        """Bernstein coefficients of the form, shape (cells, 2p + 1)."""
+        return self._products(self._control @ z) @ self._square.T
+
+    def _products(self, y: Matrix) -> Matrix:
+        products: Matrix = (y * self._signs) @ y.transpose(0, 2, 1)
+        return products.reshape(len(y), -1)
+
+
+def _convolution(degree: int) -> Matrix:
+    """What adds up all products a_i b_j with i + j = m, shape (2p + 1, (p + 1)²)."""
+    orders = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
+    return np.asarray(orders[None] == np.arange(2 * degree + 1)[:, None], dtype=np.float64)
+
+
+def _reserve_series(decay_per_s: float, width_s: float) -> tuple[Vector, Matrix]:
+    """How the Taylor coefficients of η on a cell follow from η at its start and from its gain's.
+
+    η_{k+1} = d (w_k − λη_k)/(k + 1).
+
+    Returns:
+        (2p + 1,) for a start of 1, and (2p + 1, 2p + 1) by the gain's coefficients.
+    """
+    size = 2 * DEGREE + 1
+    faded, gathered = np.zeros(size), np.zeros((size, size))
+    faded[0] = 1.0
+    for k in range(size - 1):
+        faded[k + 1] = -decay_per_s * width_s * faded[k] / (k + 1)
+        gathered[k + 1] = -decay_per_s * width_s * gathered[k] / (k + 1)
+        gathered[k + 1, k] += width_s / (k + 1)
+    return faded, gathered

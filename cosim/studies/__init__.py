@@ -1,0 +1,1 @@
+"""Studies over many runs: campaigns, trigger design, the paper reproduced."""

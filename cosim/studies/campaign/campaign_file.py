@@ -1,0 +1,322 @@
+"""The campaign file: what is varied, what is drawn, what is measured and shown.
+
+Settings are those of a scenario, as after ``--set``: a key with dots, in quotes, sets one value
+(``"trigger.beta" = 0.3``), a key without them a whole table (``trigger = { policy = … }``).
+"""
+
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, FiniteFloat, JsonValue, model_validator
+
+from cosim.simulation.batch.batch_interface import ROW
+from cosim.studies.campaign.metrics import METRICS, Metric
+from noack.config import toml_file
+from noack.config.matrices import Rows
+from noack.config.section import Section, Seed
+
+MOST_POINTS = 10_000
+MOST_SERIES = 12
+"""Curves of one figure."""
+
+Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
+Value = str | int | float | bool
+
+
+def label_of(value: JsonValue) -> str:
+    """How a value of an axis is written."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if not isinstance(value, float):
+        return str(value)
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
+
+
+def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | None:
+    """A key and the later one that replaces its value, or the table that it lies in."""
+    pairs = itertools.product(before, after)
+    return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
+
+
+def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
+    keys = list(settings)
+    for i in range(1, len(keys)):
+        if (lost := replaced(keys[:i], keys[i : i + 1])) is not None:
+            raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which stands before it")
+
+
+class Axis(Section):
+    """What is varied: a key of the scenario with its values, or variants of several keys each."""
+
+    name: Identifier
+    """Names the column of the results: small letters, digits and _."""
+    title: str = ""
+    """What figures and tables call it; the name unless given."""
+    key: str | None = None
+    """A key of the scenario, e.g. network.mansd; goes with values."""
+    values: Annotated[tuple[Value, ...], Field(min_length=1)] | None = None
+    """Its values."""
+    variants: Annotated[dict[str, Settings], Field(min_length=1)] | None = None
+    """Instead of key and values: names, each with the settings that it stands for."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.variants is None) == (self.key is None and self.values is None):
+            raise ValueError("key: give key and values, or variants")
+        if self.variants is None and (self.key is None or self.values is None):
+            missing = "key" if self.key is None else "values"
+            raise ValueError(f"{missing}: missing; key and values go together")
+        if self.name in (*(ROW.names or ()), *METRICS, "draw"):
+            raise ValueError(f"name: {self.name} is a column already; take another")
+        for name, settings in (self.variants or {}).items():
+            _require_kept(f"variants.{name}", settings)
+        labels = self.labels
+        twice = next((label for i, label in enumerate(labels) if label in labels[:i]), None)
+        if twice is not None:
+            raise ValueError(f"values: {twice} is there twice")
+        return self
+
+    @property
+    def called(self) -> str:
+        """Its title, or its name."""
+        return self.title or self.name.replace("_", " ")
+
+    @property
+    def labels(self) -> list[str]:
+        """Of the values or variants, in order."""
+        return list(self.variants) if self.variants else [label_of(v) for v in self.values or ()]
+
+    @property
+    def settings(self) -> list[Mapping[str, JsonValue]]:
+        """What each value or variant sets."""
+        if self.variants is not None:
+            return list(self.variants.values())
+        return [{self.key or "": value} for value in self.values or ()]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """All keys that it sets."""
+        return tuple({key: None for settings in self.settings for key in settings})
+
+    @property
+    def numbers(self) -> list[float] | None:
+        """The values as numbers, if they all are."""
+        values = self.values or ()
+        if not values or any(isinstance(v, str | bool) for v in values):
+            return None
+        return [float(value) for value in values]
+
+
+class Metrics(Section):
+    """How runs are measured, and what of it tables show."""
+
+    shown: Annotated[tuple[Metric, ...], Field(min_length=1)] = (
+        "transmissions",
+        "deliveries",
+        "inter_event_min_s",
+        "settling_s",
+        "cost",
+        "certificate_used",
+    )
+    """Columns of the tables."""
+    Q: Rows | None = None
+    """Weight of the state in the cost ∫ xᵀQx + uᵀRu dt, by rows; the identity unless given."""
+    R: Rows | None = None
+    """Weight of the input in the cost, by rows; the identity unless given."""
+    settle: Annotated[FiniteFloat, Field(gt=0, lt=1)] = 0.02
+    """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""
+    most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
+    """A run with more transmissions is given up."""
+
+
+class Comparison(Section):
+    """Differences draw by draw: the same plant, start and losses at two values of an axis."""
+
+    axis: Identifier
+    """The axis."""
+    reference: Value
+    """The value or variant that the others are compared with."""
+
+
+class _Figure(Section):
+    where: dict[str, Value] = Field({})
+    """Only grid points with these values of these axes."""
+
+
+class Pareto(_Figure):
+    """Means of two metrics against each other; of each series the points that none dominates."""
+
+    kind: Literal["pareto"] = "pareto"
+    """Cost against transmissions, or whatever two are to be small."""
+    series: Identifier
+    """The axis whose values have a front each."""
+    x: Metric = "transmissions"
+    """The horizontal axis."""
+    y: Metric = "cost"
+    """The vertical axis."""
+
+
+class Curve(_Figure):
+    """The mean of a metric over the values of an axis; what else varies makes several curves."""
+
+    kind: Literal["curve"] = "curve"
+    """A metric over an axis."""
+    x: Identifier
+    """The axis."""
+    metric: Metric
+    """The metric."""
+
+
+class HeatMap(_Figure):
+    """The mean of a metric over two axes; what else varies makes several maps."""
+
+    kind: Literal["heat_map"] = "heat_map"
+    """A metric over two axes."""
+    x: Identifier
+    """The horizontal axis."""
+    y: Identifier
+    """The vertical axis."""
+    metric: Metric
+    """The metric."""
+
+
+class Distribution(_Figure):
+    """The share of runs in which a metric is at most so much; one curve for each grid point."""
+
+    kind: Literal["distribution"] = "distribution"
+    """A metric over all draws."""
+    metric: Metric
+    """The metric."""
+
+
+Figure = Annotated[Pareto | Curve | HeatMap | Distribution, Field(discriminator="kind")]
+
+
+def spanned(figure: Pareto | Curve | HeatMap | Distribution) -> tuple[str, ...]:
+    """The axes that a figure has a place of its own for."""
+    match figure:
+        case Pareto():
+            return (figure.series,)
+        case Curve():
+            return (figure.x,)
+        case HeatMap():
+            return (figure.x, figure.y)
+        case Distribution():
+            return ()
+
+
+class Campaign(Section):
+    """Many runs over a grid of settings."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    """Names the campaign's folder: letters, digits, _ and -."""
+    description: str = ""
+    """What the campaign is to find out."""
+    scenario: Annotated[str, Field(min_length=1)]
+    """What all runs start from: a scenario file beside this one, or the name of a shipped one."""
+    settings: dict[str, JsonValue] = Field({})
+    """Settings of all runs, in place of the scenario's."""
+    time: Literal["continuous", "sampled"] = "continuous"
+    """continuous: the trigger watches all the time and the network takes none, exactly, compiled.
+    sampled: the machines of a live run in virtual time, with the schedule's sampling, delays and
+    acknowledgements; a thousand times slower."""
+    draws: Annotated[int, Field(ge=1, le=100_000_000)]
+    """Runs at each grid point: plants from the box, initial states, losses."""
+    seed: Seed = 0
+    """Of the draws. Draw i has the same plant, start and losses at every grid point."""
+    chunk: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
+    """Draws in a file of the results: what a worker does at a time, and what a kill may cost."""
+    axes: Annotated[tuple[Axis, ...], Field(min_length=1)]
+    """What is varied; the grid is all combinations."""
+    metrics: Metrics = Metrics()
+    compare: Comparison | None = None
+    figures: tuple[Figure, ...] = ()
+    """What the page shows."""
+
+    @cached_property
+    def by_name(self) -> Mapping[str, Axis]:
+        """The axes."""
+        return {axis.name: axis for axis in self.axes}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.by_name) < len(self.axes):
+            names = [axis.name for axis in self.axes]
+            twice = next(i for i, name in enumerate(names) if name in names[:i])
+            raise ValueError(f"axes.{twice}.name: there is such an axis already")
+        for i, axis in enumerate(self.axes):
+            for other in self.axes[:i]:
+                if (lost := replaced(other.keys, axis.keys)) is not None:
+                    raise ValueError(
+                        f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {other.name}; "
+                        "an axis that sets a whole table comes first, and no two set the same key"
+                    )
+        _require_kept("settings", self.settings)
+        size = math.prod(len(axis.labels) for axis in self.axes)
+        if size > MOST_POINTS:
+            raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} may be")
+        if self.compare is not None:
+            self._require_axis("compare.axis", self.compare.axis)
+            self._require_value("compare.reference", self.compare.axis, self.compare.reference)
+        for i, figure in enumerate(self.figures):
+            self._check_figure(f"figures.{i}", figure)
+        return self
+
+    def _check_figure(self, place: str, figure: Pareto | Curve | HeatMap | Distribution) -> None:
+        for key in ("series",) if isinstance(figure, Pareto) else ("x", "y"):
+            if (name := getattr(figure, key, None)) is not None:
+                self._require_axis(f"{place}.{key}", name)
+        for name, value in figure.where.items():
+            self._require_axis(f"{place}.where.{name}", name)
+            self._require_value(f"{place}.where.{name}", name, value)
+        own, fixed = spanned(figure), set(figure.where)
+        if len(set(own)) < len(own):
+            raise ValueError(f"{place}.y: a map needs two different axes")
+        if isinstance(figure, Pareto):
+            count = len(self.by_name[figure.series].labels)
+        else:
+            rest = [axis for axis in self.axes if axis.name not in {*own, *fixed}]
+            count = math.prod(len(axis.labels) for axis in rest)
+        if count > MOST_SERIES:
+            raise ValueError(
+                f"{place}: {count} series are too many to tell apart, {MOST_SERIES} at most; "
+                "choose values of other axes by where = { axis = value }"
+            )
+
+    def _require_axis(self, place: str, name: str) -> None:
+        if name not in self.by_name:
+            raise ValueError(f"{place}: no such axis; the axes are {', '.join(self.by_name)}")
+
+    def _require_value(self, place: str, axis: str, value: Value) -> None:
+        labels = self.by_name[axis].labels
+        if label_of(value) not in labels:
+            raise ValueError(f"{place}: no such value; {axis} has {', '.join(labels)}")
+
+    def selected(self, where: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
+        """Places in the grid, one number for each axis, that have these values."""
+        ranges = [
+            [i for i, label in enumerate(axis.labels) if axis.name not in where
+             or label == label_of(where[axis.name])]
+            for axis in self.axes
+        ]  # fmt: skip
+        return itertools.product(*ranges)
+
+
+def load(path: Path) -> Campaign:
+    """Read and validate a campaign file.
+
+    Raises:
+        CallerError: one line per mistake, each with file, key, value and remedy.
+    """
+    return toml_file.validated(Campaign, toml_file.read(path, Campaign), str(path))
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of campaign files, for editors."""
+    return toml_file.json_schema(Campaign)

@@ -1,0 +1,195 @@
+"""From a campaign file to the points of its grid, each a scenario and what its runs share."""
+
+import copy
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.shipped_files import find_shipped
+from cosim.simulation.batch.batch_interface import Setting, run_batch, setting_of
+from cosim.simulation.continuous.network_fates import timeless
+from cosim.studies.campaign.campaign_file import Campaign, Value
+from cosim.studies.campaign.metrics import certified_error
+from cosim.studies.campaign.random_draws import Box, box_of
+from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from noack.config import toml_file
+from noack.config.matrices import Rows, require_shape
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import completed, put
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+
+SCENARIOS = "scenarios"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of the grid."""
+
+    number: int
+    place: tuple[int, ...]
+    """Which value of each axis."""
+    labels: Mapping[str, str]
+    """By axis."""
+    values: Mapping[str, Value]
+    """By axis: numbers where all values of it are numbers, otherwise labels."""
+    scenario: Scenario
+    """Its plant and initial state not yet drawn."""
+    certified_error: float | None
+    """Δβ, or None."""
+    work: "Work"
+    """Runs its draws."""
+
+
+@dataclass(frozen=True)
+class ContinuousWork:
+    """What a worker needs to know of a point in continuous time; the same for all its chunks."""
+
+    setting: Setting
+    box: Box
+    seed: int
+
+    def run(self, draws: range) -> NDArray[np.void]:
+        """Run some successive draws; one row each."""
+        return run_batch(self.setting, self.box.population(self.seed, draws))
+
+
+Work = ContinuousWork | SampledWork
+
+
+def run_draws(work: Work, draws: range) -> NDArray[np.void]:
+    """Run some successive draws; one row of ``batch_interface.ROW`` each, (k,)."""
+    return work.run(draws)
+
+
+def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
+    """Path and content of the scenario that all runs start from, the common settings made.
+
+    Raises:
+        CallerError: it cannot be read, or a setting does not fit.
+    """
+    source = f'{path}: scenario = "{campaign.scenario}"'
+    scenario = path.parent / campaign.scenario
+    if not scenario.is_file():
+        if scenario.suffix == ".toml" or scenario.exists():
+            raise CallerError(
+                f"{source}: no such file; it lies beside the campaign's, or is shipped"
+            )
+        try:
+            scenario = find_shipped(campaign.scenario, SCENARIOS)
+        except CallerError as error:
+            raise CallerError(f"{path}: scenario: {error}") from None
+    content = toml_file.read(scenario)
+    for key, value in campaign.settings.items():
+        put(content, key, value, f"{path}: settings.{key}")
+    return scenario, content
+
+
+def grid(campaign: Campaign, path: Path) -> list[Point]:
+    """All points of a campaign's grid, in order: the last axis varies fastest.
+
+    Args:
+        campaign: the campaign.
+        path: of its file; the scenario lies beside it, and mistakes name it.
+
+    Raises:
+        CallerError: one line per mistake.
+    """
+    scenario_path, base = base_of(campaign, path)
+    points = []
+    for number, place in enumerate(campaign.selected({})):
+        content, chosen = copy.deepcopy(base), list(zip(campaign.axes, place, strict=True))
+        labels = {axis.name: axis.labels[i] for axis, i in chosen}
+        where = ", ".join(f"{name} = {label}" for name, label in labels.items())
+        source = f"{path}: at {where}"
+        for axis, i in chosen:
+            for key, value in axis.settings[i].items():
+                put(content, key, value, source)
+        scenario = completed(content, scenario_path, source)
+        values = {
+            axis.name: axis.labels[i] if axis.numbers is None else axis.numbers[i]
+            for axis, i in chosen
+        }
+        points.append(_point(campaign, number, place, labels, values, scenario, source))
+    _require_effects(campaign, points, path)
+    return points
+
+
+def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
+    """Refuse an axis two of whose values are the same runs: what it sets plays no part in them."""
+    runs = {point.place: blake2b(pickle.dumps(point.work)).digest() for point in points}
+    for i, axis in enumerate(campaign.axes):
+        found: dict[bytes, str] = {}
+        for value, label in enumerate(axis.labels):
+            same = b"".join(content for place, content in runs.items() if place[i] == value)
+            if (other := found.setdefault(same, label)) != label:
+                raise CallerError(
+                    f"{path}: axes.{i}: {axis.name} = {other} and {axis.name} = {label} are the "
+                    f"same runs: what {', '.join(axis.keys)} says there makes no difference to them"
+                )
+
+
+def _point(
+    campaign: Campaign,
+    number: int,
+    place: tuple[int, ...],
+    labels: Mapping[str, str],
+    values: Mapping[str, Value],
+    scenario: Scenario,
+    source: str,
+) -> Point:
+    metrics = campaign.metrics
+    n, m = scenario.model.dimensions
+    try:
+        resolved = resolve(scenario)
+        Q = _weight(metrics.Q, "metrics.Q", n, "one row per state")
+        R = _weight(metrics.R, "metrics.R", m, "one row per input")
+        work, certified = _work(campaign, scenario, resolved, Q, R)
+    except (CallerError, ValueError) as error:
+        raise CallerError(f"{source}: {error}") from None
+    return Point(number, place, labels, values, scenario, certified, work)
+
+
+def _work(
+    campaign: Campaign, scenario: Scenario, resolved: Scenario, Q: Matrix | None, R: Matrix | None
+) -> tuple[Work, float | None]:
+    """Who runs the draws, and the bound Δβ that no run may exceed, or None."""
+    settle, most_events = campaign.metrics.settle, campaign.metrics.most_events
+    if campaign.time == "sampled":
+        alone = in_virtual_time(scenario)
+        return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
+    if resolved.is_acknowledged:
+        raise CallerError(
+            'network.protocol: continuous time is for the loop without acknowledgements, "none"; '
+            'with time = "sampled" a campaign runs both'
+        )
+    _require_timeless(resolved)
+    setting = replace(setting_of(resolved), Q=Q, R=R, settle=settle, most_events=most_events)
+    return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)
+
+
+def _require_timeless(scenario: Scenario) -> None:
+    network = scenario.network
+    kept = timeless(network.link).impairments
+    taking_time = [one.kind for one in network.link.impairments if one not in kept]
+    if taking_time:
+        raise CallerError(
+            f"network.impairments: {', '.join(taking_time)}: in continuous time the network takes "
+            'no time; leave it out, e.g. settings = { "network.impairments" = [] }, '
+            'or let time = "sampled"'
+        )
+
+
+def _weight(rows: Rows | None, key: str, size: int, why: str) -> Matrix | None:
+    require_shape(rows, key, (size, size), why)
+    weight = None if rows is None else np.array(rows)
+    if weight is not None and not np.array_equal(weight, weight.T):
+        raise ValueError(f"{key}: must be symmetric")
+    return weight

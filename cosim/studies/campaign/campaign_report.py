@@ -1,0 +1,134 @@
+"""Writes what a campaign found into its folder, and prints it."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.studies.campaign.campaign_figures import figures
+from cosim.studies.campaign.campaign_page import (
+    Row,
+    compared_row,
+    found_row,
+    page,
+    unfinished,
+    verdict,
+)
+from cosim.studies.campaign.campaign_summary import Summary
+from cosim.studies.campaign.chunk_store import RUNS, Store
+from cosim.studies.campaign.metrics import METRICS
+from noack.core.errors import MachineError
+
+PAGE, SUMMARY = "campaign.html", "summary.json"
+_MOST_ROWS = 40
+_APART = 3
+"""At most between columns, margins included."""
+_MOST_REMARKS = 5
+
+
+def write_report(summary: Summary, store: Store, base: Mapping[str, Any]) -> list[Path]:
+    """Write page and summary; return the paths of what is to be looked at.
+
+    Raises:
+        MachineError: they cannot be written.
+    """
+    written = [store.folder / PAGE, store.folder / SUMMARY]
+    html = page(summary, list(figures(summary, store)), base)
+    document = json.dumps(_known(summary.document()), indent=1, allow_nan=False)
+    try:
+        for path, text in zip(written, (html, document + "\n"), strict=True):
+            scratch = path.with_name(f".{path.name}.partial")
+            scratch.write_text(text, encoding="utf-8")
+            scratch.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise MachineError(f"{store.folder}: the page cannot be written: {reason}") from None
+    return [*written, store.folder / RUNS]
+
+
+def print_summary(console: Console, summary: Summary) -> None:
+    """Print the tables of a summary."""
+    campaign = summary.campaign
+    shown = campaign.metrics.shown
+    tables = [
+        (
+            f"{campaign.name}: {summary.draws:,} draws",
+            [found_row(one, shown) for one in summary.found],
+        )
+    ]
+    if campaign.compare is not None:
+        title = f"minus the same draw at {campaign.compare.axis} = {campaign.compare.reference}"
+        tables.append((title, [compared_row(one, shown) for one in summary.compared]))
+    axes = [axis.called for axis in campaign.axes]
+    headings = [METRICS[metric].heading for metric in shown]
+    for title, rows in tables:
+        for table in tables_of(title, axes, headings, rows[:_MOST_ROWS], console.width):
+            console.print(table)
+        if len(rows) > _MOST_ROWS:
+            console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
+    if campaign.time == "continuous":
+        console.print(
+            "continuous time: the trigger watches always, and the network takes none; with "
+            'time = "sampled" it is as in a live run, sampling and delays included',
+            style="dim",
+            highlight=False,
+        )
+    remarks = list(unfinished(summary))
+    for remark in remarks[:_MOST_REMARKS]:
+        console.print(remark, style="yellow", markup=False, highlight=False)
+    if len(remarks) > _MOST_REMARKS:
+        console.print(f"and at {len(remarks) - _MOST_REMARKS} more grid points: see the page")
+    console.print(verdict(summary), style="bold red" if summary.breaches else "bold")
+
+
+def tables_of(
+    title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[Row], width: int
+) -> Iterator[Table]:
+    """Tables with all columns, as many as are needed for a terminal of this width; nothing is cut.
+
+    Args:
+        title: of the first.
+        axes: headings of the labels, which each table repeats.
+        headings: of the cells.
+        rows: of all tables.
+        width: in characters.
+    """
+    labels = sum(_width(axis, [row.labels[i] for row in rows]) for i, axis in enumerate(axes))
+    widths = [_width(words, [row.cells[i] for row in rows]) for i, words in enumerate(headings)]
+    begin = 0
+    while begin < len(headings):
+        end = begin + 1
+        while end < len(headings) and labels + sum(widths[begin : end + 1]) <= width:
+            end += 1
+        table = Table(
+            title=escape(title) if begin == 0 else None, title_justify="left", box=SIMPLE_HEAD,
+            pad_edge=False, collapse_padding=True,
+        )  # fmt: skip
+        for words in axes:
+            table.add_column(escape(words), overflow="fold")
+        for words, least in zip(headings[begin:end], widths[begin:end], strict=True):
+            table.add_column(escape(words), justify="right", min_width=least - _APART)
+        for row in rows:
+            table.add_row(*map(escape, row.labels), *row.cells[begin:end])
+        yield table
+        begin = end
+
+
+def _width(heading: str, cells: Iterable[str]) -> int:
+    """Of a column, whose heading may break between words."""
+    return max(map(len, (*heading.split(), *cells))) + _APART
+
+
+def _known(value: Any) -> Any:
+    """As JSON knows it: null for what is not finite."""
+    if isinstance(value, dict):
+        return {key: _known(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_known(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,133 @@
+"""What a campaign found: every metric at every grid point, and differences draw by draw."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cosim.simulation.batch.batch_interface import ROW
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.studies.campaign.campaign_file import Campaign, label_of
+from cosim.studies.campaign.campaign_grid import Point
+from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.draw_statistics import (
+    CONFIDENCE,
+    Difference,
+    Estimate,
+    difference,
+    estimate,
+)
+from cosim.studies.campaign.metrics import Metric, measured
+from noack.core.linear_systems import Vector
+
+_ROUNDING = 1e-9
+_ENDED = {
+    OK: "finished", DIVERGED: "diverged", TOO_MANY_EVENTS: "too_many_events",
+    UNDECIDED: "undecided",
+}  # fmt: skip
+
+
+class Found(NamedTuple):
+    """All runs at a grid point."""
+
+    point: Point
+    ended: Mapping[str, int]
+    """How many ended how."""
+    estimates: Mapping[Metric, Estimate]
+    breaches: int
+    """Runs whose ‖e_c‖ exceeds what is certified: a mistake in the theory or in the code."""
+
+
+class Compared(NamedTuple):
+    """Runs at a grid point, less those of the same draws at another."""
+
+    point: Point
+    reference: Point
+    differences: Mapping[Metric, Difference]
+
+
+class Summary(NamedTuple):
+    """What a campaign found."""
+
+    campaign: Campaign
+    draws: int
+    found: Sequence[Found]
+    compared: Sequence[Compared]
+
+    @property
+    def breaches(self) -> int:
+        """Runs in which a certified bound is exceeded."""
+        return sum(found.breaches for found in self.found)
+
+    def document(self) -> dict[str, Any]:
+        """The content of ``summary.json``."""
+        return {
+            "name": self.campaign.name,
+            "draws": self.draws,
+            "confidence": CONFIDENCE,
+            "breaches": self.breaches,
+            "points": [
+                {
+                    "axes": dict(found.point.labels),
+                    "ended": dict(found.ended),
+                    "certified_error": found.point.certified_error,
+                    "metrics": {name: e._asdict() for name, e in found.estimates.items()},
+                }
+                for found in self.found
+            ],
+            "differences": [
+                {
+                    "axes": dict(compared.point.labels),
+                    "reference": dict(compared.reference.labels),
+                    "metrics": {
+                        name: {**d.estimate._asdict(), "larger": d.larger, "smaller": d.smaller}
+                        for name, d in compared.differences.items()
+                    },
+                }
+                for compared in self.compared
+            ],
+        }
+
+
+def summarise(campaign: Campaign, store: Store) -> Summary:
+    """Read all runs of a campaign, one or two grid points at a time."""
+    found = [_found(point, store) for point in store.points]
+    return Summary(campaign, store.draws, found, list(_compared(campaign, store)))
+
+
+def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
+    """All metrics of the runs at a grid point, and how each run ended."""
+    columns = store.columns(point.number, ROW.names or ())
+    return measured(columns, point.certified_error), columns["status"]
+
+
+def _found(point: Point, store: Store) -> Found:
+    metrics, status = runs_at(point, store)
+    used = metrics.get("certificate_used", np.zeros(0))
+    return Found(
+        point,
+        {how: int((status == code).sum()) for code, how in _ENDED.items() if code in status},
+        {name: estimate(values) for name, values in metrics.items()},
+        int((used[np.isfinite(used)] > 1 + _ROUNDING).sum()),
+    )
+
+
+def _compared(campaign: Campaign, store: Store) -> Iterator[Compared]:
+    if campaign.compare is None:
+        return
+    axis = [axis.name for axis in campaign.axes].index(campaign.compare.axis)
+    reference_i = campaign.axes[axis].labels.index(label_of(campaign.compare.reference))
+    groups: dict[tuple[int, ...], list[Point]] = {}
+    for point in store.points:
+        groups.setdefault(point.place[:axis] + point.place[axis + 1 :], []).append(point)
+    for group in groups.values():
+        reference = next(point for point in group if point.place[axis] == reference_i)
+        own, _ = runs_at(reference, store)
+        for point in group:
+            if point is not reference:
+                others, _ = runs_at(point, store)
+                differences = {
+                    name: difference(values, own[name])
+                    for name, values in others.items() if name in own
+                }  # fmt: skip
+                yield Compared(point, reference, differences)

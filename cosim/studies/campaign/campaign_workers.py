@@ -1,0 +1,223 @@
+"""Who runs the chunks of a campaign: processes of this machine, or a Dask cluster.
+
+Either way chunks are independent, and their results come back here to be written by one process.
+"""
+
+import logging
+import math
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from itertools import islice
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.studies.campaign.campaign_grid import Point, Work, run_draws
+from cosim.studies.campaign.chunk_store import Chunk
+from cosim.studies.campaign.worker_identity import arithmetic, difference
+from cosim.studies.process_pool import interrupts_held, processes
+from noack.core.errors import CallerError, PeerError
+
+Finished = tuple[Chunk, NDArray[np.void]]
+Runner = Callable[[Sequence[Point], Iterable[Chunk]], Iterator[Finished]]
+"""Runs chunks and gives their results as they come, in any order."""
+
+_AHEAD = 2
+"""Chunks under way for each worker: one that runs, one that waits."""
+_LOOK_EVERY_S = 1.0
+_PATIENCE_S = 30.0
+_CONNECT_S = 10.0
+_CONNECT_TRIES = 3
+
+
+class OtherArithmeticError(PeerError):
+    """A worker's results would not be the same, bit for bit."""
+
+
+class LostWorkersError(PeerError):
+    """Workers have died, or cannot be reached any more."""
+
+
+def alone(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    """Run chunks in this process."""
+    for chunk in chunks:
+        yield chunk, run_draws(points[chunk.point].work, chunk.draws)
+
+
+@contextmanager
+def local(workers: int) -> Iterator[Runner]:
+    """Run chunks in so many processes of this machine."""
+    if workers == 1:
+        yield alone
+        return
+    with processes(workers) as pool:
+
+        def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+            try:
+                yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
+            except BrokenProcessPool:
+                raise LostWorkersError(
+                    "a worker process was killed (was there not enough memory?)"
+                ) from None
+
+        yield run
+
+
+def _require_address(address: str) -> None:
+    """Dask's client begins to work before it looks at an address, and is long in ending."""
+    try:
+        parts = urlsplit(address if "://" in address else f"tcp://{address}")
+        known = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
+    except ValueError:
+        known = False
+    if not known:
+        raise CallerError(f"--scheduler {address}: write it as tcp://HOST:PORT")
+
+
+def _client(connect: Any, address: str) -> Any:
+    """Connect; Dask gives its thread ten seconds to begin, which a busy machine may not keep."""
+    for _ in range(_CONNECT_TRIES - 1):
+        with suppress(AssertionError):
+            return connect(address, timeout=_CONNECT_S, set_as_default=False)
+    try:
+        return connect(address, timeout=_CONNECT_S, set_as_default=False)
+    except AssertionError:
+        raise PeerError(
+            f"--scheduler {address}: the machine is too busy for Dask's client to begin"
+        ) from None
+
+
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np.void]:
+    """Run some draws on another machine.
+
+    Raises:
+        OtherArithmeticError: its results would be others than those of who asks.
+    """
+    if (other := difference(arithmetic(), wanted)) is not None:
+        raise OtherArithmeticError(
+            f"a worker on {socket.gethostname()} would give other results: {other}"
+        )
+    return run_draws(work, draws)
+
+
+@contextmanager
+def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
+    """Run chunks on the Dask cluster of a scheduler; the workers need this noack, too.
+
+    Args:
+        address: of the scheduler.
+        say: is told, in a line, what the cluster is waited for.
+
+    Raises:
+        CallerError: Dask is not installed, or the address is none.
+        PeerError: the scheduler does not answer.
+    """
+    try:
+        import distributed
+    except ImportError:
+        raise CallerError(
+            "--scheduler needs Dask, which is not installed; pip install 'noack[cluster]'"
+        ) from None
+    _require_address(address)
+    for name in list(logging.root.manager.loggerDict):
+        if name.startswith("distributed"):  # what is to be said of its troubles is said below
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        client = _client(distributed.Client, address)
+    except (OSError, TimeoutError):
+        raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
+
+    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+        watch = _Watch(client, address, say)
+        executor: Executor = client.get_executor(pure=False)
+        try:
+            yield from _windowed(executor, points, chunks, watch, arithmetic())
+        except OtherArithmeticError as error:
+            raise OtherArithmeticError(f"{address}: {error}") from None
+        except (ImportError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and "deserializ" not in str(error):
+                raise
+            raise PeerError(
+                f"{address}: scheduler and workers need this noack and its libraries, too"
+            ) from None
+        except CancelledError:
+            raise LostWorkersError(f"{address}: the scheduler is gone") from None
+        except distributed.scheduler.KilledWorker:
+            raise LostWorkersError(
+                f"{address}: several workers died over the same chunk (is there not enough memory?)"
+            ) from None
+
+    with client:
+        yield run
+
+
+class _Watch:
+    """How many chunks may be under way on a cluster, which grows and shrinks.
+
+    Args:
+        client: of the cluster.
+        address: of its scheduler.
+        say: is told what is waited for.
+    """
+
+    def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
+        self._client, self._address, self._say = client, address, say
+        self._told = False
+        self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
+
+    def __call__(self) -> int:
+        """Look, though not too often.
+
+        Raises:
+            LostWorkersError: the scheduler is gone, or there has been no worker for long.
+        """
+        now_s = time.monotonic()
+        if now_s - self._looked_s > _LOOK_EVERY_S:
+            try:
+                self._cores = sum(self._client.ncores().values())
+            except (OSError, TimeoutError):
+                raise LostWorkersError(f"{self._address}: the scheduler is gone") from None
+            self._looked_s = now_s
+            if self._cores:
+                self._seen_s, self._told = now_s, False
+            elif not self._told:
+                self._told = True
+                self._say(f"{self._address}: no worker; waiting {_PATIENCE_S:g} s for one")
+            elif now_s - self._seen_s > _PATIENCE_S:
+                raise LostWorkersError(
+                    f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
+                    "(those with an older noack end at once)"
+                )
+        return max(_AHEAD * self._cores, 1)
+
+
+def _windowed(
+    executor: Executor,
+    points: Sequence[Point],
+    chunks: Iterable[Chunk],
+    most: Callable[[], int],
+    wanted: Mapping[str, str] | None = None,
+) -> Iterator[Finished]:
+    """Keep so many chunks under way, so that memory does not grow with the campaign."""
+    rest = iter(chunks)
+    under_way: dict[Future[NDArray[np.void]], Chunk] = {}
+    while True:
+        for chunk in islice(rest, max(most() - len(under_way), 0)):
+            task = (points[chunk.point].work, chunk.draws)
+            with interrupts_held():
+                future = (
+                    executor.submit(run_draws, *task) if wanted is None
+                    else executor.submit(run_alike, *task, wanted)
+                )  # fmt: skip
+            under_way[future] = chunk
+        if not under_way:
+            return
+        done, _ = wait(under_way, _LOOK_EVERY_S, FIRST_COMPLETED)
+        for future in done:
+            yield under_way.pop(future), future.result()

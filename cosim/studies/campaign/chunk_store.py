@@ -1,0 +1,259 @@
+"""A campaign's folder: the runs in chunks of Parquet, each written whole or not at all.
+
+``FOLDER/runs/point-00003/draws-000004000.parquet`` holds runs 4,000 … of grid point 3, a row each,
+with the values of the axes beside what was measured. A chunk that is there is never made again.
+"""
+
+import contextlib
+import fcntl
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from cosim.simulation.batch.batch_interface import ROW
+from cosim.studies.campaign.campaign_file import Campaign
+from cosim.studies.campaign.campaign_grid import Point
+from cosim.studies.campaign.worker_identity import arithmetic, difference
+from noack.core.errors import CallerError, MachineError
+
+RUNS, MANIFEST = "runs", "campaign.json"
+_LOCK = ".lock"
+_FORMAT = 1
+_PARTIAL = ".partial"
+MOST_FILES = 1_000_000
+
+
+class Chunk(NamedTuple):
+    """Some successive draws at a grid point."""
+
+    point: int
+    start: int
+    stop: int
+
+    @property
+    def draws(self) -> range:
+        """Their numbers."""
+        return range(self.start, self.stop)
+
+
+class Store:
+    """The chunks of a campaign.
+
+    Args:
+        folder: the campaign's folder.
+        points: of its grid.
+        draws: runs at each point.
+        size: draws in a chunk.
+
+    Raises:
+        CallerError: there would be too many files.
+    """
+
+    def __init__(self, folder: Path, points: Sequence[Point], draws: int, size: int) -> None:
+        if (count := len(points) * -(-draws // size)) > MOST_FILES:
+            raise CallerError(
+                f"draws = {draws}, chunk = {size}: the results would be {count:,} files; "
+                f"at most {MOST_FILES:,}: give fewer draws, or a larger chunk"
+            )
+        self.folder, self.points, self.draws = folder, points, draws
+        self._size = size
+        self._schema = pa.schema(
+            [
+                *(
+                    (name, pa.dictionary(pa.int16(), pa.string()) if text else pa.float64())
+                    for name, value in points[0].values.items()
+                    for text in (isinstance(value, str),)
+                ),
+                ("draw", pa.int64()),
+                *((name, pa.from_numpy_dtype(ROW[name])) for name in ROW.names or ()),
+            ]
+        )
+
+    def chunks(self, point: int) -> Iterator[Chunk]:
+        """All chunks of a point."""
+        for start in range(0, self.draws, self._size):
+            yield Chunk(point, start, min(start + self._size, self.draws))
+
+    def missing(self) -> Iterator[Chunk]:
+        """The chunks that are not there: of all points the first draws first."""
+        for chunks in zip(*(self.chunks(point.number) for point in self.points), strict=True):
+            yield from (chunk for chunk in chunks if not self._is_there(chunk))
+
+    def write(self, chunk: Chunk, rows: NDArray[np.void]) -> None:
+        """Write a chunk; whoever looks sees all of it or nothing.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        values = self.points[chunk.point].values
+        columns: dict[str, Any] = {
+            name: pa.array([value]).dictionary_encode().cast(self._schema.field(name).type)
+            .take(np.zeros(len(rows), np.int8))
+            if isinstance(value, str) else np.full(len(rows), float(value))
+            for name, value in values.items()
+        }  # fmt: skip
+        columns["draw"] = np.arange(chunk.start, chunk.stop)
+        columns |= {name: np.ascontiguousarray(rows[name]) for name in ROW.names or ()}
+        path = self._path(chunk)
+        scratch = path.with_name(f".{path.name}{_PARTIAL}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            table = pa.table(columns, self._schema)
+            pq.write_table(table, scratch, compression="zstd", write_page_checksum=True)
+            scratch.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                scratch.unlink(missing_ok=True)
+            raise
+
+    def columns(self, point: int, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Columns of all runs at a point, by draw, (draws,) each.
+
+        Raises:
+            MachineError: a file cannot be read.
+        """
+        parts: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+        for chunk in self.chunks(point):
+            path = self._path(chunk)
+            try:
+                table = pq.read_table(path, columns=list(names), page_checksum_verification=True)
+            except (OSError, pa.ArrowException):
+                raise MachineError(
+                    f"{path}: cannot be read, or is damaged; remove it, and the same command "
+                    "makes it again"
+                ) from None
+            for name in names:
+                parts[name].append(table[name].to_numpy()[: len(chunk.draws)])
+        return {name: np.concatenate(part) for name, part in parts.items()}
+
+    def _is_there(self, chunk: Chunk) -> bool:
+        """Whether its file is sound; that of a campaign with more draws may hold more."""
+        try:
+            found = pq.read_metadata(self._path(chunk))
+        except (OSError, pa.ArrowException):
+            return False
+        return bool(
+            found.num_rows >= len(chunk.draws)
+            and found.schema.to_arrow_schema().names == self._schema.names
+        )
+
+    def _path(self, chunk: Chunk) -> Path:
+        return self.folder / RUNS / f"point-{chunk.point:05}" / f"draws-{chunk.start:09}.parquet"
+
+
+@contextmanager
+def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterator[None]:
+    """Have a campaign's folder to oneself: a new one, or one of the same campaign.
+
+    What may differ is how many draws there are, and what is shown; also what the arithmetic
+    depends on, if nothing is to be made any more.
+
+    Args:
+        campaign: the campaign.
+        base: content of the scenario that all runs start from.
+        store: its folder.
+
+    Raises:
+        CallerError: it holds another campaign, or one made by another arithmetic, or someone else
+            is at work in it.
+        MachineError: it cannot be made.
+    """
+    folder = store.folder
+    manifest = {
+        "format": _FORMAT,
+        "campaign": _identity(campaign),
+        "scenario": base,
+        # What the scenario's files say, and its defaults, is not in what stands above.
+        "scenario_resolved": blake2b(
+            "".join(point.scenario.model_dump_json() for point in store.points).encode(),
+            digest_size=16,
+        ).hexdigest(),
+        "arithmetic": arithmetic(),
+    }
+    manifest = json.loads(json.dumps(manifest, default=str))
+    with ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / _LOCK).open("a"))
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise CallerError(f"{folder}: another noack is at work in it") from None
+            made_by = _claim(folder, manifest)
+            for scratch in (folder / RUNS).glob(f"*/.*{_PARTIAL}"):
+                scratch.unlink(missing_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise MachineError(f"{folder}: cannot be written: {reason}") from None
+        other = difference(made_by, arithmetic())
+        if other is not None and next(store.missing(), None) is not None:
+            raise CallerError(
+                f"{folder}: cannot be gone on with, results would not be of one piece "
+                f"({other}); give another --out, or remove it"
+            )
+        yield
+
+
+def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
+    """Make the folder this campaign's; return the arithmetic that its runs are made by."""
+    path = folder / MANIFEST
+    try:
+        there = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        if (folder / RUNS).exists():
+            raise CallerError(
+                f"{folder}: holds runs, but no {MANIFEST}; give another --out"
+            ) from None
+        scratch = path.with_name(f".{path.name}{_PARTIAL}")
+        scratch.write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        scratch.replace(path)
+        return dict(manifest["arithmetic"])
+    except ValueError:
+        there = None
+    if not isinstance(there, dict) or not isinstance(there.get("arithmetic"), dict):
+        raise CallerError(f"{path}: not a campaign's; give another --out")
+    made_by: dict[str, str] = there.pop("arithmetic")
+    found = _difference(there, {k: v for k, v in manifest.items() if k != "arithmetic"})
+    if found is not None:
+        raise CallerError(
+            f"{folder}: holds another campaign ({found}); give another --out, or remove it"
+        )
+    return made_by
+
+
+def _identity(campaign: Campaign) -> dict[str, Any]:
+    """What results depend on."""
+    content = campaign.model_dump(
+        mode="json", exclude={"draws", "description", "figures", "compare"}
+    )
+    del content["metrics"]["shown"]
+    for axis in content["axes"]:
+        del axis["title"]
+    return content
+
+
+def _difference(there: Any, here: Any, key: str = "") -> str | None:
+    """The first key whose values differ."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        for name in sorted(there.keys() | here.keys()):
+            place = f"{key}.{name}" if key else name
+            if (found := _difference(there.get(name), here.get(name), place)) is not None:
+                return found
+        return None
+    if isinstance(there, list) and isinstance(here, list) and len(there) == len(here):
+        pairs = enumerate(zip(there, here, strict=True))
+        return next(filter(None, (_difference(a, b, f"{key}.{i}") for i, (a, b) in pairs)), None)
+    return None if there == here else f"{key} is {_short(there)} there, {_short(here)} here"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."

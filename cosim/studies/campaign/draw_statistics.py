@@ -1,0 +1,115 @@
+"""What the draws of a grid point say of a metric, and how surely.
+
+Means have Student's confidence intervals, ± t s/√k; they and their spread are of the finite values,
+whose number is said. The median's interval is that of order statistics (binomial, free of any
+distribution) and counts what is infinite: a run that never settles is later than all others.
+"""
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Vector
+
+CONFIDENCE = 0.95
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+class Estimate(NamedTuple):
+    """A metric over k draws."""
+
+    draws: int
+    finite: int
+    """Draws in which it is finite; mean and interval are of these."""
+    mean: float
+    halfwidth: float
+    """Of the mean's 95 % confidence interval."""
+    q05: float
+    q25: float
+    median: float
+    q75: float
+    q95: float
+    median_low: float
+    """The median's 95 % confidence interval."""
+    median_high: float
+    largest: float
+
+
+def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
+    """Estimate a metric from its values in k ≥ 1 draws.
+
+    Args:
+        values: (k,), without NaN.
+        finite: those of them that count for the mean; all finite ones unless given.
+    """
+    finite = values[np.isfinite(values)] if finite is None else finite
+    mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
+    if len(finite) > 1:
+        with np.errstate(over="ignore"):  # the interval of numbers beyond 1e150 is infinite
+            deviation = float(finite.std(ddof=1))
+        halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
+    ordered = np.sort(values)
+    q05, q25, median, q75, q95 = (float(ordered[_rank(len(values), share)]) for share in QUANTILES)
+    low, high = _median_ranks(len(values))
+    return Estimate(
+        len(values),
+        len(finite),
+        mean,
+        halfwidth,
+        q05,
+        q25,
+        median,
+        q75,
+        q95,
+        float(ordered[low]) if low is not None else -math.inf,
+        float(ordered[high]) if high is not None else math.inf,
+        float(ordered[-1]),
+    )
+
+
+class Difference(NamedTuple):
+    """A metric at one grid point minus at another, draw by draw."""
+
+    estimate: Estimate
+    larger: float
+    """Share of the draws in which it is larger."""
+    smaller: float
+    """Share of the draws in which it is smaller."""
+
+
+def difference(values: Vector, reference: Vector) -> Difference:
+    """Estimate ``values`` − ``reference``, (k,) each.
+
+    Where both are infinite the difference is 0 for quantiles, and does not count for the mean.
+    """
+    with np.errstate(invalid="ignore"):
+        differences = np.where(values == reference, 0.0, values - reference)
+    both = np.isfinite(values) & np.isfinite(reference)
+    return Difference(
+        estimate(differences, differences[both]),
+        float((values > reference).mean()),
+        float((values < reference).mean()),
+    )
+
+
+@cache
+def _student(count: int) -> float:
+    """What the standard error of a mean of so many values is multiplied by."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
+
+
+def _rank(count: int, share: float) -> int:
+    """Rank, from 0, of the smallest value that so large a share does not exceed."""
+    return max(math.ceil(share * count) - 1, 0)
+
+
+def _median_ranks(count: int) -> tuple[int | None, int | None]:
+    """Ranks between which the median lies with 95 % confidence; None where no rank will do."""
+    from scipy.stats import binom
+
+    low = int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5)) - 1
+    return (low, count - 1 - low) if low >= 0 else (None, None)

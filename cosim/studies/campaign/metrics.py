@@ -1,0 +1,101 @@
+"""What is measured of each run of a campaign, and what a certificate says of it beforehand."""
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.simulation.batch.batch_status import OK
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Vector
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.gains import Output, error_gains
+
+Metric = Literal[
+    "transmissions",
+    "deliveries",
+    "lost_share",
+    "inter_event_min_s",
+    "inter_event_mean_s",
+    "settling_s",
+    "cost",
+    "sup_e_c_scaled",
+    "certificate_used",
+    "final_norm",
+]
+
+
+class Description(NamedTuple):
+    """How a metric is called."""
+
+    title: str
+    unit: str = ""
+    meaning: str = ""
+    """What the title leaves open."""
+    logarithmic: bool = False
+    """Whether its axis in a figure may be."""
+
+    @property
+    def heading(self) -> str:
+        """Of a column."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    @property
+    def label(self) -> str:
+        """Of an axis."""
+        return f"{self.title} {self.meaning}".strip() + (f" [{self.unit}]" if self.unit else "")
+
+
+METRICS: Mapping[Metric, Description] = {
+    "transmissions": Description("transmissions", logarithmic=True),
+    "deliveries": Description("deliveries", logarithmic=True),
+    "lost_share": Description("share lost"),
+    "inter_event_min_s": Description("shortest interval", "s", logarithmic=True),
+    "inter_event_mean_s": Description("mean interval", "s", logarithmic=True),
+    "settling_s": Description("settling time", "s"),
+    "cost": Description("cost", "", "∫ xᵀQx + uᵀRu dt", logarithmic=True),
+    "sup_e_c_scaled": Description("largest error", "", "sup ‖e_c‖ e^(αt)"),
+    "certificate_used": Description("bound used", "", "sup ‖e_c‖ e^(αt) / Δβ"),
+    "final_norm": Description("final state", "", "‖x‖", logarithmic=True),
+}
+
+
+def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> dict[Metric, Vector]:
+    """All metrics of some runs; infinite is what does not happen, and all of a run that fails.
+
+    Args:
+        columns: what the batch engine says of k runs, (k,) each.
+        certified: Δβ; without it there is no ``certificate_used``.
+    """
+    found: dict[Metric, Vector] = {}
+    failed = columns["status"] != OK
+    for name in METRICS:
+        if name in columns:
+            values = np.asarray(columns[name], dtype=np.float64)
+            found[name] = np.where(np.isnan(values) | failed, np.inf, values)
+    arrived = columns["deliveries"] / np.maximum(columns["transmissions"], 1)
+    found["lost_share"] = np.where(failed, np.inf, 1.0 - arrived)
+    if certified is not None:
+        found["certificate_used"] = found["sup_e_c_scaled"] / certified
+    return found
+
+
+def certified_error(resolved: Scenario) -> float | None:
+    """Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
+
+    Δ sums the gains of the present error and of M − 1 missed ones, however close, by identity (I1):
+    it depends on the models alone. It needs models that decay faster than the threshold (which a
+    hold does not), a threshold without a floor within the horizon, and a network that keeps to
+    the cap.
+    """
+    trigger, network = resolved.trigger, resolved.network
+    if trigger.policy != "decaying" or trigger.floor > 0 or not network.enforce_mansd:
+        return None
+    models = error_gains(loop_of(resolved), trigger.alpha_per_s)
+    try:
+        missing = models.missing(Output.WEIGHTED, network.mansd, 0.0)
+    except NotDecayingError:
+        return None
+    return (models.now(Output.WEIGHTED) + missing) * trigger.beta

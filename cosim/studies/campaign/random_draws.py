@@ -1,0 +1,116 @@
+"""What is drawn: plants from the box, initial states, losses, disturbances and noise.
+
+Each is from a stream of its own.
+
+Draw i depends on the campaign's seed and i alone: not on the grid point, the chunk or the worker.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.simulation.batch.batch_interface import Population
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.sections.run_sections import Seeds
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.random_streams import uniforms, words
+
+_STREAM = "campaign"
+
+
+class Box(NamedTuple):
+    """Where plants and initial states are drawn from."""
+
+    A: Matrix
+    """Centre, (n, n)."""
+    B: Matrix
+    """Centre, (n, m)."""
+    x0: Vector
+    """Centre, (n,)."""
+    half_A: Matrix
+    """Half-widths, (n, n)."""
+    half_B: Matrix
+    """Half-widths, (n, m)."""
+    half_x0: Vector
+    """Half-widths, (n,)."""
+    vertex: bool
+    """Plants are drawn from the box's corners only."""
+
+    def population(self, seed: int, draws: range) -> Population:
+        """Some successive draws."""
+        signs = partial(np.copysign, 1.0) if self.vertex else np.asarray
+        A, B = (
+            centre + half * signs(_units(seed, name, draws, centre.size)).reshape(-1, *centre.shape)
+            for name, centre, half in (("A", self.A, self.half_A), ("B", self.B, self.half_B))
+        )
+        x0 = self.x0 + self.half_x0 * _units(seed, "initial_state", draws, self.x0.size)
+        # 63 bits: what TOML calls an integer.
+        loss_seeds = words(seed, _STREAM, "loss", rows=draws, width=1)[:, 0] >> np.uint64(1)
+        return Population(A, B, x0, loss_seeds)
+
+
+def box_of(scenario: Scenario) -> Box:
+    """The box of a scenario; of a plant that is given or nominal, without extent.
+
+    Of one that is not linear, it is around the model.
+    """
+    loop = loop_of(
+        resolve(
+            scenario.model_copy(
+                update={
+                    "plant": scenario.plant.model_copy(
+                        update={
+                            "draw": "given" if scenario.plant.draw == "given" else "nominal",
+                            "initial_state_halfwidth": None,
+                        }
+                    )
+                }
+            )
+        )
+    )
+    A, B, x0 = loop.A, loop.B, loop.x0
+    drawn = scenario.plant.draw in ("uniform", "vertex")
+
+    def half(given: tuple[object, ...] | None, like: Matrix) -> Matrix:
+        return np.zeros_like(like) if given is None else np.array(given, dtype=np.float64)
+
+    return Box(
+        A,
+        B,
+        x0,
+        half(scenario.plant.uncertainty_A if drawn else None, A),
+        half(scenario.plant.uncertainty_B if drawn else None, B),
+        half(scenario.plant.initial_state_halfwidth, x0),
+        scenario.plant.draw == "vertex",
+    )
+
+
+def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
+    """One run of a campaign as a scenario of its own, resolved."""
+    A, B, x0, loss_seeds = (
+        drawn[0].tolist() for drawn in box_of(scenario).population(seed, range(draw, draw + 1))
+    )
+    plant = scenario.plant.model_copy(
+        update={
+            **({"draw": "given", "A": _rows(A), "B": _rows(B)} if scenario.is_linear else {}),
+            "initial_state": tuple(x0),
+            "initial_state_halfwidth": None,
+        }
+    )
+    disturbance, noise = (
+        int(words(seed, _STREAM, name, rows=range(draw, draw + 1), width=1)[0, 0] >> np.uint64(1))
+        for name in ("disturbance", "noise")
+    )
+    seeds = Seeds(loss=loss_seeds, disturbance=disturbance, noise=noise)
+    return resolve(scenario.model_copy(update={"plant": plant, "seeds": seeds}))
+
+
+def _rows(matrix: list[list[float]]) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix))
+
+
+def _units(seed: int, name: str, draws: range, width: int) -> Matrix:
+    """Uniform in [−1, 1), (k, width)."""
+    return 2.0 * uniforms(seed, _STREAM, name, rows=draws, width=width) - 1.0

@@ -1,0 +1,143 @@
+"""Runs of a campaign by the machines of a live run, in virtual time.
+
+With the schedule's sampling, delays and acknowledgements, which continuous time has no place for.
+
+The plant holds its input from step to step, so the cost is exact: over a step of h, with
+z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978). What
+disturbs it is held likewise, and belongs to z, weighing nothing. Of plants that are not linear it
+is by the trapezoidal rule over the plant's steps. The rest is of the samples: x at the plant's
+steps, e_c at the measurements.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from cosim.record.align import in_common, join_all
+from cosim.record.run_record import RunRecord
+from cosim.simulation.batch.batch_interface import ROW
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
+from noack.config.scenario import Scenario
+from noack.config.sections.run_sections import Ports, Realtime, Seeds
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from noack.trigger.policy_from_settings import policy_of
+
+
+@dataclass(frozen=True)
+class SampledWork:
+    """What a worker needs to know of a point; the same for all its chunks.
+
+    Args:
+        scenario: its plant and initial state not yet drawn; see :func:`in_virtual_time`.
+        seed: of the draws.
+        Q: weight of the state in the cost, (n, n); None: the identity.
+        R: weight of the input, (m, m); None: the identity.
+        settle: settled is when ‖x‖ stays at or below this share of ‖x(0)‖.
+        most_events: a run with more is given up.
+    """
+
+    scenario: Scenario
+    seed: int
+    Q: Matrix | None
+    R: Matrix | None
+    settle: float
+    most_events: int
+
+    @property
+    def box(self) -> Box:
+        """Where plants and initial states are drawn from."""
+        return box_of(self.scenario)
+
+    def run(self, draws: range) -> NDArray[np.void]:
+        """Run some successive draws; one row of ``batch_interface.ROW`` each."""
+        rows = np.zeros(len(draws), ROW)
+        for row, draw in zip(rows, draws, strict=True):
+            record = simulate(drawn_scenario(self.scenario, self.seed, draw))
+            with np.errstate(all="ignore"):  # a run that diverges is told by its status
+                self._measure(record, row)
+        return rows
+
+    def _measure(self, record: RunRecord, row: np.void) -> None:
+        measurements, steps = record[SENSOR_MEASUREMENT], record[PLANT_STEP]
+        events_s = measurements["t_ns"][measurements["event"] != NO_SEQUENCE] / NS_PER_S
+        gaps_s = np.diff(events_s)
+        row["transmissions"] = len(events_s)
+        row["deliveries"] = len(record[CONTROLLER_DELIVERY])
+        row["inter_event_min_s"] = gaps_s.min() if len(gaps_s) else np.nan
+        row["inter_event_mean_s"] = gaps_s.mean() if len(gaps_s) else np.nan
+        for name in ("settling_s", "cost", "sup_e_c_scaled", "final_norm", "diverged_at_s"):
+            row[name] = np.nan
+        norms, t_s = np.linalg.norm(steps["x"], axis=1), steps["t_ns"] / NS_PER_S
+        lost = np.flatnonzero(~np.isfinite(norms))
+        if len(lost):
+            row["status"], row["diverged_at_s"] = DIVERGED, t_s[lost[0]]
+            return
+        if len(events_s) > self.most_events:
+            row["status"] = TOO_MANY_EVENTS
+            return
+        row["status"] = OK
+        above = np.flatnonzero(norms > self.settle * norms[0])
+        if not len(above):
+            row["settling_s"] = 0.0
+        elif above[-1] < len(norms) - 1:
+            row["settling_s"] = t_s[above[-1]]
+        row["final_norm"] = norms[-1]
+        row["cost"] = self._cost(record)
+        joined = join_all(record)
+        fading_per_s = policy_of(record.scenario).guards(record.loop.n).fading_per_s
+        scaled = joined.e_c_norm * np.exp(fading_per_s * joined.t_ns / NS_PER_S)
+        row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
+
+    def _cost(self, record: RunRecord) -> float:
+        loop, steps = record.loop, record[PLANT_STEP]
+        n, m = loop.n, loop.m
+        if not record.scenario.is_linear:
+            return self._trapezoid(record)
+        held = {"d": loop.B, "w": np.eye(n)}
+        added = [name for name in held if name in (steps.dtype.names or ())]
+        through = np.hstack([loop.B, *(held[name] for name in added)])
+        size = n + len(through.T)
+        weight = np.zeros((size, size))
+        weight[:n, :n] = np.eye(n) if self.Q is None else self.Q
+        weight[n : n + m, n : n + m] = np.eye(m) if self.R is None else self.R
+        drift = np.zeros((size, size))
+        drift[:n, :n], drift[:n, n:] = loop.A, through
+        block = np.block([[-drift.T, weight], [np.zeros((size, size)), drift]])
+        block = expm(block * (record.scenario.plant_period_ns / NS_PER_S))
+        over_a_step = block[size:, size:].T @ block[:size, size:]
+        z = np.hstack([steps[name] for name in ("x", "u", *added)])[:-1]
+        return float(np.einsum("ki,ij,kj->", z, over_a_step, z))
+
+    def _trapezoid(self, record: RunRecord) -> float:
+        x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"][:-1]
+        Q = np.eye(record.loop.n) if self.Q is None else self.Q
+        R = np.eye(record.loop.m) if self.R is None else self.R
+        of_x = np.einsum("ki,ij,kj->k", x, Q, x)
+        of_u = np.einsum("ki,ij,kj->k", u, R, u)
+        step_s = record.scenario.plant_period_ns / NS_PER_S
+        return float(step_s * (0.5 * (of_x[1:] + of_x[:-1]) + of_u).sum())
+
+
+def in_virtual_time(scenario: Scenario) -> Scenario:
+    """The scenario without what plays no part in its simulation."""
+    return scenario.model_copy(
+        update={
+            "name": "campaign",
+            "description": "",
+            "speed": 1.0,
+            "seeds": Seeds(),
+            "ports": Ports(),
+            "realtime": Realtime(),
+        }
+    )

@@ -1,0 +1,157 @@
+"""What is measured of a candidate: transmissions and settling over draws, certified bounds."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from cosim.simulation.batch.batch_interface import Population, run_batch, setting_of
+from cosim.studies.campaign.draw_statistics import CONFIDENCE
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.theory.run_conditions import ideal_conditions, nominal_conditions
+from noack.theory.scenario_certificates import Certificate, certify, certify_box, outside_box
+
+Bounded = Literal["state", "error"]
+Bounds = Mapping[Bounded, float]
+"""sup‖x‖ and sup‖e_c‖, Euclidean; infinite if none is certified."""
+
+_Z = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a design must meet.
+
+    Args:
+        settling_s: the quantile of the settling times is at most this.
+        quantile: which.
+        settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
+        bounds: certified bounds are at most these.
+        schedule: they are certified under the scenario's schedule, not the paper's conditions.
+    """
+
+    settling_s: float
+    quantile: float
+    settle: float
+    bounds: Bounds
+    schedule: bool = False
+
+    def excess(self, settling_s: float, bounds: Bounds) -> float:
+        """0 if all are met, else how far the worst is missed: 1 − limit/value."""
+        pairs = [(settling_s, self.settling_s)]
+        pairs += [(bounds[name], limit) for name, limit in self.bounds.items() if name in bounds]
+        return max(0.0, *(1.0 - limit / value if value > 0 else 0.0 for value, limit in pairs))
+
+
+class Measured(NamedTuple):
+    """Of k draws; intervals have 95 % confidence."""
+
+    draws: int
+    transmissions: float
+    """Mean."""
+    halfwidth: float
+    """Of the mean's interval (normal)."""
+    settling_s: float
+    """The quantile; infinite if too many runs do not settle within the horizon."""
+    settling_low_s: float
+    settling_high_s: float
+    """Its interval, of order statistics: free of any distribution."""
+    settled: float
+    """The share of runs that settle within the limit."""
+
+
+def measure(scenario: Scenario, limits: Limits, population: Population) -> Measured:
+    """Run a scenario over draws; a run that fails never settles.
+
+    Raises:
+        CallerError: the engine cannot run it.
+    """
+    setting = replace(setting_of(resolve(scenario)), settle=limits.settle)
+    rows = run_batch(setting, population)
+    sent = rows["transmissions"].astype(np.float64)
+    settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
+    ordered = np.append(np.sort(settling_s), math.inf)
+    at, low, high = ranks(len(rows), limits.quantile)
+    return Measured(
+        len(rows),
+        float(sent.mean()),
+        _Z * float(sent.std(ddof=1)) / math.sqrt(len(sent)),
+        float(ordered[at]),
+        float(ordered[low]) if low >= 0 else 0.0,
+        float(ordered[high]),
+        float(np.mean(settling_s <= limits.settling_s)),
+    )
+
+
+def ranks(count: int, quantile: float) -> tuple[int, int, int]:
+    """Ranks, from 0, of a quantile among so many values, and of its interval's ends.
+
+    The lower end is −1 where there is none, the upper one then is ``count``.
+    """
+    from scipy.stats import binom
+
+    # The j-th of all, from 1, is at least the quantile if fewer than j lie below it.
+    tail = (1.0 - CONFIDENCE) / 2
+    low = int(binom.ppf(tail, count, quantile)) - 1
+    high = int(binom.ppf(1.0 - tail, count, quantile))
+    return max(math.ceil(quantile * count) - 1, 0), low, min(high, count)
+
+
+def require_draws(draws: int, quantile: float) -> None:
+    """Require enough draws for an interval of the quantile.
+
+    Raises:
+        CallerError: they are too few.
+    """
+    if ranks(draws, quantile)[2] < draws:
+        return
+    enough = draws
+    while ranks(enough, quantile)[2] == enough:
+        enough += max(enough // 50, 1)
+    raise CallerError(
+        f"--draws: {draws} say too little of the quantile {quantile:g}; {enough} are enough"
+    )
+
+
+def require_certifiable(scenario: Scenario) -> None:
+    """Require that a certificate covers what is drawn.
+
+    Raises:
+        CallerError: it would not.
+    """
+    if scenario.plant.initial_state_halfwidth is not None:
+        raise CallerError(
+            "--bound: is certified for one x(0); leave out plant.initial_state_halfwidth"
+        )
+    outside = outside_box(resolve(scenario))
+    if outside is not None:
+        raise CallerError(f"--bound: {outside}")
+
+
+def certificate_of(scenario: Scenario, limits: Limits) -> Certificate:
+    """The certificate of all plants in the box, or of the plant if there is no box."""
+    resolved = resolve(scenario)
+    late = resolved.certificate.late_periods
+    conditions = (
+        nominal_conditions(resolved, late) if limits.schedule else ideal_conditions(resolved)
+    )
+    return certify_box(resolved, conditions) or certify(resolved, conditions)
+
+
+def bounds_of(scenario: Scenario, limits: Limits) -> Bounds:
+    """Certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
+    found = certificate_of(scenario, limits)
+    if found.constants is None:
+        return {"state": math.inf, "error": math.inf}
+    turns_s = found.floor_from_s if math.isfinite(found.floor_from_s) else 0.0
+    t_s = np.array([0.0, turns_s])
+    weight = loop_of(resolve(scenario)).weight
+    shrinks = 1.0 if weight is None else float(np.linalg.norm(np.linalg.inv(weight), 2))
+    return {
+        "state": float(found.state(t_s).max()),
+        "error": shrinks * float(found.controller_error(t_s).max()),
+    }

@@ -1,0 +1,108 @@
+"""The page of a design: one file of HTML with figure and tables, and the table of a terminal."""
+
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from cosim.output import report
+from cosim.output.number_format import plus_minus
+from cosim.output.report.figure_files import inline
+from cosim.studies.design.design_figure import trade_off
+from cosim.studies.design.design_result import WORDS, Found, certified, seconds
+from noack.config.scenario_file import dumps
+
+_CAPTION = (
+    "Each candidate's mean number of transmissions and the quantile of its settling times, all on "
+    "the same draws; those that settle too rarely to have a quantile are left out. The star is the "
+    "chosen one on fresh draws."
+)
+_MOST_ROWS = 20
+HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
+
+
+def page(found: Found) -> str:
+    """Return the page as HTML; whatever is not the figure is escaped."""
+    limits, bounds = found.limits, found.bounds or {}
+    lines = [
+        f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
+        f"within {limits.settling_s:g} s",
+        *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
+    ]
+    return _templates().get_template("design.html.jinja").render(
+        title=found.space.families[0].scenario.name,
+        subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
+        f"seed {found.seed}",
+        verdict=found.verdict(),
+        tone="good" if found.confirmed else "doubt" if found.feasible else "bad",
+        limits=lines,
+        certified=[certified(name, value) for name, value in bounds.items()],
+        conditions=found.conditions,
+        figure=Markup(inline(trade_off(found), "trade-off", _CAPTION)),
+        caption=_CAPTION,
+        headings=HEADINGS,
+        rows=rows(found),
+        scenario_toml=dumps(found.scenario),
+    )  # fmt: skip
+
+
+def rows(found: Found) -> list[tuple[str, ...]]:
+    """The trade-off curve."""
+    found_rows: list[tuple[str, ...]] = []
+    for trial in found.front:
+        family = found.space.families[trial.candidate.family]
+        found_rows.append(
+            (
+                plus_minus(trial.measured.transmissions, trial.measured.halfwidth),
+                seconds(trial.measured),
+                f"{trial.candidate.alpha_per_s:.4g}",
+                f"{trial.candidate.beta:.4g}",
+                family.weight,
+                family.gain,
+            )
+        )
+    return found_rows
+
+
+def print_found(console: Console, found: Found) -> None:
+    """Print the trade-off curve, thinned if it is long, and the verdict."""
+    title = f"{found.space.families[0].scenario.name}: trade-off, no other is smaller in both"
+    # All of it in 80 columns, no figure cut off.
+    table = Table(
+        title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
+    )
+    for heading in HEADINGS:
+        words = heading in HEADINGS[-2:]
+        table.add_column(heading, justify="left" if words else "right", no_wrap=True)
+    every = rows(found)
+    for row in every[:: -(-len(every) // _MOST_ROWS) or 1]:
+        table.add_row(*row)
+    if every:
+        console.print(table)
+    if found.feasible:
+        console.print(found.verdict(), highlight=False, markup=False, soft_wrap=True)
+        console.print(
+            f"chosen among {len(found.trials):,} candidates on {found.best.measured.draws:,} "
+            f"draws; the figures are of {found.fresh.draws:,} others",
+            highlight=False,
+            soft_wrap=True,
+        )
+    bounds = [certified(name, value) for name, value in (found.bounds or {}).items()]
+    if bounds:
+        text = f"certified {found.conditions}: {', '.join(bounds)}"
+        console.print(text, highlight=False, soft_wrap=True)
+
+
+@cache
+def _templates() -> Environment:
+    return Environment(
+        loader=FileSystemLoader([Path(__file__).parent, Path(report.__file__).parent]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )

@@ -1,0 +1,158 @@
+"""What was found, in words and numbers."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from cosim.output.number_format import plus_minus
+from cosim.studies.design.candidate_measures import Bounded, Bounds, Limits, Measured
+from cosim.studies.design.design_search import Trial
+from cosim.studies.design.design_space import Space
+from noack.config.scenario import Scenario
+
+_DESIGNED = "_designed"
+WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
+
+
+@dataclass(frozen=True)
+class Found:
+    """The result of a design.
+
+    Args:
+        space: what was chosen from.
+        limits: what had to be met.
+        trials: all that were tried.
+        front: the trade-off curve, by ascending transmissions.
+        best: of those that meet the limits the one with the fewest transmissions, or the closest.
+        fresh: the best, measured on draws that no choice depended on.
+        bounds: of the best, certified; None if that cannot be.
+        seed: of the draws.
+    """
+
+    space: Space
+    limits: Limits
+    trials: Sequence[Trial]
+    front: Sequence[Trial]
+    best: Trial
+    fresh: Measured
+    bounds: Bounds | None
+    seed: int
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the best meets the limits, with the confidence of its interval."""
+        return self.best.excess(self.limits) == 0
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether it also does on the fresh draws: the quantile itself."""
+        return self.feasible and self.fresh.settling_s <= self.limits.settling_s
+
+    @property
+    def scenario(self) -> Scenario:
+        """With what was chosen, under a name of its own."""
+        family = self.space.families[self.best.candidate.family]
+        chosen = family.with_trigger(self.best.candidate)
+        limits = self.limits
+        return chosen.model_copy(
+            update={
+                "name": f"{chosen.name.removesuffix(_DESIGNED)[: 64 - len(_DESIGNED)]}{_DESIGNED}",
+                "description": f"{chosen.name} with the trigger that transmits least while "
+                f"{100 * limits.quantile:g} % of draws settle within {limits.settling_s:g} s.",
+            }
+        )
+
+    @property
+    def conditions(self) -> str:
+        """What certified bounds hold for."""
+        kind = "the scenario's schedule" if self.limits.schedule else "the paper's conditions"
+        return f"under {kind}, for the whole box"
+
+    def verdict(self) -> str:
+        """One line."""
+        if self.confirmed:
+            sent = plus_minus(self.fresh.transmissions, self.fresh.halfwidth)
+            return f"{sent} transmissions, settled after {self._settling(self.fresh)}: {self._at()}"
+        if self.feasible:
+            return (
+                f"not confirmed: on fresh draws it takes {self._settling(self.fresh)}, "
+                f"{self.limits.settling_s:g} s are allowed; take more --draws"
+            )
+        return f"no design meets the limits; the closest has {self._missed()}, at {self._at()}"
+
+    def document(self) -> dict[str, Any]:
+        """As JSON."""
+        limits, fresh = self.limits, self.fresh
+        chosen = self.scenario
+        return {
+            "scenario": self.space.families[0].scenario.name,
+            "limits": {
+                "settling_s": limits.settling_s,
+                "quantile": limits.quantile,
+                "settle": limits.settle,
+                "bounds": dict(limits.bounds),
+                "under": "schedule" if limits.schedule else "paper",
+            },
+            "seed": self.seed,
+            "tried": len(self.trials),
+            "feasible": self.feasible,
+            "confirmed": self.confirmed,
+            "verdict": self.verdict(),
+            "best": self._row(self.best)
+            | {
+                "W": chosen.decaying.weight,
+                "K": chosen.model.gain,
+                "fresh": fresh._asdict(),
+                "bounds": None if self.bounds is None else dict(self.bounds),
+            },
+            "front": [self._row(trial) for trial in self.front],
+        }
+
+    def _row(self, trial: Trial) -> dict[str, Any]:
+        family = self.space.families[trial.candidate.family]
+        return {
+            "gain": family.gain,
+            "weight": family.weight,
+            "alpha_per_s": trial.candidate.alpha_per_s,
+            "beta": trial.candidate.beta,
+            **trial.measured._asdict(),
+        }
+
+    def _at(self) -> str:
+        one = self.best.candidate
+        name = self.space.families[one.family].name
+        return f"α = {one.alpha_per_s:.4g} /s, β = {one.beta:.4g}, weight {name}"
+
+    def _settling(self, measured: Measured) -> str:
+        return f"{seconds(measured)} in {100 * self.limits.quantile:g} % of draws"
+
+    def _missed(self) -> str:
+        """What exceeds its limit, and by how much."""
+        measured, missed = self.best.measured, []
+        if measured.settling_high_s > self.limits.settling_s:
+            missed.append(
+                f"a settling time of {self._settling(measured)} "
+                f"({self.limits.settling_s:g} s allowed)"
+            )
+        for name, limit in self.limits.bounds.items():
+            value = self.best.bounds[name]
+            if value > limit:
+                missed.append(f"{certified(name, value)} ({limit:g} allowed)")
+        return " and ".join(missed)
+
+
+def certified(name: Bounded, value: float) -> str:
+    """A certified bound in words."""
+    if not math.isfinite(value):
+        return f"no certified bound of {WORDS[name]}"
+    return f"{WORDS[name]} ≤ {value:.4g}"
+
+
+def seconds(measured: Measured) -> str:
+    """The quantile of the settling times with its interval."""
+    low, at, high = (
+        f"{value:.4g}" if math.isfinite(value) else "∞"
+        for value in (measured.settling_low_s, measured.settling_s, measured.settling_high_s)
+    )
+    return f"{at} s [{low}, {high}]"

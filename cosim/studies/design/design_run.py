@@ -1,0 +1,65 @@
+"""A design from its scenario to what was found."""
+
+from collections.abc import Callable, Mapping
+
+from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.candidate_measures import (
+    Limits,
+    bounds_of,
+    require_certifiable,
+    require_draws,
+)
+from cosim.studies.design.design_result import Found
+from cosim.studies.design.design_search import Search
+from cosim.studies.design.design_space import space_of
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+
+_SCREENING = 4
+"""Screening takes this part of the draws."""
+
+
+def design(
+    families: Mapping[tuple[str, str], Scenario],
+    limits: Limits,
+    *,
+    draws: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Found:
+    """Choose among families; deterministic.
+
+    Args:
+        families: scenarios, not resolved, by the names of gain and norm.
+        limits: what must be met.
+        draws: to choose by; as many others confirm the choice.
+        seed: of all draws.
+        progress: told which share of the work is done, roughly.
+
+    Raises:
+        CallerError: the limits or the scenario do not allow it.
+    """
+    first = next(iter(families.values()))
+    first.require_exact()
+    if limits.settling_s > first.horizon_s:
+        raise CallerError(
+            f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}"
+        )
+    require_draws(draws, limits.quantile)
+    if limits.bounds:
+        require_certifiable(first)
+    space = space_of(families)
+    search = Search(
+        space, limits, box_of(first), seed,
+        screening=max(draws // _SCREENING, 1), draws=draws, progress=progress,
+    )  # fmt: skip
+    best = search.run()
+    scenario = space.families[best.candidate.family].with_trigger(best.candidate)
+    try:
+        require_certifiable(scenario)
+        bounds = best.bounds or bounds_of(scenario, limits)
+    except CallerError:  # nobody asked for a bound
+        bounds = None
+    return Found(
+        space, limits, search.trials, search.front(), best, search.confirm(best), bounds, seed
+    )

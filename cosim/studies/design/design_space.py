@@ -1,0 +1,151 @@
+"""What is chosen from: families of loops, each with a gain and a norm, and in each α and β."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, spectral_abscissa
+
+RATE_STEP, RATE_STEPS, MOST_RATE = 1.5, 6, 0.95
+"""The grid's α: MOST_RATE of the decay rate, and so often RATE_STEP times less."""
+LEVELS = np.geomspace(0.01, 3.0, 8)
+"""The grid's β, as shares of ‖x(0)‖."""
+LEVEL_STEP = float(LEVELS[1] / LEVELS[0])
+_WIDEST = 3.0
+"""The search may leave the grid's β by this factor."""
+
+
+class Candidate(NamedTuple):
+    """A trigger of a family."""
+
+    family: int
+    alpha_per_s: float
+    beta: float
+
+
+@dataclass(frozen=True)
+class Family:
+    """Candidates that differ in α and β only.
+
+    Args:
+        gain: what its gain is called.
+        weight: what its norm is called.
+        scenario: with this gain and norm, not resolved.
+    """
+
+    gain: str
+    weight: str
+    scenario: Scenario
+
+    @property
+    def name(self) -> str:
+        """Norm and gain."""
+        return self.weight if self.gain == "given" else f"{self.weight}, {self.gain}"
+
+    def with_trigger(self, candidate: Candidate) -> Scenario:
+        """The scenario of a candidate."""
+        trigger = self.scenario.decaying.model_copy(
+            update={"alpha_per_s": candidate.alpha_per_s, "beta": candidate.beta}
+        )
+        return self.scenario.model_copy(update={"trigger": trigger})
+
+
+@dataclass(frozen=True)
+class Space:
+    """All families with their ranges of α and β.
+
+    Args:
+        families: at least one.
+        decay_per_s: of each, the decay rate that α must stay below.
+        initial_norm: ‖x(0)‖.
+        floor: of the trigger, which β must exceed.
+    """
+
+    families: tuple[Family, ...]
+    decay_per_s: tuple[float, ...]
+    initial_norm: float
+    floor: float
+
+    def grid(self) -> Iterator[Candidate]:
+        """Where the search begins."""
+        for family, decay_per_s in enumerate(self.decay_per_s):
+            for step in range(RATE_STEPS):
+                for level in LEVELS:
+                    alpha_per_s = MOST_RATE * decay_per_s / RATE_STEP**step
+                    one = Candidate(family, alpha_per_s, float(level) * self.initial_norm)
+                    if self.holds(one):
+                        yield one
+
+    def around(self, centre: Candidate, share: float) -> Iterator[Candidate]:
+        """A candidate's neighbours, a share of the grid's steps away."""
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                one = Candidate(
+                    centre.family,
+                    centre.alpha_per_s * RATE_STEP ** (i * share),
+                    centre.beta * LEVEL_STEP ** (j * share),
+                )
+                if (i or j) and self.holds(one):
+                    yield one
+
+    def holds(self, one: Candidate) -> bool:
+        """Whether a candidate may be tried."""
+        low = max(LEVELS[0] * self.initial_norm / _WIDEST, self.floor)
+        high = LEVELS[-1] * self.initial_norm * _WIDEST
+        return one.alpha_per_s < self.decay_per_s[one.family] and low < one.beta < high
+
+
+def with_gain(scenario: Scenario, K: Matrix) -> Scenario:
+    """The scenario with another gain, (m, n)."""
+    rows = tuple(tuple(row) for row in K.tolist())
+    model = scenario.model.model_copy(update={"gain": rows})
+    return scenario.model_copy(update={"model": model})
+
+
+def with_norm(scenario: Scenario, weight: Matrix | None) -> Scenario:
+    """The scenario with another norm in the trigger, W or the identity."""
+    rows = None if weight is None else tuple(tuple(row) for row in weight.tolist())
+    trigger = scenario.decaying.model_copy(update={"weight": rows})
+    return scenario.model_copy(update={"trigger": trigger})
+
+
+def decay_rate(scenario: Scenario) -> float:
+    """What α must stay below, per second: the decay rate of the nominal loop, and of the models.
+
+    Raises:
+        CallerError: the nominal loop does not decay.
+    """
+    loop = loop_of(resolve(scenario))
+    rate = -spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
+    if rate <= 0:
+        raise CallerError("model.gain: the nominal loop is not stable; --gain lqr chooses another")
+    return rate
+
+
+def space_of(families: Mapping[tuple[str, str], Scenario]) -> Space:
+    """The space of scenarios by the names of gain and norm.
+
+    Raises:
+        CallerError: ‖x(0)‖ = 0, the floor is above all β, or a nominal loop does not decay.
+    """
+    found = tuple(Family(gain, weight, one) for (gain, weight), one in families.items())
+    first = found[0].scenario
+    initial_norm = math.hypot(*first.plant.initial_state)
+    if initial_norm == 0:
+        raise CallerError(
+            "plant.initial_state: is 0, but a loop settles to a share of ‖x(0)‖; give another"
+        )
+    floor, highest = first.decaying.floor, float(LEVELS[-1]) * initial_norm
+    if floor >= highest:
+        raise CallerError(
+            f"trigger.floor = {floor:g}: must be less than the largest β that is tried, "
+            f"{LEVELS[-1]:g} ‖x(0)‖ = {highest:g}"
+        )
+    rates = tuple(decay_rate(one.scenario) for one in found)
+    return Space(found, rates, initial_norm, floor)

@@ -1,0 +1,91 @@
+"""Which gains and norms there are to choose from."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cosim.studies.design.design_space import MOST_RATE, RATE_STEP, decay_rate, with_gain, with_norm
+from cosim.studies.design.lqr import lqr_gain
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.weight import choose_weight
+
+NORMS = ("identity", "given", "chosen")
+COSTS_OF_INPUT = (0.1, 1.0, 10.0)
+"""R is multiplied by these: three regulators, from eager to sparing."""
+_LEVEL = 0.1
+
+
+def families_of(
+    scenario: Scenario,
+    norms: Sequence[str],
+    lqr: tuple[Matrix, Matrix] | None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> dict[tuple[str, str], Scenario]:
+    """Scenarios by the names of gain and norm.
+
+    Args:
+        scenario: as loaded.
+        norms: of :data:`NORMS`.
+        lqr: Q and R, for gains of regulators instead of the scenario's; R times each of
+            :data:`COSTS_OF_INPUT`.
+        progress: told which share of the work is done; norms that are chosen take long.
+
+    Raises:
+        CallerError: a norm or a gain cannot be had.
+    """
+    if not norms:
+        raise CallerError(f"--weights: name one at least of {', '.join(NORMS)}")
+    gains = {"given": scenario} if lqr is None else dict(_regulated(scenario, *lqr))
+    found = {}
+    for i, (gain, one) in enumerate(gains.items()):
+
+        def told(share: float, done: int = i) -> None:
+            progress((done + share) / len(gains))
+
+        for norm in norms:
+            found[gain, norm] = _normed(one, norm, told)
+    return found
+
+
+def _regulated(scenario: Scenario, Q: Matrix, R: Matrix) -> list[tuple[str, Scenario]]:
+    loop = loop_of(resolve(scenario))
+    for name, matrix, size in (("--Q", Q, loop.n), ("--R", R, loop.m)):
+        if matrix.shape != (size, size):
+            raise CallerError(
+                f"{name}: expected {size} x {size}, or {size} numbers for its diagonal"
+            )
+    found = []
+    for cost in COSTS_OF_INPUT:
+        K = lqr_gain(loop.A_model, loop.B_model, Q, cost * R)
+        found.append((f"lqr R × {cost:g}", with_gain(scenario, K)))
+    return found
+
+
+def _normed(scenario: Scenario, norm: str, progress: Callable[[float], None]) -> Scenario:
+    if norm == "identity":
+        return with_norm(scenario, None)
+    if norm == "given":
+        if scenario.decaying.weight is None:
+            raise CallerError("--weights given: the scenario has no trigger.weight")
+        return scenario
+    if norm != "chosen":
+        raise CallerError(f'--weights: {", ".join(NORMS)}, not "{norm}"')
+    if scenario.mode == "zoh":
+        raise CallerError(
+            "--weights chosen: models that hold do not decay; take --weights identity"
+        )
+    loop = loop_of(resolve(scenario))
+    nominal = replace(loop, A=loop.A_model, B=loop.B_model)
+    # In the middle of the grid: a norm that contracts at this rate does so at all lower ones.
+    alpha_per_s = MOST_RATE * decay_rate(scenario) / RATE_STEP
+    beta = _LEVEL * float(np.linalg.norm(loop.x0))
+    try:
+        weight = choose_weight(nominal, beta, alpha_per_s, scenario.network.mansd, progress)
+    except NotDecayingError as error:
+        raise CallerError(f"--weights chosen: {error}") from None
+    return with_norm(scenario, weight)

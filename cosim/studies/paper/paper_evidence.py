@@ -1,0 +1,349 @@
+"""What the page says about the paper's assumptions and slips, computed: examples, counterexamples.
+
+Each function returns numbers for the page, each from the exact simulator or from linear algebra.
+"""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import schur
+
+from cosim.record.align import join_all
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.paper.draw_measures import open_loop_eigenvalues, simulate_draw
+from cosim.studies.paper.paper_conditions import BASE, MODES, load_condition, resolved_draw
+from noack.config.named_models import lane_following
+from noack.config.resolution import Loop, loop_of
+from noack.config.scenario_file import load
+from noack.core.clock import NS_PER_S
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
+from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
+from noack.trigger.decaying import DecayingTrigger
+
+Numbers = dict[str, Any]
+
+_LONG_S = 300.0
+_SAMPLED_S = 20.0
+_SAMPLES = 101
+_ROUNDING = 1e-12
+"""What is smaller is a matter of rounding, and of the machine."""
+_ZERO = 1e-6
+"""Eigenvalues below it in magnitude are 0: the lane's double eigenvalue 0 is defective."""
+
+
+def evidence(path: Path, representative: int) -> Numbers:
+    """Everything, as JSON knows it.
+
+    Args:
+        path: the paper's scenario.
+        representative: the draw whose plant serves as an example.
+    """
+    scenario = load_condition(path, BASE)
+    M, trigger = scenario.network.mansd + 1, scenario.decaying
+    return {
+        "example": {"M": M, "beta": trigger.beta, "alpha_per_s": trigger.alpha_per_s},
+        "eigenvalues": _eigenvalues(),
+        "loss": _loss(M),
+        "exact_model": _exact_model(path),
+        "trapped": _trapped(path),
+        "slow_model": _slow_model(M),
+        "standstill": _standstill(path),
+        "overshoot": _overshoot(path, representative),
+        "theorem_1": _theorem_1(path, representative),
+        "theorem_3": _theorem_3(path, representative),
+        "sampled": _sampled(path, representative),
+    }
+
+
+def _eigenvalues() -> Numbers:
+    """The example's numbers as printed, and with the other sign of U."""
+    found: Numbers = {}
+    for name, speed in (("printed", -12.0), ("flipped", 12.0)):
+        model = lane_following({"speed": speed})
+        eigenvalues = np.linalg.eigvals(model.A + model.B @ model.K)
+        found[name] = _complex(eigenvalues[np.lexsort((eigenvalues.imag, eigenvalues.real))])
+    A = lane_following({}).A
+    found["open"] = sorted(open_loop_eigenvalues(_loop(A)).real.tolist())
+    found["rank"] = int(np.linalg.matrix_rank(A))
+    found["rank_squared"] = int(np.linalg.matrix_rank(A @ A))
+    return found
+
+
+def _loss(M: int) -> Numbers:
+    """What a bound of M − 1 successive dropouts leaves of a loss probability p.
+
+    A delivery follows after 1 + p + … + p^(M−1) transmissions on average.
+    """
+    polynomial = np.ones(M)
+    polynomial[-1] -= 2.0
+    roots = np.roots(polynomial)
+    (half,) = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
+    return {
+        "half": float(half),
+        "at_0.8": 1 - 1 / sum(0.8**k for k in range(M)),
+        "most": (M - 1) / M,
+    }
+
+
+def _exact_model(path: Path) -> Numbers:
+    """Proposition 1 fails for an exact model: the nominal lane, only the first packet delivered."""
+    settings = ("plant.draw=nominal", f"horizon_s={_LONG_S}")
+    resolved = resolved_draw(load(path, settings), 0, "model")
+    run = simulate_continuous(
+        continuous_loop_of(resolved),
+        horizon_s=_LONG_S,
+        delivered=lambda event: event == 0,
+        known_start=False,
+    )
+    loop = loop_of(resolved)
+    eigenvalues, vectors = np.linalg.eig(loop.H)
+    BK, identity = loop.B @ loop.K, np.eye(loop.n)
+    apart = [
+        float(np.linalg.norm(np.linalg.solve(value * identity - loop.A, BK @ chi) - chi))
+        for value, chi in zip(eigenvalues, vectors.T, strict=True)
+    ]
+    times_s = [0.0, 10.0, 20.0, 30.0]
+    return {
+        "horizon_s": _LONG_S,
+        "events": len(run.event_s),
+        "times_s": times_s,
+        "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
+        "apart": max(*apart, _ROUNDING),
+    }
+
+
+def _trapped(path: Path) -> Numbers:
+    """The dimensions of the x whose pair (x, x) lies in the span of Γ's stable modes.
+
+    "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
+    """
+    scenario = load_condition(path, BASE)
+    draw = 0
+    while True:
+        loop = loop_of(resolved_draw(scenario, draw, "model"))
+        if (unstable := int((open_loop_eigenvalues(loop).real > _ZERO).sum())) > 0:
+            break
+        draw += 1
+    return {
+        "draw": draw,
+        "n": loop.n,
+        "unstable": unstable,
+        "model": _stable_pairs(loop, loop.H, _ZERO),
+        "zoh": _stable_pairs(loop, np.zeros_like(loop.H), _ZERO),
+        "strictly": _stable_pairs(loop, loop.H, -_ZERO),
+    }
+
+
+def _stable_pairs(loop: Loop, H: Matrix, least_real: float) -> int:
+    """Dimensions of {x: (x, x) has no share in modes of Γ = [[A, BK], [0, H]] beyond a real part.
+
+    The rows of the left invariant subspace of these modes vanish on such a pair.
+    """
+    gamma = np.block([[loop.A, loop.B @ loop.K], [np.zeros_like(H), H]])
+
+    def beyond(real: float, imaginary: float) -> bool:
+        return real > least_real
+
+    _, basis, modes = schur(gamma.T, sort=beyond)
+    rows = basis[:, :modes].T
+    return loop.n - int(np.linalg.matrix_rank(rows[:, : loop.n] + rows[:, loop.n :], tol=_ZERO))
+
+
+def _slow_model(M: int) -> Numbers:
+    """No Δ for all times: a model that decays more slowly than the threshold, M − 1 of M lost.
+
+    The first state has an exact model, so that it causes no events. In the second the model's pole
+    is −0.1, the plant's −1; α = 0.5 is below A + BK's decay rate 1. A has the distinct eigenvalues
+    1 and −1, as the paper asks.
+    """
+    A, model, B, K = np.diag([1.0, -1.0]), np.diag([1.0, -0.1]), np.eye(2)[:, :1], [[-3.0, 0.0]]
+    trigger = DecayingTrigger(1.0, 0.5, 0.0, None)
+    loop = _loop(A, B, np.array(K), model, np.array([1.0, 5.0]))
+    horizon_s = 250.0
+    run = simulate_continuous(
+        loop,
+        trigger,
+        horizon_s=horizon_s,
+        delivered=lambda event: event % M == 0,
+        known_start=False,
+    )
+    ends = [state for i, state in enumerate(run.before) if i % M == 0 and i > 0]
+    return {
+        "alpha_per_s": trigger.alpha_per_s,
+        "closed_per_s": -spectral_abscissa(A + B @ np.array(K)),
+        "model_per_s": -spectral_abscissa(loop.H),
+        "deliveries_s": [state.t_s for state in ends],
+        "thresholds": [
+            float(np.linalg.norm(state.e_c)) * math.exp(trigger.alpha_per_s * state.t_s)
+            for state in ends
+        ],
+        "first_ratios": (np.diff(run.event_s)[1:5] / run.event_s[1:5]).tolist(),
+    }
+
+
+def _standstill(path: Path) -> Numbers:
+    """A hold without growth: the nominal lane comes to rest beside the lane, and stays there.
+
+    K x(0) = 0, and (V, r) decays along A's stable direction until ψ = 0: nothing moves any more.
+    """
+    settings = ("plant.draw=nominal", "mode=zoh", "horizon_s=40")
+    resolved = resolved_draw(load(path, settings), 0, "zoh")
+    loop, trigger = loop_of(resolved), resolved.decaying
+    eigenvalues, vectors = np.linalg.eig(loop.A[:2, :2])
+    slowest = int(np.argmin(eigenvalues))
+    rate, lateral = float(eigenvalues[slowest]), vectors[:, slowest]
+    lateral = -0.3 * lateral / lateral[0]
+    yaw = lateral[1] / rate  # ψ(∞) = ψ(0) − r(0)/λ = 0
+    x0 = np.array([*lateral, yaw, -yaw * loop.K[0, 2] / loop.K[0, 3]])
+    run = simulate_continuous(
+        continuous_loop_of(resolved),
+        horizon_s=resolved.horizon_s,
+        delivered=lambda event: event == 0,
+        known_start=False,
+        x0=x0,
+    )
+    last = run.before[-1]
+    threshold = run.system.threshold(last.t_s)
+    times_s = [0.0, 2.0, 10.0, 20.0, 30.0]
+    return {
+        "x0": x0.tolist(),
+        "stable_per_s": rate,
+        "ratio": -rate / trigger.alpha_per_s,
+        "events_s": run.event_s.tolist(),
+        "times_s": times_s,
+        "norms": np.linalg.norm(run.at(times_s).x, axis=1).tolist(),
+        "thresholds": float(np.linalg.norm(last.e_c)) / threshold,
+    }
+
+
+def _overshoot(path: Path, representative: int) -> Numbers:
+    """Sup ‖x‖ / ‖x(0)‖ for ever smaller x(0)."""
+    scales = (1.0, 1e-2, 1e-4)
+    scenario = load_condition(path, BASE).model_copy(update={"horizon_s": 100.0})
+    found: Numbers = {"scales": list(scales)}
+    for mode in MODES:
+        resolved = resolved_draw(scenario, representative, mode)
+        system = continuous_loop_of(resolved)
+        peaks = []
+        for scale in scales:
+            run = simulate_continuous(
+                system,
+                horizon_s=scenario.horizon_s,
+                delivered=network_fates(resolved),
+                known_start=False,
+                x0=scale * system.loop.x0,
+            )
+            norms = np.linalg.norm(run.at(np.linspace(0, scenario.horizon_s, 2001)).x, axis=1)
+            peaks.append(float(norms.max() / norms[0]))
+        found[mode] = peaks
+    return found
+
+
+def _theorem_1(path: Path, representative: int) -> Numbers:
+    """Theorem 1's Δ of every stretch between deliveries, from the trajectory; the best γ, η_j."""
+    run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "model"))
+    trigger, H = run.system.decaying, run.system.loop.H
+    arrived = np.flatnonzero(run.delivered)
+    deltas, closest = [], []
+    for first, following in pairwise(arrived.tolist()):
+        longest = [_longest_s(run, j) for j in range(first + 1, following)]
+        deltas.append(theorem_1(H, trigger.alpha_per_s, longest))
+        closest += (np.array(longest) / np.diff(run.event_s[first + 1 : following + 1])).tolist()
+    return {"stretches": len(deltas), "largest": max(deltas), "interval_ratio": max(closest)}
+
+
+def _longest_s(run: ContinuousRun, event: int) -> float:
+    trigger = run.system.decaying
+    t_s = np.linspace(run.event_s[event], run.event_s[event + 1], _SAMPLES)
+    samples = run.system.sample(run.after[event], t_s)
+    interval = Interval(t_s, np.linalg.norm(samples.x, axis=1), np.linalg.norm(samples.x_s, axis=1))
+    return longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, trigger.alpha_per_s)
+
+
+def _theorem_3(path: Path, representative: int) -> Numbers:
+    """eq:zohnume as printed, and with the factor that its derivation gives, along a run.
+
+    With γ of the nominal plant and the largest η_j that the theorem allows, ‖x(t_j)‖.
+    """
+    from scipy.optimize import brentq
+
+    run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "zoh"))
+    beta, alpha_per_s = run.system.decaying.beta, run.system.decaying.alpha_per_s
+    gamma = float(open_loop_eigenvalues(_loop(lane_following({}).A)).real.max())
+
+    def solved_s(eta: float, level: float) -> float:
+        def excess(delta_s: float) -> float:
+            return eta * math.expm1(gamma * delta_s) - level * math.exp(-alpha_per_s * delta_s)
+
+        return float(brentq(excess, 0.0, 1e3))
+
+    rows = []
+    for t_s in (0.0, 10.0, 20.0, 30.0):
+        state = run.after[int(np.searchsorted(run.event_s, t_s))]
+        eta = float(np.linalg.norm(state.x))
+        rows.append(
+            {
+                "t_s": state.t_s,
+                "norm": eta,
+                "printed": solved_s(eta, beta),
+                "derived": solved_s(eta, beta * math.exp(-alpha_per_s * state.t_s)),
+            }
+        )
+    return {"gamma_per_s": gamma, "rows": rows}
+
+
+def _sampled(path: Path, representative: int) -> Numbers:
+    """The same draw with a trigger that looks at the scenario's sampling rate only."""
+    scenario = load_condition(path, BASE).model_copy(update={"horizon_s": _SAMPLED_S})
+    resolved = resolved_draw(scenario, representative, "model")
+    continuous = simulate_draw(resolved)
+    record = simulate(resolved)
+    joined = join_all(record)
+    tested = record[SENSOR_MEASUREMENT]["event"] > 0  # event 0 happens without a test
+    beyond = joined.e_s_norm[tested] / joined.threshold[tested]
+    exact = continuous.at(joined.t_ns / NS_PER_S)
+    return {
+        "horizon_s": _SAMPLED_S,
+        "period_s": resolved.measurement_period_ns / NS_PER_S,
+        "events": int(tested.sum()) + 1,
+        "events_continuous": len(continuous.event_s),
+        "beyond": float(beyond.max()),
+        "rms": math.sqrt(float(((joined.x - exact.x) ** 2).sum(axis=1).mean())),
+    }
+
+
+def _loop(
+    A: Matrix,
+    B: Matrix | None = None,
+    K: Matrix | None = None,
+    A_model: Matrix | None = None,
+    x0: Matrix | None = None,
+) -> Loop:
+    n = len(A)
+    B = np.zeros((n, 1)) if B is None else B
+    K = np.zeros((1, n)) if K is None else K
+    A_model = A if A_model is None else A_model
+    return Loop(
+        A_model=A_model,
+        B_model=B,
+        K=K,
+        H=A_model + B @ K,
+        A=A,
+        B=B,
+        x0=np.zeros(n) if x0 is None else x0,
+        weight=None,
+        state_names=entry_names("x", n),
+        input_names=entry_names("u", B.shape[1]),
+    )
+
+
+def _complex(values: NDArray[Any]) -> list[list[float]]:
+    return [[float(value.real), float(value.imag)] for value in values]

@@ -1,0 +1,137 @@
+"""The figures of the page: the paper's Fig. 2 and 3 for one draw, and all draws together."""
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
+from numpy.typing import NDArray
+
+from cosim.output import palette
+from cosim.output.report.axes import BELOW_IN, RIGHT_IN, WIDTH_IN, Shown, finish, place
+from cosim.output.report.figure_style import INK, printed, styled
+from cosim.output.report.signal_figures import paper_figure
+from cosim.simulation.continuous.continuous_run import ContinuousRun
+from cosim.studies.paper.paper_conditions import MODES, Mode
+from cosim.studies.paper.paper_results import Results
+from netem.link_machine import Datagram, update_link_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Vector
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import NETEM_PACKET, Fate, effective, tables
+
+SHOWN_S = 20.0
+"""The representative draw is shown up to here; later everything is too small to be seen."""
+_STEP_S = 0.01
+_BINS = 30
+_PANELS = (
+    ("events", "transmissions", "count", True),
+    ("deliveries", "deliveries", "count", True),
+    ("settled_5_s", "settling to 5 %", "time [s]", False),
+    ("gap_min_s", "shortest interval", "time [s]", True),
+)
+_LEFT_IN, _HEAD_IN, _ABOVE_IN, _GAP_IN, _BELOW_IN = 0.78, 0.62, 1.5, 0.75, 1.85
+_COLOURS: Mapping[Mode, Any] = {
+    "model": printed(palette.SERIES[2]),
+    "zoh": printed(palette.SERIES[3]),
+}
+_DOT = printed(palette.PLANT)
+
+
+def draw_figure(run: ContinuousRun, resolved: Scenario, draw: int) -> Figure:
+    """States, broadcasting and receiving intervals of one loop of a draw."""
+    shown = run.event_s <= SHOWN_S
+    samples = run.at(np.linspace(0.0, SHOWN_S, round(SHOWN_S / _STEP_S) + 1))
+    fates = _fates(resolved, int(shown.sum()))
+    event_s = run.event_s[shown]
+    return paper_figure(
+        mode=resolved.mode,
+        t_s=samples.t_s,
+        x=samples.x,
+        x_s=samples.x_s,
+        x_c=samples.x_c,
+        state_names=run.system.loop.state_names,
+        broadcast_s=event_s,
+        dropped=~effective(fates),
+        received_s=event_s[effective(fates)],
+        forced=fates[effective(fates)] == Fate.FORCED,
+        title=f"draw {draw}",
+    )
+
+
+def _fates(resolved: Scenario, events: int) -> NDArray[np.int64]:
+    """The network's word on each of the first updates, (events,)."""
+    link, fate = update_link_of(resolved), (tables(1, 1)[NETEM_PACKET].names or ()).index("fate")
+    return np.array(
+        [
+            output.row[fate]
+            for _ in range(events)
+            for output in link.handle(Datagram(0, b""), 0)
+            if isinstance(output, Record)
+        ],
+        dtype=np.int64,
+    )
+
+
+@styled
+def ensemble_figure(results: Results) -> Figure:
+    """Above, how the draws are distributed; below, both loops of each draw against each other."""
+    figure = Figure(figsize=(WIDTH_IN, _HEAD_IN + _ABOVE_IN + _GAP_IN + _BELOW_IN + BELOW_IN))
+    width_in = (WIDTH_IN - RIGHT_IN) / len(_PANELS) - _LEFT_IN
+    shown: list[Shown] = []
+    for i, (name, title, unit, logarithm) in enumerate(_PANELS):
+        left_in = _LEFT_IN + i * (width_in + _LEFT_IN)
+        both: dict[Mode, Vector] = {mode: results.column(f"{mode}.{name}") for mode in MODES}
+        above = place(figure, left_in, _HEAD_IN, width_in, _ABOVE_IN)
+        shown = _histogram(above, both, logarithm=logarithm)
+        above.set(title=title, xlabel=unit, ylabel="draws" if i == 0 else "")
+        below = place(figure, left_in, _HEAD_IN + _ABOVE_IN + _GAP_IN, width_in, _BELOW_IN)
+        _against(below, both["model"], both["zoh"], logarithm=logarithm)
+        below.set(xlabel=f"MB-ET, {unit}", ylabel=f"ZOH-ET, {unit}")
+    handles, labels = zip(*shown, strict=True)
+    corner = (1 - RIGHT_IN / WIDTH_IN, 1 - 0.04 / figure.get_figheight())
+    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=corner, ncols=len(labels))
+    text = f"{results.count():,} draws, each with MB-ET and ZOH-ET"
+    y = 1 - 0.07 / figure.get_figheight()
+    figure.text(_LEFT_IN / WIDTH_IN, y, text, weight="bold", size=10.5, va="top")
+    return figure
+
+
+def _histogram(axes: Axes, both: Mapping[Mode, Vector], *, logarithm: bool) -> list[Shown]:
+    seen = np.concatenate(list(both.values()))
+    seen = seen[np.isfinite(seen)]
+    edges = (np.geomspace if logarithm else np.linspace)(seen.min(), seen.max(), _BINS + 1)
+    shown: list[Shown] = []
+    for mode, values in both.items():
+        style = {"color": _COLOURS[mode], "alpha": 0.75}
+        axes.hist(values[np.isfinite(values)], edges.tolist(), **style)
+        shown.append((Patch(**style), MODES[mode]))
+    if logarithm:
+        _few_decades(axes, "x")
+    finish(axes)
+    return shown
+
+
+def _against(axes: Axes, model: Vector, zoh: Vector, *, logarithm: bool) -> None:
+    """One dot per draw; on the line both are equal."""
+    finite = np.isfinite(model) & np.isfinite(zoh)
+    model, zoh = model[finite], zoh[finite]
+    low, high = min(model.min(), zoh.min()), max(model.max(), zoh.max())
+    axes.plot((low, high), (low, high), color=INK, linewidth=0.9)
+    axes.plot(model, zoh, "o", color=_DOT, markersize=2.2, alpha=0.5, markeredgewidth=0)
+    if logarithm:
+        _few_decades(axes, "x")
+        _few_decades(axes, "y")
+    finish(axes)
+
+
+def _few_decades(axes: Axes, which: Literal["x", "y"]) -> None:
+    """A logarithmic axis so short that only 1 and 3 of each decade have room for a number."""
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_locator(NullLocator())

@@ -1,0 +1,157 @@
+"""The page ``paper.md``: the template's words, the results' numbers."""
+
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from cosim.studies.paper.draw_measures import STEP_S
+from cosim.studies.paper.ensemble_statistics import (
+    number,
+    paired,
+    percent,
+    quartiles,
+    share,
+    spread,
+)
+from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
+from cosim.studies.paper.paper_conditions import BASE, CONDITIONS, HORIZON_S, MODES, settings_of
+from cosim.studies.paper.paper_results import Results
+from noack.core.linear_systems import Vector
+
+_LOST = "lost"
+_MEASURES = (
+    ("transmissions", "events"),
+    ("deliveries", "deliveries"),
+    ("share lost", _LOST),
+    ("median time between transmissions, s", "gap_median_s"),
+    ("median time between deliveries, s", "reception_median_s"),
+    ("shortest inter-event time, s", "gap_min_s"),
+    ("settling time to 5 %, s", "settled_5_s"),
+    ("settling time to 1 %, s", "settled_1_s"),
+    ("sup ‖e_c‖e^(αt)/β", "controller_error"),
+    ("sup ‖x‖/‖x(0)‖", "peak"),
+    (f"‖x‖ at {HORIZON_S:g} s", "final_norm"),
+)
+
+
+class _Compared(NamedTuple):
+    """A row of the page's main table."""
+
+    what: str
+    model: str
+    zoh: str
+    difference: str
+    larger: str
+
+
+class _Varied(NamedTuple):
+    """A row of the page's table of variations."""
+
+    what: str
+    draws: str
+    events: str
+    lost: str
+    gap_min: str
+    settled: str
+    more: str
+    later: str
+
+
+def render(results: Results) -> str:
+    """Return the page in Markdown."""
+    return (
+        _templates()
+        .get_template("paper.md.jinja")
+        .render(
+            draws=results.count(),
+            representative=results.representative,
+            settings=settings_of(BASE, results.representative),
+            horizon_s=HORIZON_S,
+            step_s=STEP_S,
+            confirmed_from=CONFIRMED_FROM,
+            partly_from=PARTLY_FROM,
+            claims=list(claims(results)),
+            compared=list(_compared(results)),
+            varied=list(_varied(results)),
+            column=results.column,
+            certified=lambda name: results.column(name, table="certified"),
+            printed=lambda name: results.column(name, table="printed"),
+            **_shares(results),
+            **results.evidence,
+        )
+    )
+
+
+def _shares(results: Results) -> dict[str, Any]:
+    column = results.column
+    events, settled = _both(results, "events"), _both(results, "settled_5_s")
+    finest = _both(results, "settled_1_s")
+    return {
+        "fewer": share(events[0] < events[1]),
+        "times": quartiles(events[1] / events[0]).median,
+        "later": share(settled[1] > settled[0]),
+        "settle": share(np.isfinite(finest[0]) & np.isfinite(finest[1])),
+        "unstabilised": int(
+            (column("slowest_closed") > -results.evidence["example"]["alpha_per_s"]).sum()
+        ),
+        "not_unstable": share(column("fastest_open") <= 0),
+        "stretches": {m: float((column(f"{m}.deliveries") - 1).sum()) for m in MODES},
+        "growing": {m: float(column(f"{m}.growing").sum()) for m in MODES},
+    }
+
+
+def _compared(results: Results) -> Iterator[_Compared]:
+    for what, name in _MEASURES:
+        model, zoh = _both(results, name)
+        yield _Compared(
+            what,
+            spread(model),
+            spread(zoh),
+            spread(paired(model, zoh)),
+            percent(share(zoh > model)),
+        )
+
+
+def _varied(results: Results) -> Iterator[_Varied]:
+    for condition in CONDITIONS:
+        name = condition.name
+        events, settled = _both(results, "events", name), _both(results, "settled_5_s", name)
+        lost = [percent(quartiles(values).median) for values in _both(results, _LOST, name)]
+        yield _Varied(
+            condition.title + ("" if condition.left_open else " *"),
+            number(results.count(name)),
+            _medians(events),
+            " / ".join(lost),
+            _medians(_both(results, "gap_min_s", name)),
+            _medians(settled),
+            percent(share(events[1] > events[0])),
+            percent(share(settled[1] > settled[0])),
+        )
+
+
+def _both(results: Results, name: str, condition: str = BASE.name) -> list[Vector]:
+    """A measure of MB-ET and of ZOH-ET."""
+    if name == _LOST:
+        return [results.lost(mode, condition) for mode in MODES]
+    return [results.column(f"{mode}.{name}", condition) for mode in MODES]
+
+
+def _medians(both: list[Vector]) -> str:
+    return " / ".join(number(quartiles(values).median) for values in both)
+
+
+@cache
+def _templates() -> Environment:
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= {"n": number, "percent": percent, "spread": spread}
+    return templates

@@ -1,0 +1,27 @@
+"""What ``noack paper`` prints: the claims, and where the page is."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from cosim.studies.paper.paper_claims import Verdict
+
+_STYLES = {
+    Verdict.CONFIRMED: "green",
+    Verdict.PARTLY: "yellow",
+    Verdict.NOT_CONFIRMED: "bold red",
+}
+
+
+def print_claims(console: Console, found: dict[str, Any]) -> None:
+    """Print what :func:`cosim.studies.paper.paper_run.document` found."""
+    table = Table(title=f"Section V over {found['draws']:,} draws", show_lines=True)
+    for heading in ("the paper says", "verdict", "numbers"):
+        table.add_column(heading)
+    for claim in found["claims"]:
+        style = _STYLES[claim["verdict"]]
+        table.add_row(claim["gist"], f"[{style}]{claim['verdict']}[/]", claim["why"])
+    console.print(table)
+    for file in found["files"]:
+        console.print(file, highlight=False, soft_wrap=True, markup=False)

@@ -1,0 +1,208 @@
+"""Runs a relay, with all that watches it at its side."""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from netem.control import relay_attachments
+from netem.control.emulator_session import starting
+from netem.control.emulator_statistics import Statistics, statistics
+from netem.engine.engine_choice import compiled_engine_is_missing, open_relay
+from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Relay, Tap
+from netem.fates.fate_recorder import FateRecorder
+from netem.fates.fate_replay import read_fates
+from netem.standard_error import say
+from noack.config.impairments import LinkSettings
+from noack.core.errors import CallerError
+from noack.runtime.address import text_of
+from noack.runtime.real_time_settings import realtime
+from noack.runtime.signals import Signals
+
+_FIFO_PRIORITY = 50
+_SPIN_NS = 50_000
+"""A sleeper wakes late by less, nearly always; the core is not kept from others for longer."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options on how a relay runs, and what watches it."""
+    group = parser.add_argument_group("how it runs")
+    group.add_argument(
+        "--engine", choices=("auto", "batched", "plain"), default="auto",
+        help="batched is the fast one, for Linux; plain runs everywhere (auto)",
+    )  # fmt: skip
+    group.add_argument(
+        "--segment", action="store_true",
+        help="send runs of datagrams of equal size as one message that the kernel cuts",
+    )  # fmt: skip
+    group.add_argument(
+        "--realtime", action="store_true",
+        help="ask for SCHED_FIFO, locked memory, no deep idle states, each where permitted; and "
+        "stay awake for the last 50 µs before a delayed datagram is due",
+    )  # fmt: skip
+    group.add_argument(
+        "--compile", action="store_true",
+        help="compile for this machine what the first start would, and end",
+    )  # fmt: skip
+    group = parser.add_argument_group("what it records")
+    group.add_argument(
+        "--capture", metavar="FILE.pcapng",
+        help="all datagrams, with their fates as comments; - for the standard output",
+    )  # fmt: skip
+    group.add_argument(
+        "--record-fates", metavar="FILE.parquet", type=Path, help="what became of each datagram"
+    )
+    group.add_argument(
+        "--replay-fates", metavar="FILE.parquet", type=Path,
+        help="let the same become of each datagram again, by its number in its flow; the record's "
+        "cap is kept, unless mansd says another, whenever they come",
+    )  # fmt: skip
+    relay_attachments.add_options(parser)
+
+
+def compile_all() -> None:
+    """Compile what the fast engine and captures need, and say how long it took."""
+    if missing := compiled_engine_is_missing():
+        say(f"nothing is compiled here: the batched engine {missing}")
+        return
+    began_s = time.monotonic()
+    from netem.capture.pcapng import Section
+    from netem.engine.batched_engine import load
+
+    load()
+    Section(())
+    say(f"all is compiled ({time.monotonic() - began_s:.1f} s)")
+
+
+def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
+    """Relay until Ctrl-C; return what has happened.
+
+    Args:
+        specs: the links.
+        options: parsed options of :func:`add_options`.
+
+    Raises:
+        CallerError: an address is taken, a file cannot be written.
+    """
+    side_options = relay_attachments.options_of(options)
+    if options.capture == "-" and (options.json or options.stats is not None):
+        raise CallerError("--capture -: the standard output is taken by --json or --stats")
+    _check_files(options)
+    if options.replay_fates is not None:
+        specs = _replaying(specs, options.replay_fates)
+    with ExitStack() as last, ExitStack() as stack:
+        with starting(side_options.name):
+            taps = _taps(specs, options, stack)
+            opened = open_relay(
+                specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
+            )
+            stack.callback(opened.close)
+            # Until all files are complete.
+            signals = last.enter_context(Signals().handled())
+            side = stack.enter_context(relay_attachments.attached(opened, side_options))
+        stack.enter_context(_in_realtime(options.realtime))
+        _say_ready(opened)
+        if options.capture != "-" and not side_options.takes_output:
+            _print_ready(opened, as_json=options.json)
+        opened.run(lambda: side.left or signals.received is not None, side.housekeeping)
+        return statistics(side.look())
+
+
+def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
+    """Let links do what a trace says, and keep its cap where they have none of their own."""
+    fates = read_fates(path, [spec.name for spec in specs])
+
+    def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
+        given: LinkSettings = getattr(spec, direction)
+        cap = fates.caps[spec.name, direction] if given.mansd is None else given.mansd
+        return given.model_copy(update={"mansd": cap})
+
+    return [
+        replace(
+            spec,
+            forward=settings(spec, "forward"),
+            back=settings(spec, "back"),
+            decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
+        )
+        for spec in specs
+    ]
+
+
+def _check_files(options: argparse.Namespace) -> None:
+    """Refuse to write into what is to be read, or into one file twice."""
+    files = {
+        f"--{name.replace('_', '-')}": Path(given).resolve()
+        for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")
+        if (given := getattr(options, name, None)) is not None and str(given) != "-"
+    }
+    for name, path in files.items():
+        for other, same in files.items():
+            if name > other and path == same and not path.is_char_device():
+                raise CallerError(f"{name} {path}: is the file of {other}, too; take another")
+
+
+def _taps(
+    specs: Sequence[LinkSpec], options: argparse.Namespace, stack: ExitStack
+) -> Sequence[Tap]:
+    taps: list[Tap] = []
+    if options.capture is not None:
+        taps.append(stack.enter_context(_capture(options.capture, specs)))
+    if options.record_fates is not None:
+        taps.append(stack.enter_context(FateRecorder(options.record_fates, specs)))
+    return taps
+
+
+@contextmanager
+def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
+    try:
+        from netem.capture.capture_tap import CaptureTap, interfaces_of
+        from netem.capture.capture_writer import CaptureWriter
+    except ModuleNotFoundError as error:  # the plain engine runs without numba
+        raise CallerError(f"--capture: needs {error.name}, which is not installed") from None
+    writer = CaptureWriter(path, interfaces_of(specs))
+    try:
+        yield CaptureTap(writer, len(specs))
+    finally:
+        writer.close()
+        if writer.error is not None:
+            say(writer.error)
+        elif writer.missing:
+            say(f"{writer.missing} events are missing in the capture")
+
+
+def _say_ready(opened: Relay) -> None:
+    """Only when Ctrl-C would end it well."""
+    addresses = opened.addresses()
+    for spec in opened.specs:
+        name = f" ({spec.name})" if len(opened.specs) > 1 else ""
+        where = f"{text_of(addresses[spec.name])} → {text_of(spec.to)}{name}"
+        say(f"{where}, Ctrl-C ends")
+
+
+def _print_ready(opened: Relay, *, as_json: bool) -> None:
+    """On standard output, for programs that wait for this line."""
+    addresses = opened.addresses()
+    line = f"ready: listening on {', '.join(map(text_of, addresses.values()))}"
+    if as_json:
+        links = [
+            {"name": spec.name, "listen": text_of(addresses[spec.name]), "to": text_of(spec.to)}
+            for spec in opened.specs
+        ]
+        line = json.dumps({"ready": links})
+    if sys.stdout is not None:
+        with suppress(OSError, ValueError):  # nobody reads it; the emulator goes on
+            os.write(sys.stdout.fileno(), f"{line}\n".encode())
+
+
+@contextmanager
+def _in_realtime(wanted: bool) -> Iterator[None]:
+    with realtime(wanted, _FIFO_PRIORITY) as granted:
+        for setting, answer in granted.items():
+            if answer.startswith("refused"):
+                say(f"{setting} {answer}")
+        yield

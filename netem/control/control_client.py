@@ -1,0 +1,82 @@
+"""The other side of live control: asks a running emulator, and follows its statistics."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Self, cast
+
+import zenoh
+from zenoh.handlers import RingChannel
+
+from netem.control.control_server import secret_of
+from netem.control.emulator_session import Session, running
+from netem.control.emulator_statistics import Statistics
+from noack.core.errors import PeerError
+from noack.runtime.zenoh_session import answer_to, cause_of, open_star
+
+_ANSWER_S = 10.0
+_SILENCE_S = 3.0
+_POLL_S = 0.02
+
+
+class Client:
+    """A connection to a running emulator.
+
+    Args:
+        session: how to reach it, from :func:`netem.control.emulator_session.find`.
+
+    Raises:
+        PeerError: it cannot be reached.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._name = session.name
+        self._token = session.token
+        try:
+            self._session = open_star(session.endpoint, secret_of(self._token), listen=False)
+        except zenoh.ZError as error:
+            raise PeerError(
+                f"emulator {self._name!r} cannot be reached at {session.endpoint}: "
+                f"{cause_of(error)}"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def ask(self, what: str, **content: Any) -> Any:
+        """Ask ``report``, ``settings`` or ``change``, and return the answer.
+
+        Raises:
+            CallerError: what was asked for is wrong; one line.
+            PeerError: there is no answer.
+        """
+        payload = json.dumps(content | {"token": self._token})
+        key = f"netem/{self._name}/{what}"
+        answer = answer_to(self._session, key, payload, _ANSWER_S)
+        if answer is not None:
+            return json.loads(answer)
+        raise PeerError(f"emulator {self._name!r} does not answer")
+
+    def follow(self, stop: Callable[[], bool]) -> Iterator[Statistics]:
+        """Yield the statistics that the emulator publishes, until ``stop()``.
+
+        Raises:
+            PeerError: the emulator has ended.
+        """
+        key = f"netem/{self._name}/statistics"
+        with self._session.declare_subscriber(key, RingChannel(2)) as subscriber:
+            heard_s = time.monotonic()
+            while not stop():
+                sample = subscriber.try_recv()
+                if sample is not None:
+                    heard_s = time.monotonic()
+                    yield cast(Statistics, json.loads(sample.payload.to_string()))
+                elif time.monotonic() < heard_s + _SILENCE_S:
+                    time.sleep(_POLL_S)
+                elif self._name not in running():
+                    raise PeerError(f"emulator {self._name!r} has ended")
+                else:
+                    heard_s = time.monotonic()

@@ -1,0 +1,150 @@
+"""The view, drawn live: in full on a terminal, as lines of text on anything else."""
+
+import contextlib
+import io
+import json
+import os
+import select
+import sys
+import termios
+import tty
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Self
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from netem.control.emulator_statistics import Statistics
+from netem.control.statistics_history import History
+from netem.control.statistics_view import plain_lines, render
+
+_MESSAGES_SHOWN = 3
+
+
+class Screen:
+    """Shows statistics while the context lasts; the last picture stays when it ends.
+
+    What others write to standard error meanwhile is shown below, and written at the end.
+
+    Args:
+        title: of the emulator.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._console = Console()
+        self._history = History()
+        self._live: Live | None = None
+        self._size = self._console.size
+        self._messages = _Messages()
+        self._keys = False
+        self._stack = ExitStack()
+        self.left = False
+        """Whether the person has pressed q."""
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal and not self._console.is_dumb_terminal:
+            with ExitStack() as stack:
+                stack.callback(self._leave)
+                stack.enter_context(contextlib.redirect_stderr(self._messages))
+                self._keys = stack.enter_context(_single_keys())
+                self._live = stack.enter_context(
+                    Live(
+                        console=self._console,
+                        screen=True,
+                        auto_refresh=False,
+                        redirect_stdout=False,
+                        redirect_stderr=False,
+                    )
+                )
+                self._stack = stack.pop_all()
+            self._draw()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def show(self, statistics: Statistics) -> None:
+        """Show newer statistics."""
+        if self._live is not None:
+            self._history.add(statistics)
+            self._draw()
+        else:
+            print("\n".join(plain_lines(statistics)), flush=True)
+
+    def look(self) -> bool:
+        """Look at keyboard and size of the terminal; return whether the person wants to leave."""
+        while self._keys and select.select([sys.stdin], (), (), 0)[0]:
+            keys = os.read(sys.stdin.fileno(), 64)
+            self._keys = bool(keys)
+            self.left = self.left or b"q" in keys.lower()
+        if self._live is not None and self._console.size != self._size:
+            self._size = self._console.size
+            self._draw()
+        return self.left
+
+    def _draw(self) -> None:
+        assert self._live is not None
+        messages = list(self._messages.lines)[-_MESSAGES_SHOWN:]
+        height = self._console.height - len(messages) - 1
+        picture = render(self._history, self._title, self._console.width, height)
+        below = [Text(f" {message}", "yellow", no_wrap=True) for message in messages]
+        help_line = Text(" q ends" if self._keys else " Ctrl-C ends", "dim")
+        self._live.update(Group(picture, *below, help_line), refresh=True)
+
+    def _leave(self) -> None:
+        if self._history.latest is not None:
+            self._console.print(render(self._history, self._title, self._console.width, None))
+        for message in self._messages.lines:
+            print(message, file=sys.stderr)
+
+
+class JsonLines:
+    """Stands in for a :class:`Screen` where a program reads: a line of JSON each time."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def show(self, statistics: Statistics) -> None:
+        """Write newer statistics."""
+        print(json.dumps(statistics), flush=True)
+
+    def look(self) -> bool:
+        """Nobody presses a key."""
+        return False
+
+
+class _Messages(io.TextIOBase):
+    """Keeps the last lines written to it."""
+
+    def __init__(self) -> None:
+        self.lines: deque[str] = deque(maxlen=1000)
+        self._begun = ""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, text: str) -> int:
+        *lines, self._begun = (self._begun + text).split("\n")
+        self.lines.extend(lines)
+        return len(text)
+
+
+@contextlib.contextmanager
+def _single_keys() -> Iterator[bool]:
+    """Take keys as they are pressed, and unseen; yield whether there is a keyboard."""
+    if not sys.stdin.isatty():
+        yield False
+        return
+    before = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin)
+    try:
+        yield True
+    finally:
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)

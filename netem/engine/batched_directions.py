@@ -1,0 +1,124 @@
+"""The two directions of each link in the pump's memory: programs, and states that grow."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from netem.engine.compiled_pump import functions
+from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
+from netem.engine.pump.pump_layout import TABLES
+from netem.rule_program import empty_state, program_of, recent_width
+from netem.rule_records import Decision
+from netem.rules.link_rules import Program, State
+from noack.config.impairments import Corrupt, LinkSettings
+
+_ROWS = 16
+
+
+class Grown(NamedTuple):
+    """What grows with the number of flows."""
+
+    flows: NDArray[Any]
+    memory: NDArray[Any]
+    recent_ns: NDArray[Any]
+
+
+class Way:
+    """One direction of a link.
+
+    Args:
+        settings: what it does.
+        seed: of its random streams.
+        name: of the link and the direction.
+        decisions: recorded ones, of each flow.
+        row: its row of :data:`netem.engine.pump.pump_layout.DIRECTION`, (1,).
+        link_state: its row of :class:`netem.rule_records.LinkState`, (1,).
+        counters: its row of :class:`netem.rule_records.Counters`, (1,).
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        name: tuple[str, str],
+        decisions: Sequence[Sequence[Decision]],
+        row: NDArray[Any],
+        link_state: NDArray[Any],
+        counters: NDArray[Any],
+    ) -> None:
+        self.settings = settings
+        self._seed, self._name = seed, name
+        self._row = row
+        self._link_state, self._counters = link_state, counters
+        plain = program_of(settings, seed, *name, decisions=decisions)
+        self.program = compiled_program(plain)
+        self.state = self._state(plain, _ROWS)
+        self._show()
+
+    @property
+    def rows(self) -> int:
+        """How many flows there is room for."""
+        return len(self.state.flows)
+
+    def start_flow(self, row: int, number: int) -> None:
+        """Make room for a flow, in a row that is free."""
+        while row >= self.rows:
+            self._grow()
+        set_flow(self.state, row, number, self.settings.first_delivered)
+
+    def change(self, settings: LinkSettings, latest_ns: NDArray[np.int64]) -> None:
+        """Go on with other settings.
+
+        Args:
+            settings: what it does from now on.
+            latest_ns: (rows,) when the last that is under way leaves; −1 none.
+        """
+        old = self.program
+        plain = program_of(settings, self._seed, *self._name, tracks=old.tracks)
+        # There may be millions, and the relay is waiting.
+        program = compiled_program(plain)._replace(
+            decisions=old.decisions, decisions_begin=old.decisions_begin
+        )
+        state = self._state(plain, self.rows)._replace(flows=self.state.flows)
+        recent_ns: NDArray[np.int64] = state.recent_ns  # type: ignore[assignment]
+        recent_ns[:] = -1
+        functions().carry(old, self.state, program, state, latest_ns)
+        self.settings, self.program, self.state = settings, program, state
+        self._show()
+
+    def _state(self, plain: Program, rows: int) -> State:
+        state = compiled_state(plain, empty_state(plain), rows, recent_width(plain))
+        return state._replace(link=self._link_state[0], counters=self._counters[0])
+
+    def _grow(self) -> None:
+        old = self.state
+        grown = Grown(*(_doubled(getattr(old, field)) for field in Grown._fields))
+        self.state = old._replace(**grown._asdict())
+        self._show()
+
+    def _show(self) -> None:
+        """Write down where everything lies."""
+        row = self._row
+        for name in TABLES:
+            table: Any = getattr(self.program, name)
+            row[name] = table.ctypes.data
+            row[f"{name}_rows"] = len(table)
+        for name in ("mansd", "limit", "scored", "tracks"):
+            row[name] = getattr(self.program, name)
+        corrupts = any(isinstance(one, Corrupt) for one in self.settings.impairments)
+        row["keeps"] = self.program.tracks or corrupts
+        state: Any = self.state
+        for name in ("flows", "memory", "recent_ns", "queues", "departures_ns"):
+            row[name] = getattr(state, name).ctypes.data
+        row["rows"] = len(state.flows)
+        row["width"] = state.recent_ns.shape[1]
+        row["queue_rows"] = len(state.queues)
+        row["departure_rows"] = len(state.departures_ns)
+
+
+def _doubled(array: NDArray[Any]) -> NDArray[Any]:
+    grown = np.zeros((2 * len(array), *array.shape[1:]), array.dtype)
+    grown[: len(array)] = array
+    return grown

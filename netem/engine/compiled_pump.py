@@ -1,0 +1,32 @@
+"""The pump's functions, compiled once for this machine."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+from netem.engine.compiled_rules import compile_rule, is_kept
+from netem.engine.pump.client_table import insert, remove
+from netem.engine.pump.pump_loop import run_pump
+from netem.rules.settings_change import carry
+
+_SOURCES: Any = (run_pump, insert, remove, carry)
+
+
+class Functions(NamedTuple):
+    """What Python calls."""
+
+    run_pump: Callable[..., int]
+    insert: Callable[..., None]
+    remove: Callable[..., None]
+    carry: Callable[..., None]
+
+
+@cache
+def functions() -> Functions:
+    """Return them; each is compiled, or loaded, when it is first called."""
+    return Functions(*map(compile_rule, _SOURCES))
+
+
+def are_kept() -> bool:
+    """Whether all have been compiled before, for this machine."""
+    return all(map(is_kept, _SOURCES))

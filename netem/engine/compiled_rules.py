@@ -1,0 +1,154 @@
+"""Compiles the rules of a link with numba: the very functions that :mod:`netem.link_machine` runs.
+
+What is compiled is kept in the user's cache; see :mod:`noack.runtime.code_cache`.
+"""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import netem.engine.pump
+import netem.rules
+from netem import relay_events, rule_records
+from netem.engine import histogram
+from netem.rule_program import new_flow
+from netem.rule_records import array_of, dtype_of
+from netem.rules.link_rules import Program, State
+from netem.rules.mansd import NEVER_NS
+from noack.runtime import code_cache
+from noack.runtime.code_cache import cache_folder, compiler
+
+_PROGRAM = {
+    "stages": rule_records.Stage,
+    "chances": rule_records.Chance,
+    "chains": rule_records.Chain,
+    "four_states": rule_records.FourStateChain,
+    "scripts": rule_records.Script,
+    "waits": rule_records.Wait,
+    "bottlenecks": rule_records.Bottleneck,
+    "darknesses": rule_records.Darkness,
+    "decisions": rule_records.Decision,
+}
+
+
+def compiled_program(program: Program) -> Program:
+    """Return a program as arrays, for compiled rules."""
+    tables: dict[str, Any] = {
+        name: array_of(record, getattr(program, name)) for name, record in _PROGRAM.items()
+    }
+    for name in ("integers", "decisions_begin"):
+        tables[name] = np.array(getattr(program, name), dtype=np.int64)
+    tables["reals"] = np.array(program.reals, dtype=np.float64)
+    return program._replace(**tables)
+
+
+def compiled_state(program: Program, state: State, rows: int, width: int) -> State:
+    """Return a state as arrays, with room for ``rows`` flows; see :func:`set_flow`.
+
+    Args:
+        program: the link's program.
+        state: its state without flows, from :func:`netem.rule_program.empty_state`.
+        rows: how many.
+        width: length of the rings of release times.
+    """
+    arrays: dict[str, Any] = {
+        "flows": np.zeros(rows, dtype_of(rule_records.FlowState)),
+        "memory": np.zeros((rows, len(program.stages)), dtype_of(rule_records.Memory)),
+        "recent_ns": np.zeros((rows, width), np.int64),
+        "queues": array_of(rule_records.QueueState, state.queues),
+        "departures_ns": np.array(state.departures_ns, dtype=np.int64),
+        "link": array_of(rule_records.LinkState, [state.link])[0],
+        "counters": array_of(rule_records.Counters, [state.counters])[0],
+    }
+    return State(**arrays)
+
+
+def set_flow(state: State, row: int, number: int, first_delivered: bool) -> None:
+    """Let a row of a state of arrays be that of a new flow."""
+    flows, memory, recent_ns = _arrays(state)
+    flows[row] = array_of(rule_records.FlowState, [new_flow(number, first_delivered)])[0]
+    memory[row] = np.zeros(1, memory.dtype)
+    recent_ns[row] = NEVER_NS
+
+
+def _arrays(state: State) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    return state.flows, state.memory, state.recent_ns  # type: ignore[return-value]
+
+
+# Without reference counts: nothing is allocated, and counting the twenty arrays of program and
+# state at each call would take twenty times as long as the decision.
+_OPTIONS = {"_nrt": False, "forceinline": True}
+
+
+@cache
+def compile_rule(function: Callable[..., Any]) -> Any:
+    """Compile a function that calls rules; without the global lock, and cached on disk.
+
+    It must not allocate: no new arrays, lists or strings.
+    """
+    return compiler(_prepare(), nogil=True, _nrt=False)(function)
+
+
+def compile_kept(function: Callable[..., Any], folder: Path | None) -> Any:
+    """Compile a function, and keep it in a folder of :func:`prepare`, if there is one."""
+    return compiler(folder, nogil=True, _nrt=False)(function)
+
+
+@cache
+def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
+    """Let compiled code call the functions of modules that call rules.
+
+    Args:
+        name: of what is compiled.
+        modules: all whose functions are compiled, or that these depend on.
+
+    Returns:
+        Where it is kept; None if it is not.
+    """
+    _prepare()
+    _register(modules)
+    sources = (*_compiled_modules(), *modules, rule_records, relay_events)
+    return cache_folder(name, (Path(str(module.__file__)) for module in sources))
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Whether a function has been compiled before, for this machine."""
+    return code_cache.is_kept(_prepare(), function)
+
+
+def folder() -> Path | None:
+    """Where what is compiled is kept for the next run, if it is."""
+    return _prepare()
+
+
+@cache
+def _prepare() -> Path | None:
+    """Let compiled code call the rules; return where it is kept, if it is."""
+    modules = list(_compiled_modules())
+    _register(modules)
+    sources = (*modules, rule_records, relay_events)
+    return cache_folder("netem", (Path(str(module.__file__)) for module in sources))
+
+
+def _register(modules: Sequence[ModuleType]) -> None:
+    from numba.extending import register_jitable
+
+    for module in modules:
+        for _, function in inspect.getmembers(module, inspect.isfunction):
+            if function.__module__ == module.__name__:
+                register_jitable(**_OPTIONS)(function)
+
+
+def _compiled_modules() -> Iterator[ModuleType]:
+    for package in (netem.rules, netem.engine.pump):
+        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            yield importlib.import_module(found.name)
+    yield histogram

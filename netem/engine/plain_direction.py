@@ -1,0 +1,122 @@
+"""One direction of a link in the portable engine: the machine, and what is counted of it."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from netem.engine.histogram import bucket_of, empty
+from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkSpec
+from netem.engine.unintended_losses import Losses
+from netem.link_machine import Datagram, Link
+from netem.rule_records import Verdict
+from noack.config.impairments import LinkSettings
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import NETEM_RELEASE
+
+
+class Departure(NamedTuple):
+    """A datagram, or a copy, that is to be sent."""
+
+    flow: int
+    data: bytes
+    packet: int
+    fate: int
+    arrival_ns: int
+    release_ns: int
+    bit: int
+    delayed: bool
+    copy: bool
+    stale: bool
+
+
+class _Kept(NamedTuple):
+    """What is known of a datagram of which something is under way."""
+
+    arrival_ns: int
+    fate: int
+    bits: tuple[int, int]
+    """Of the datagram and of its copy."""
+    left: int
+    """How many are under way."""
+
+
+class PlainWay:
+    """One direction of a link.
+
+    Args:
+        spec: the link.
+        direction: which.
+        settings: what it does.
+    """
+
+    def __init__(self, spec: LinkSpec, direction: Direction, settings: LinkSettings) -> None:
+        self.settings = settings
+        decisions = spec.decisions.get(direction, ())
+        self.link = Link(settings, spec.seed, spec.name, direction, decisions=decisions)
+        self.losses = Losses(spec.name, direction)
+        self.errors: Counter[int] = Counter()
+        """Datagrams that could not be sent, or kept until then, by errno."""
+        self._delays, self._lateness = empty(), empty()
+        self._kept: dict[tuple[int, int], _Kept] = {}
+
+    def admit(self, flow: int, data: bytes, now_ns: int) -> tuple[Verdict, Sequence[Departure]]:
+        """Decide what becomes of a datagram; return what leaves at once."""
+        outputs = self.link.handle(Datagram(flow, data), now_ns)
+        verdict = self.link.verdict
+        times_ns = (verdict.release_ns, verdict.copy_ns)
+        bits = (verdict.bit, verdict.copy_bit)
+        left = sum(t_ns > now_ns for t_ns in times_ns)
+        if left:
+            self._kept[flow, verdict.packet] = _Kept(now_ns, verdict.fate, bits, left)
+        now = [which for which in range(2) if times_ns[which] == now_ns]
+        datagrams = [output for output in outputs if isinstance(output, Datagram)]
+        return verdict, [
+            Departure(
+                flow, datagram.data, verdict.packet, verdict.fate, now_ns, now_ns, bits[which],
+                delayed=False, copy=which == 1, stale=False,
+            )
+            for which, datagram in zip(now, datagrams, strict=True)
+        ]  # fmt: skip
+
+    def due(self, now_ns: int) -> Iterator[Departure]:
+        """Let out what is due, one by one."""
+        while (deadline_ns := self.link.next_deadline_ns()) is not None and deadline_ns <= now_ns:
+            yield self._departure(self.link.on_timer(now_ns))
+
+    def sent(self, departure: Departure, now_ns: int) -> None:
+        """Take note that a datagram was sent."""
+        self._delays[bucket_of(now_ns - departure.arrival_ns)] += 1
+        if departure.delayed:
+            self._lateness[bucket_of(now_ns - departure.release_ns)] += 1
+
+    def change(self, settings: LinkSettings) -> None:
+        """Go on with other settings."""
+        self.settings = settings
+        self.link.change(settings)
+
+    def report(self, flows: Sequence[FlowReport]) -> DirectionReport:
+        """What has happened so far."""
+        for error, datagrams in self.errors.items():
+            self.losses.not_sent(error, datagrams)
+        return DirectionReport(
+            settings=self.settings,
+            counters=self.link.counters,
+            unintended=self.losses.counts(),
+            under_way=self.link.under_way,
+            flows=flows,
+            delays=self._delays.copy(),
+            lateness=self._lateness.copy(),
+        )
+
+    def _departure(self, outputs: Sequence[Datagram | Record | Notice]) -> Departure:
+        datagram, record = outputs
+        if not isinstance(datagram, Datagram) or not isinstance(record, Record):
+            raise TypeError(f"not what a {NETEM_RELEASE} comes with: {outputs}")
+        _, packet, release_ns, _, flow, copy, stale = record.row
+        kept = self._kept.pop((flow, packet))
+        if kept.left > 1:
+            self._kept[flow, packet] = kept._replace(left=kept.left - 1)
+        return Departure(
+            flow, datagram.data, packet, kept.fate, kept.arrival_ns, release_ns, kept.bits[copy],
+            delayed=True, copy=bool(copy), stale=bool(stale),
+        )  # fmt: skip

@@ -1,0 +1,92 @@
+"""Clients by their address: a hash table with open addressing and linear probing."""
+
+from netem.engine.pump.pump_layout import Array
+
+_AF_INET = 2
+_LOW_WORD = 0xFFFFFFFF
+_GOLDEN = -7046029254386353131
+"""2⁶⁴/φ as an integer with sign."""
+
+
+def key_of(name: Array, link: int) -> tuple[int, int, int, int]:
+    """Return what identifies a client: family, port, host, scope and link, in four words.
+
+    Args:
+        name: (4,) int64, its socket address.
+        link: number of the link.
+    """
+    if name[0] & 0xFFFF == _AF_INET:
+        return name[0], 0, 0, link << 32
+    return name[0] & _LOW_WORD, name[1], name[2], (name[3] & _LOW_WORD) | (link << 32)
+
+
+def find(table: Array, clients: Array, key0: int, key1: int, key2: int, key3: int) -> int:
+    """Row of the client with a key; −1 if there is none."""
+    mask = len(table) - 1
+    place = _hash(key0, key1, key2, key3) & mask
+    while table[place] >= 0:
+        client = clients[table[place]]
+        if (
+            client.key0 == key0
+            and client.key1 == key1
+            and client.key2 == key2
+            and client.key3 == key3
+        ):
+            return table[place]
+        place = (place + 1) & mask
+    return -1
+
+
+def insert(table: Array, clients: Array, row: int, name: Array) -> None:
+    """Put a client into the table, which has room.
+
+    Args:
+        table: the table.
+        clients: the clients.
+        row: the client's.
+        name: (4,) int64, its socket address.
+    """
+    client = clients[row]
+    key0, key1, key2, key3 = key_of(name, client.link)
+    client.key0 = key0
+    client.key1 = key1
+    client.key2 = key2
+    client.key3 = key3
+    mask = len(table) - 1
+    place = _home(clients, row) & mask
+    while table[place] >= 0:
+        place = (place + 1) & mask
+    table[place] = row
+
+
+def remove(table: Array, clients: Array, row: int) -> None:
+    """Take a client out of the table, and close the gap."""
+    mask = len(table) - 1
+    gap = _home(clients, row) & mask
+    while table[gap] != row:
+        gap = (gap + 1) & mask
+    place = gap
+    while True:
+        place = (place + 1) & mask
+        if table[place] < 0:
+            break
+        home = _home(clients, table[place]) & mask
+        # It may move back unless its home lies after the gap, on the way round.
+        if ((place - home) & mask) >= ((place - gap) & mask):
+            table[gap] = table[place]
+            gap = place
+    table[gap] = -1
+
+
+def _home(clients: Array, row: int) -> int:
+    client = clients[row]
+    return _hash(client.key0, client.key1, client.key2, client.key3)
+
+
+def _hash(key0: int, key1: int, key2: int, key3: int) -> int:
+    """Mix four words; the product wraps."""
+    mixed = 0
+    for word in (key0, key1, key2, key3):
+        mixed = (mixed ^ word) * _GOLDEN
+        mixed ^= mixed >> 29
+    return mixed

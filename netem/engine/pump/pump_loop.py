@@ -1,0 +1,138 @@
+"""The loop: wait, receive, decide, send, and let out what is due."""
+
+from netem.engine.pump.error_queue import take_errors
+from netem.engine.pump.libc_calls import (
+    CLOCK_MONOTONIC,
+    CLOCK_REALTIME,
+    MSG_DONTWAIT,
+    POLLIN,
+    SYS_EPOLL_PWAIT2,
+    address_of,
+    clock_ns,
+    epoll_wait,
+    ppoll,
+    recvmmsg,
+    syscall,
+)
+from netem.engine.pump.pump_decisions import decide, let_out_due
+from netem.engine.pump.pump_layout import (
+    CARRY_ON,
+    HEADER,
+    HOUSEKEEPING,
+    LEAVING_FULL,
+    READY_WORDS,
+    Memory,
+)
+from netem.engine.pump.pump_send import send
+from netem.rule_records import Verdict
+from netem.rules.link_rules import Program, State
+
+_HEADER_BYTES = HEADER.itemsize
+_EPOLLERR = 8
+_NS = 1_000_000_000
+_FEW_BUFFERS = 16
+_HOUSEKEEPING_NS = 500_000
+"""Python takes less, nearly always."""
+_MOST_PUT_OFF_NS = 10_000_000
+
+
+def run_pump(
+    memory: Memory, program_like: Program, state_like: State, verdicts: list[Verdict], until_ns: int
+) -> int:
+    """Relay until Python is needed; return why it is.
+
+    Args:
+        memory: all that it works on.
+        program_like: a program, for its types.
+        state_like: a state, likewise.
+        verdicts: room for one.
+        until_ns: when to return at the latest, since the relay's start.
+    """
+    pump = memory.pump[0]
+    while True:
+        reason = CARRY_ON
+        if pump.batch_next < pump.batch_end:
+            reason = decide(memory, program_like, state_like, verdicts[0])
+        if reason == CARRY_ON:
+            reason = let_out_due(memory, state_like, pump.read_ns)
+        all_taken = pump.ready_next >= pump.ready
+        if reason != CARRY_ON or all_taken or pump.slots_in - pump.batch_end < _FEW_BUFFERS:
+            if pump.leaving > 0:
+                send(memory)
+            if reason == LEAVING_FULL:
+                continue
+            if reason != CARRY_ON:
+                return reason
+            pump.batch_next = 0
+            pump.batch_end = 0
+        if all_taken:
+            pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            wait_until_ns = until_ns
+            if pump.read_ns >= until_ns:
+                if not _is_soon_due(memory, until_ns):
+                    pump.ready = 0
+                    pump.ready_next = 0
+                    return HOUSEKEEPING
+                wait_until_ns = pump.read_ns + _HOUSEKEEPING_NS
+            if not _wait(memory, wait_until_ns):
+                return HOUSEKEEPING
+        if pump.ready_next < pump.ready:
+            _receive(memory)
+
+
+def _is_soon_due(memory: Memory, until_ns: int) -> bool:
+    """Whether housekeeping had better wait, as it would make the next delayed datagram late."""
+    pump = memory.pump[0]
+    return (
+        pump.heap > 0
+        and memory.heap[0].release_ns - pump.read_ns < _HOUSEKEEPING_NS
+        and pump.read_ns - until_ns < _MOST_PUT_OFF_NS
+    )
+
+
+def _wait(memory: Memory, until_ns: int) -> bool:
+    """Wait for a datagram or for the next to be due; return whether it was not interrupted."""
+    pump = memory.pump[0]
+    wait_ns = until_ns - pump.read_ns
+    if pump.heap > 0:
+        wait_ns = max(min(wait_ns, memory.heap[0].release_ns - pump.spin_ns - pump.read_ns), 0)
+    events = len(memory.ready) // READY_WORDS
+    address = address_of(memory.ready)
+    memory.time[0] = wait_ns // _NS
+    memory.time[1] = wait_ns % _NS
+    if pump.sleeps == 0:
+        found = syscall(
+            SYS_EPOLL_PWAIT2, pump.epoll, address, events, address_of(memory.time), 0, 0
+        )
+    else:
+        memory.poll[0] = pump.epoll
+        memory.poll[1] = POLLIN
+        found = ppoll(address_of(memory.poll), 1, address_of(memory.time), 0)
+        if found > 0:
+            found = epoll_wait(pump.epoll, address, events, 0)
+    pump.ready = max(found, 0)
+    pump.ready_next = 0
+    if pump.ready == 0:
+        pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+    return found >= 0
+
+
+def _receive(memory: Memory) -> None:
+    """Take what there is at the next socket that is ready, as far as there is room."""
+    pump = memory.pump[0]
+    event = pump.ready_next * READY_WORDS
+    socket = memory.ready[event + READY_WORDS - 2]
+    pump.ready_next += 1
+    if memory.ready[event] & _EPOLLERR:
+        take_errors(memory, socket)
+    begin = pump.batch_end
+    headers = address_of(memory.in_headers) + begin * _HEADER_BYTES
+    fd = memory.sockets[socket].fd
+    taken = recvmmsg(fd, headers, pump.slots_in - begin, MSG_DONTWAIT, 0)
+    pump.read_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+    if pump.stamps != 0:
+        pump.real_ns = clock_ns(CLOCK_REALTIME, memory.time) - pump.read_ns
+    if taken > 0:
+        pump.batch_socket = socket
+        pump.batch_next = begin
+        pump.batch_end = begin + taken

@@ -1,0 +1,253 @@
+"""Sends what is lined up: by one call for each socket, and each flow in its order."""
+
+from netem.engine.histogram import bucket_of
+from netem.engine.pump.error_queue import take_errors
+from netem.engine.pump.libc_calls import (
+    CLOCK_MONOTONIC,
+    MSG_DONTWAIT,
+    POLLOUT,
+    address_of,
+    clock_ns,
+    errno,
+    poll,
+    sendmmsg,
+    sendto,
+)
+from netem.engine.pump.payload_store import block_address, blocks_for, drop
+from netem.engine.pump.pump_events import tell_departure
+from netem.engine.pump.pump_layout import (
+    BLOCK_BYTES,
+    CLIENT,
+    CLIENT_NAME,
+    CONTROL,
+    DIRECTION,
+    HEADER,
+    NO_NAME,
+    VECTOR,
+    Memory,
+)
+
+_EINTR = 4
+_EAGAIN = 11
+_ENOBUFS = 105
+_HEADER_BYTES = HEADER.itemsize
+_VECTOR_BYTES = VECTOR.itemsize
+_CONTROL_BYTES = CONTROL.itemsize
+_CLIENT_BYTES = CLIENT.itemsize
+_CLIENT_NAME = CLIENT.fields["name"][1]  # type: ignore[index]
+_DIRECTION_BYTES = DIRECTION.itemsize
+_DIRECTION_NAME = DIRECTION.fields["name"][1]  # type: ignore[index]
+_UDP = 17
+_UDP_SEGMENT = 103
+_SEGMENT_CONTROL_BYTES = 18
+_MOST_SEGMENTS = 64
+_MOST_SEGMENTED_BYTES = 65_507
+_TRIES = 3
+_MOST_TRIES = 64
+"""An earlier datagram's ICMP error fails a send, once. What fails with none in the error queue, or
+so often, will fail again."""
+_PATIENCE_NS = 50_000_000
+"""So long, at most, a socket may be full. A full queue of the device (ENOBUFS) is not waited for:
+other links would be late."""
+
+
+def send(memory: Memory) -> None:
+    """Send all that is lined up."""
+    pump = memory.pump[0]
+    pump.stamp += 1
+    sockets = 0
+    for number in range(pump.leaving):
+        leaving = memory.leaving[number]
+        socket = memory.sockets[leaving.socket]
+        if socket.stamp != pump.stamp:
+            socket.stamp = pump.stamp
+            socket.head = number
+            memory.order[sockets] = leaving.socket
+            sockets += 1
+        else:
+            memory.leaving[socket.tail].next = number
+        socket.tail = number
+        leaving.next = -1
+    for place in range(sockets):
+        socket = memory.sockets[memory.order[place]]
+        number = socket.head
+        while number >= 0:
+            headers, following = _fill(memory, number)
+            done = headers
+            if socket.fd >= 0:
+                done = _transmit(memory, memory.order[place], headers, following)
+            else:
+                for k in range(headers):
+                    memory.leaving[memory.out_first[k]].error = socket.error
+            if done < headers:
+                following = memory.out_first[done]
+            now_ns = clock_ns(CLOCK_MONOTONIC, memory.time) - pump.epoch_ns
+            while number != following:
+                _account(memory, number, now_ns)
+                number = memory.leaving[number].next
+    pump.leaving = 0
+    pump.leaving_bytes = 0
+
+
+def _fill(memory: Memory, number: int) -> tuple[int, int]:
+    """Fill headers from ``number`` on; return how many, and with which datagram to go on."""
+    pump = memory.pump[0]
+    headers, vectors = 0, 0
+    base = address_of(memory.out_vectors)
+    while number >= 0 and headers < len(memory.out_headers):
+        leaving = memory.leaving[number]
+        size_bytes = leaving.size_bytes
+        needed = 1 if leaving.slot < 0 else blocks_for(size_bytes)
+        if vectors + needed > len(memory.out_vectors):
+            break
+        header = memory.out_headers[headers]
+        memory.out_first[headers] = number
+        header.vectors = base + vectors * _VECTOR_BYTES
+        first_vector = vectors
+        vectors = _add_vectors(memory, vectors, number)
+        number = leaving.next
+        header.control = 0
+        header.control_bytes = 0
+        if pump.segment != 0 and 0 < size_bytes < pump.segment_below:
+            segments, all_bytes, last_bytes = 1, size_bytes, size_bytes
+            while number >= 0 and segments < _MOST_SEGMENTS and last_bytes == size_bytes:
+                other = memory.leaving[number]
+                last_bytes = other.size_bytes
+                needed = 1 if other.slot < 0 else blocks_for(last_bytes)
+                if (
+                    not 0 < last_bytes <= size_bytes
+                    or all_bytes + last_bytes > _MOST_SEGMENTED_BYTES
+                    or vectors + needed > len(memory.out_vectors)
+                    or other.direction != leaving.direction
+                    or (other.client != leaving.client and _by_client(memory, number))
+                ):
+                    break
+                vectors = _add_vectors(memory, vectors, number)
+                all_bytes += last_bytes
+                segments += 1
+                number = other.next
+            if segments > 1:
+                control = memory.out_controls[headers]
+                control.bytes = _SEGMENT_CONTROL_BYTES
+                control.level = _UDP
+                control.kind = _UDP_SEGMENT
+                control.size_bytes = size_bytes
+                header.control = address_of(memory.out_controls) + headers * _CONTROL_BYTES
+                header.control_bytes = _CONTROL_BYTES
+        header.n_vectors = vectors - first_vector
+        _address(memory, headers, leaving.direction, leaving.client)
+        headers += 1
+    return headers, number
+
+
+def _by_client(memory: Memory, number: int) -> bool:
+    return memory.directions[memory.leaving[number].direction].sends == CLIENT_NAME
+
+
+def _address(memory: Memory, header: int, way: int, client: int) -> None:
+    """Say where a message goes."""
+    direction = memory.directions[way]
+    name, name_bytes = 0, 0
+    if direction.sends == CLIENT_NAME:
+        name = address_of(memory.clients) + client * _CLIENT_BYTES + _CLIENT_NAME
+        name_bytes = memory.clients[client].name_bytes
+    elif direction.sends != NO_NAME:
+        name = address_of(memory.directions) + way * _DIRECTION_BYTES + _DIRECTION_NAME
+        name_bytes = direction.name_bytes
+    memory.out_headers[header].name = name
+    memory.out_headers[header].name_bytes = name_bytes
+
+
+def _add_vectors(memory: Memory, vectors: int, number: int) -> int:
+    """Say where a datagram's payload lies; return the next free vector."""
+    leaving = memory.leaving[number]
+    if leaving.slot < 0:
+        vector = memory.out_vectors[vectors]
+        vector.base = leaving.address
+        vector.size_bytes = leaving.size_bytes
+        return vectors + 1
+    block, left_bytes = memory.slots[leaving.slot].block, leaving.size_bytes
+    for k in range(blocks_for(left_bytes)):
+        vector = memory.out_vectors[vectors + k]
+        vector.base = block_address(memory.chunks, block)
+        vector.size_bytes = min(left_bytes, BLOCK_BYTES)
+        left_bytes -= BLOCK_BYTES
+        block = memory.block_next[block]
+    return vectors + blocks_for(leaving.size_bytes)
+
+
+def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
+    """Send messages; return how many are done with.
+
+    The others have to be filled in again, as the kernel does not segment the first of them.
+
+    Args:
+        memory: the pump's.
+        socket: number of the socket.
+        headers: how many messages there are.
+        following: the datagram after those in them; −1 none.
+    """
+    pump, fd = memory.pump[0], memory.sockets[socket].fd
+    done, tries, waited_ns = 0, 0, 0
+    base, vectors = address_of(memory.out_headers), address_of(memory.out_vectors)
+    while done < headers:
+        header = memory.out_headers[done]
+        if headers - done == 1 and header.n_vectors == 1 and header.control_bytes == 0:
+            # The cheaper call for a single one.
+            vector = memory.out_vectors[(header.vectors - vectors) // _VECTOR_BYTES]
+            sent = sendto(
+                fd, vector.base, vector.size_bytes, MSG_DONTWAIT, header.name, header.name_bytes
+            )
+            sent = min(sent + 1, 1)
+        else:
+            sent = sendmmsg(fd, base + done * _HEADER_BYTES, headers - done, MSG_DONTWAIT)
+        if sent > 0:
+            done += sent
+            tries = 0
+            continue
+        error = errno(memory.integers)
+        if error == _EINTR:
+            continue
+        if error == _EAGAIN and waited_ns < _PATIENCE_NS:
+            waited_ns += _wait_for_room(memory, fd)
+            continue
+        number = memory.out_first[done]
+        if error not in (_EAGAIN, _ENOBUFS):
+            tries += 1
+            if tries < (_MOST_TRIES if take_errors(memory, socket) > 0 else _TRIES):
+                continue
+            if header.control_bytes > 0:
+                size_bytes = memory.leaving[number].size_bytes
+                pump.segment_below = min(pump.segment_below, size_bytes)
+                return done
+        done += 1
+        tries = 0
+        end = memory.out_first[done] if done < headers else following
+        while number != end:
+            memory.leaving[number].error = error
+            number = memory.leaving[number].next
+    return done
+
+
+def _wait_for_room(memory: Memory, fd: int) -> int:
+    """Wait until a socket takes more, 1 ms at most; return how long, in ns."""
+    begun_ns = clock_ns(CLOCK_MONOTONIC, memory.time)
+    memory.poll[0] = fd
+    memory.poll[1] = POLLOUT
+    poll(address_of(memory.poll), 1, 1)
+    return max(clock_ns(CLOCK_MONOTONIC, memory.time) - begun_ns, 1000)
+
+
+def _account(memory: Memory, number: int, now_ns: int) -> None:
+    """Count a datagram that has been sent, or could not be, and let its payload go."""
+    pump, leaving = memory.pump[0], memory.leaving[number]
+    if leaving.error == 0:
+        memory.delays[leaving.direction, bucket_of(now_ns - leaving.arrival_ns)] += 1
+        if leaving.delayed != 0:
+            memory.lateness[leaving.direction, bucket_of(now_ns - leaving.release_ns)] += 1
+        if pump.taps != 0:
+            tell_departure(memory, number, now_ns)
+    else:
+        memory.errors[leaving.direction, leaving.error & 255] += 1
+    if leaving.slot >= 0:
+        drop(memory, leaving.slot)

@@ -1,0 +1,49 @@
+"""Clients that are not taken, and why."""
+
+import errno
+
+from netem.engine.relay_interface import LinkSpec
+from netem.standard_error import say
+
+_OUT_OF_FILES = (errno.EMFILE, errno.ENFILE)
+
+STOPPED_NS = 1_000_000_000
+"""An engine that has not looked for idle clients for so long was stopped, or starved."""
+
+
+class Refusals:
+    """Those of one link; each reason is said once, on standard error.
+
+    Args:
+        spec: the link.
+    """
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self._spec = spec
+        self._full = False
+        self._told: set[str] = set()
+
+    def accepts(self, clients: int) -> bool:
+        """Whether one more than ``clients`` is taken."""
+        if clients >= self._spec.most_clients:
+            self._fill(f"no more than {self._spec.most_clients} clients at once are served")
+        return not self._full
+
+    def is_exhausted(self, error: int, clients: int) -> bool:
+        """Whether a socket could not be made as there are too many; none is taken then."""
+        if error in _OUT_OF_FILES:
+            self._fill(
+                f"no file descriptors are left for more than {clients} clients; raise the limit "
+                "(ulimit -n)"
+            )
+        return error in _OUT_OF_FILES
+
+    def end(self) -> None:
+        """A client has gone: take others again."""
+        self._full = False
+
+    def _fill(self, why: str) -> None:
+        self._full = True
+        if why not in self._told:
+            self._told.add(why)
+            say(f"link {self._spec.name}: {why}")

@@ -1,0 +1,56 @@
+"""Unintended losses: no setting caused them, they break the guarantee, and are never silent."""
+
+import errno
+import os
+from collections import Counter
+from collections.abc import Mapping
+
+from netem.engine.relay_interface import Direction
+from netem.standard_error import say
+
+KERNEL = "lost_in_kernel"
+_HOW = {
+    KERNEL: "were lost in the kernel, as its receive buffer was full",
+    os.strerror(errno.ENOBUFS): "were lost, as a queue on the way out was full",
+    os.strerror(errno.ENOMEM): "were lost, as there was no memory to delay them",
+}
+
+
+class Losses:
+    """Those of one direction of a link.
+
+    Args:
+        link: the link's name.
+        direction: the direction.
+    """
+
+    def __init__(self, link: str, direction: Direction) -> None:
+        self._where = f"link {link}, {direction}"
+        self._counts: Counter[str] = Counter({KERNEL: 0})
+        self._told: Counter[str] = Counter()
+
+    def lost_in_kernel(self, datagrams: int) -> None:
+        """Say how many the kernel has dropped so far."""
+        self._set(KERNEL, datagrams)
+
+    def not_sent(self, error: int, datagrams: int) -> None:
+        """Say how many could not be sent, or kept until then, for a reason by its errno."""
+        self._set(os.strerror(error), datagrams)
+
+    def counts(self) -> Mapping[str, int]:
+        """How many were lost, by cause."""
+        return dict(self._counts)
+
+    def tell(self) -> None:
+        """Say the totals on standard error, as far as they have changed since."""
+        for what, datagrams in self._counts.items():
+            if datagrams > self._told[what]:
+                self._told[what] = datagrams
+                how = _HOW.get(what, f"could not be sent ({what})")
+                say(f"{self._where}: {datagrams} datagrams {how}, against the guarantee")
+
+    def _set(self, what: str, datagrams: int) -> None:
+        if datagrams > 0:
+            self._counts[what] = datagrams
+            if not self._told[what]:
+                self.tell()

@@ -1,0 +1,168 @@
+"""Reads fate traces back, as the decisions that a link takes again in a replay."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
+
+from netem.engine.relay_interface import DIRECTIONS, Direction
+from netem.fates.fate_trace import FORMAT, METADATA, SCHEMA
+from netem.rule_records import Decision
+from noack.config.impairments import Mansd
+from noack.core.errors import CallerError, one_line
+from noack.protocol.record_tables import Fate
+
+_LONGEST_NS = 2**62
+"""No delay is longer; added to a time it stays within 64 bits."""
+_LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
+
+
+class Fates(NamedTuple):
+    """What a trace says, of each direction of each link."""
+
+    decisions: Mapping[tuple[str, Direction], Sequence[Sequence[Decision]]]
+    """Of each flow, in the order of its datagrams."""
+    caps: Mapping[tuple[str, Direction], int | None]
+    """M − 1, if it was kept."""
+
+
+def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
+    """Read a trace, for :func:`netem.rule_program.program_of` and :class:`netem.link_machine.Link`.
+
+    A replayed link takes the decisions of each flow again, datagram by datagram: the same fate, the
+    same flipped bits, and the same delay from the datagram's arrival. When datagrams come at other
+    times than they did, the cap of the replaying link is kept all the same. A flow that the trace
+    does not know, and a flow that goes on beyond it, meets the link's own settings.
+
+    Args:
+        path: the file.
+        links: the links to be replayed; None for all that the trace has.
+
+    Raises:
+        CallerError: the file is no trace, or has holes, or does not know a link.
+    """
+    table, settings = _read(path)
+    links_recorded = list(settings)
+    for link in links or ():
+        if link not in links_recorded:
+            known = ", ".join(links_recorded)
+            raise CallerError(f"{path}: has no fates of a link {link!r}; it has those of {known}")
+    columns = {name: table[name].to_numpy() for name in SCHEMA.names}
+    found: dict[tuple[str, Direction], Sequence[Sequence[Decision]]] = {}
+    caps: dict[tuple[str, Direction], int | None] = {}
+    for link in links_recorded if links is None else links:
+        for direction in DIRECTIONS:
+            here = (columns["link"] == link) & (columns["direction"] == direction)
+            rows = {name: column[here] for name, column in columns.items()}
+            found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
+            cap = getattr(settings[link], direction).mansd
+            # It may have been changed on the way.
+            kept = cap is not None and rows["run"].max(initial=0) <= cap
+            caps[link, direction] = cap if kept else None
+    return Fates(found, caps)
+
+
+def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
+    """Return a trace's table, and what its links did at its start, by name."""
+    try:
+        with pq.ParquetFile(path) as file:
+            document = _document(path, (file.metadata.metadata or {}).get(METADATA.encode()))
+            if not file.schema_arrow.equals(SCHEMA):
+                raise CallerError(f"{path}: is no fate trace: its columns are others")
+            table = file.read()
+            table.validate(full=True)
+    except pa.ArrowInvalid:
+        raise CallerError(
+            f"{path}: is no fate trace, or one that was not finished as the emulator was killed"
+        ) from None
+    except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
+        raise CallerError(f"{path}: cannot be read ({one_line(error)})") from None
+    if document.missing_events or any(column.null_count for column in table.columns):
+        raise CallerError(
+            f"{path}: {document.missing_events or 'some'} events are missing; "
+            "a trace with holes cannot be replayed"
+        )
+    return table, {link.name: link for link in document.links}
+
+
+class _Direction(BaseModel):
+    mansd: Mansd | None
+
+
+class _Link(BaseModel):
+    name: str
+    forward: _Direction
+    back: _Direction
+
+
+class _Header(BaseModel):
+    format: int
+    version: str
+
+
+class _Document(_Header):
+    """What is needed of a trace's metadata."""
+
+    missing_events: Annotated[int, Field(ge=0)]
+    links: list[_Link]
+
+
+def _document(path: Path, text: bytes | None) -> _Document:
+    try:
+        header = _Header.model_validate_json(text or b"", strict=True)
+        if header.format != FORMAT:
+            raise CallerError(f"{path}: is of another format, that of noack {header.version}")
+        return _Document.model_validate_json(text or b"", strict=True)
+    except ValidationError:
+        raise CallerError(f"{path}: is no fate trace of this program") from None
+
+
+def _flows(
+    rows: Mapping[str, NDArray[Any]], most_flows: int, place: str
+) -> Sequence[Sequence[Decision]]:
+    """Return the decisions of each flow, from the rows of a direction."""
+    _check(rows, most_flows, place)
+    order = np.lexsort((rows["packet"], rows["flow"]))
+    flows, packets = rows["flow"][order], rows["packet"][order]
+    ends = np.flatnonzero(np.diff(flows, append=-1)) + 1
+    begins = np.concatenate(([0], ends[:-1])) if len(ends) else ends
+    expected = np.arange(len(packets)) - np.repeat(begins, ends - begins)
+    wrong = np.flatnonzero(packets != expected)
+    if len(wrong):
+        k = wrong[0]
+        raise CallerError(
+            f"{place}: flow {flows[k]}: expected datagram {expected[k]} and found {packets[k]}; "
+            "a trace with holes cannot be replayed"
+        )
+    names = ("fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
+    columns = [rows[name][order].tolist() for name in names]
+    decisions = [Decision(*values) for values in zip(*columns, strict=True)]
+    found: list[Sequence[Decision]] = [()] * (int(flows[-1]) + 1 if len(flows) else 0)
+    for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+        found[int(flows[begin])] = decisions[begin:end]
+    return found
+
+
+def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> None:
+    """Check that the rows say what an emulator can have done."""
+    delay, copy = rows["delay_ns"], rows["copy_delay_ns"]
+    lost = np.isin(rows["fate"], _LOST)
+    possible = (
+        np.isin(rows["fate"], list(Fate))
+        & (rows["flow"] >= 0)
+        & (rows["flow"] < most_flows)
+        & np.where(lost, (delay == -1) & (copy == -1), delay >= 0)
+        & ((copy == -1) | (copy >= delay))
+        & (np.maximum(delay, copy) <= _LONGEST_NS)
+        & (rows["bit"] >= -1)
+        & (rows["copy_bit"] >= -1)
+    )
+    if not possible.all():
+        k = int(np.flatnonzero(~possible)[0])
+        what = ", ".join(f"{name} {rows[name][k]}" for name in SCHEMA.names[2:])
+        raise CallerError(f"{place}: no emulator did this: {what}")

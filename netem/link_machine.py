@@ -1,0 +1,328 @@
+"""One direction of a link as a machine: datagrams in, what survives out, now or later.
+
+It reads no payload. The rules are those of :mod:`netem.rules`; here they run as plain Python, in a
+run of the loop, in simulation and in replay, and in the relay where nothing faster is to be had.
+"""
+
+import heapq
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
+from netem.rule_records import Counters, Decision, FlowState, Memory, Verdict
+from netem.rules.link_rules import admit, leave
+from netem.rules.mansd import NEVER_NS
+from netem.rules.settings_change import carry
+from noack.config.impairments import LinkSettings
+from noack.config.parameter_changes import Change, Schedule
+from noack.config.scenario import Scenario
+from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
+from noack.protocol.record_tables import (
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    NETEM_SETTING,
+    PACKET_HEAD_BYTES,
+    Fate,
+)
+
+UPDATE_LINK = "update"
+"""Name of the link from sensor to controller; part of its random streams' names."""
+
+
+class Datagram(NamedTuple):
+    """A datagram of a flow; flows are numbered in the order of their first datagram."""
+
+    flow: int
+    data: bytes
+
+
+class _UnderWay(NamedTuple):
+    """A datagram, or a copy, that is to leave; ties leave in the order in which they came."""
+
+    release_ns: int
+    number: int
+    packet: int
+    copy: bool
+    counts: bool
+    """Whether it is the first intact copy."""
+    delayed: bool
+    datagram: Datagram
+
+
+class Link:
+    """The machine of the network emulator.
+
+    Args:
+        settings: what it does to datagrams; files are read already.
+        seed: seed of its random streams.
+        name: names of the link and the direction; part of its random streams' names.
+        decisions: recorded decisions of each flow, taken again before the settings apply.
+        first_number: of its inputs and of its packets.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        decisions: Sequence[Sequence[Decision]] = (),
+        first_number: int = 0,
+    ) -> None:
+        self._first_delivered = settings.first_delivered
+        self._seed = seed
+        self._name = name
+        self._program = program_of(settings, seed, *name, decisions=decisions)
+        self._rows: dict[int, int] = {}
+        self._free_rows: list[int] = []
+        self._flows: list[FlowState] = []
+        self._memory: list[list[Memory]] = []
+        self._recent_ns: list[list[int]] = []
+        self._state = empty_state(self._program)._replace(
+            flows=self._flows, memory=self._memory, recent_ns=self._recent_ns
+        )
+        self._verdict = Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._under_way: list[_UnderWay] = []
+        self._put_under_way = 0
+        self._inputs = self._first_number = first_number
+
+    @property
+    def counters(self) -> Counters:
+        """What has happened so far."""
+        return self._state.counters
+
+    @property
+    def verdict(self) -> Verdict:
+        """What was decided of the last datagram; overwritten by the next."""
+        return self._verdict
+
+    @property
+    def under_way(self) -> int:
+        """Datagrams, and copies, that are delayed now."""
+        return self._state.link.under_way
+
+    @property
+    def delays(self) -> bool:
+        """Whether what passes may have to be kept."""
+        return self._program.tracks
+
+    def flow(self, flow: int) -> FlowState | None:
+        """What is remembered of a flow; None if none of its datagrams has come."""
+        row = self._rows.get(flow)
+        return None if row is None else self._flows[row]
+
+    def forget(self, flow: int) -> None:
+        """Forget a flow that has ended, and of which nothing is under way."""
+        row = self._rows.pop(flow, None)
+        if row is not None:
+            self._free_rows.append(row)
+
+    def change(self, settings: LinkSettings) -> None:
+        """Go on with other settings; see :mod:`netem.rules.settings_change`."""
+        old, before = self._program, self._state
+        self._first_delivered = settings.first_delivered
+        self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
+            decisions=old.decisions, decisions_begin=old.decisions_begin
+        )
+        self._memory = [new_memory(self._program) for _ in self._flows]
+        self._recent_ns = [[NEVER_NS] * recent_width(self._program) for _ in self._flows]
+        self._state = empty_state(self._program)._replace(
+            flows=self._flows,
+            memory=self._memory,
+            recent_ns=self._recent_ns,
+            link=before.link,
+            counters=before.counters,
+        )
+        latest_ns = [NEVER_NS] * len(self._flows)
+        for leaving in self._under_way:
+            row = self._rows[leaving.datagram.flow]
+            latest_ns[row] = max(latest_ns[row], leaving.release_ns)
+        carry(old, before, self._program, self._state, latest_ns)
+
+    def next_deadline_ns(self) -> int | None:
+        """When the next datagram leaves."""
+        return self._under_way[0].release_ns if self._under_way else None
+
+    def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Let the datagram out that is due."""
+        due = heapq.heappop(self._under_way)
+        stale = self._leave(due)
+        row = (
+            self._inputs, self._first_number + due.packet, due.release_ns, now_ns,
+            due.datagram.flow, int(due.copy), int(stale),
+        )  # fmt: skip
+        self._inputs += 1
+        return (due.datagram, Record(NETEM_RELEASE, row))
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Take a datagram; return it if it survives and is not delayed."""
+        verdict = self.decide(message.flow, len(message.data), now_ns)
+        head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
+        row = (
+            self._inputs, self._first_number + verdict.packet, now_ns, now_ns, message.flow,
+            Fate(verdict.fate), verdict.run, verdict.release_ns, verdict.copy_ns, verdict.bit,
+            len(message.data), head,
+        )  # fmt: skip
+        self._inputs += 1
+        record = Record(NETEM_PACKET, row)
+        if verdict.release_ns == NEVER_NS:
+            return (record,)
+        outputs: list[Datagram | Record | Notice] = []
+        intact = verdict.bit < 0
+        self._release(
+            outputs, message, verdict.release_ns, verdict.bit, now_ns, copy=False, counts=intact
+        )
+        if verdict.copy_ns != NEVER_NS:
+            counts = not intact and verdict.copy_bit < 0
+            self._release(
+                outputs, message, verdict.copy_ns, verdict.copy_bit, now_ns,
+                copy=True, counts=counts,
+            )  # fmt: skip
+        return (*outputs, record)
+
+    def decide(self, flow: int, size_bytes: int, now_ns: int) -> Verdict:
+        """Return what becomes of a flow's next datagram; the verdict is overwritten by the next."""
+        row = self._rows.get(flow)
+        if row is None:
+            row = self._add_flow(flow)
+        admit(self._program, self._state, row, size_bytes, now_ns, self._verdict)
+        return self._verdict
+
+    def _release(
+        self,
+        outputs: list[Datagram | Record | Notice],
+        message: Datagram,
+        release_ns: int,
+        bit: int,
+        now_ns: int,
+        *,
+        copy: bool,
+        counts: bool,
+    ) -> None:
+        """Send a datagram, or keep it until it is due."""
+        if bit >= 0:
+            message = message._replace(data=flipped(message.data, bit))
+        self._put_under_way += 1
+        leaving = _UnderWay(
+            release_ns, self._put_under_way, self._verdict.packet, copy, counts,
+            release_ns > now_ns, message,
+        )  # fmt: skip
+        # What was due before leaves before, even if nobody has come to let it out.
+        overdue = bool(self._under_way) and self._under_way[0].release_ns <= release_ns
+        if leaving.delayed or overdue:
+            heapq.heappush(self._under_way, leaving)
+        else:
+            self._leave(leaving)
+            outputs.append(message)
+
+    def _leave(self, leaving: _UnderWay) -> bool:
+        return leave(
+            self._state,
+            self._rows[leaving.datagram.flow],
+            leaving.packet,
+            len(leaving.datagram.data),
+            leaving.delayed,
+            leaving.counts,
+        )
+
+    def _add_flow(self, flow: int) -> int:
+        state = new_flow(flow, self._first_delivered)
+        memory, recent_ns = new_memory(self._program), [NEVER_NS] * recent_width(self._program)
+        if self._free_rows:
+            row = self._free_rows.pop()
+            self._flows[row], self._memory[row], self._recent_ns[row] = state, memory, recent_ns
+        else:
+            row = len(self._flows)
+            self._flows.append(state)
+            self._memory.append(memory)
+            self._recent_ns.append(recent_ns)
+        self._rows[flow] = row
+        return row
+
+
+class RunLink(Link):
+    """The link from sensor to controller in a run: its settings may change at set times.
+
+    Args:
+        settings: what it does to datagrams at first.
+        seed: seed of its random streams.
+        name: names of the link and the direction; part of its random streams' names.
+        schedule: what it knows of changes.
+        first_number: of its inputs and of its packets.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        seed: int,
+        *name: str,
+        schedule: Schedule,
+        first_number: int = 0,
+    ) -> None:
+        super().__init__(settings, seed, *name, first_number=first_number)
+        self._settings = settings
+        self._schedule = schedule
+        self._reached_ns = -1
+
+    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+        """Take a change; it is in force from the first datagram on that comes not before T.
+
+        A smaller cap is kept from that datagram on: if as many as it allows, or more, have just
+        been lost in a row, this one passes. So a run of losses is never longer than the larger of
+        the caps that were in force during it.
+        """
+        said = self._schedule.announce(
+            NETEM_SETTING, change, self._inputs, now_ns, self._reached_ns
+        )
+        self._inputs += 1
+        return said
+
+    def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
+        """Take a datagram; return it if it survives and is not delayed."""
+        if self._schedule.next_ns is not None:
+            while (found := self._schedule.take(now_ns)) is not None:
+                self._apply(found.prepared)
+        self._reached_ns = now_ns
+        return super().handle(message, now_ns)
+
+    def _apply(self, settings: LinkSettings) -> None:
+        first = self._settings.first_delivered  # one that was started anew has its own
+        settings = settings.model_copy(update={"first_delivered": first})
+        if settings != self._settings:
+            self._settings = settings
+            self.change(settings)
+
+
+def flipped(data: bytes, bit: int) -> bytes:
+    """Return the data with one bit flipped; bit 0 is the first byte's lowest."""
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << (bit % 8)
+    return bytes(changed)
+
+
+def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> RunLink:
+    """Return the link from sensor to controller of a resolved scenario."""
+    settings, names = _at_the_start(resolved.network.link, UPDATE_LINK, start)
+    return RunLink(
+        settings, resolved.seeds.loss, *names,
+        schedule=Schedule(resolved, lambda one: one.network.link), first_number=start.first_number,
+    )  # fmt: skip
+
+
+def link_of(settings: LinkSettings, seed: int, name: str, start: Start) -> Link:
+    """Return a link of a run, whose settings stay as they are."""
+    settings, names = _at_the_start(settings, name, start)
+    return Link(settings, seed, *names, first_number=start.first_number)
+
+
+def _at_the_start(
+    settings: LinkSettings, name: str, start: Start
+) -> tuple[LinkSettings, tuple[str, ...]]:
+    """A link's settings and the names of its random streams.
+
+    One that is started anew knows nothing of how many it dropped in a row: the first passes, and
+    what follows is drawn from other streams than before.
+    """
+    if not start.again:
+        return settings, (name,)
+    again = f"again-{start.incarnation}"
+    return settings.model_copy(update={"first_delivered": True}), (name, again)

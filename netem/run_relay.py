@@ -1,0 +1,53 @@
+"""The relay: the network emulator's socket in a run. Datagrams in, survivors out, unread.
+
+It serves the sensor's address, and the controller's where there is a way back. Survivors leave from
+the port that they came in by.
+"""
+
+import socket
+
+from netem.link_machine import Datagram
+from noack.runtime.address import Address
+from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket
+
+
+class Relay(CountingSocket[Datagram]):
+    """The channel of a link.
+
+    Args:
+        endpoint: a bound socket, from :func:`noack.runtime.udp_sockets.bind`.
+        destination: where surviving datagrams go.
+        source: the only address to serve.
+        duplex: what comes from the destination goes to the source, as flow 1.
+    """
+
+    most_bytes = MAX_UDP_BYTES
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        destination: Address,
+        source: Address,
+        *,
+        duplex: bool = False,
+    ) -> None:
+        self._flows = {source: 0, destination: 1} if duplex else {source: 0}
+        self._back = {1: source} if duplex else {}
+        self._foreign = 0
+        super().__init__(endpoint, destination, list(self._flows))
+
+    def judge(self, data: bytes, source: Address) -> Datagram | None:
+        """Return a datagram of one that is served; its content is nobody's business here."""
+        flow = self._flows.get(source)
+        if flow is None:
+            self._foreign += 1
+            return None
+        return Datagram(flow, data)
+
+    def send(self, message: Datagram) -> None:
+        """Forward a datagram that survived."""
+        self.put(message.data, self._back.get(message.flow))
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        return super().report() | {"rejected": self.rejected({"source": self._foreign})}

@@ -1,0 +1,136 @@
+"""Files with several links: TOML in, what a relay takes out.
+
+[[link]]
+name = "uplink"
+listen = "127.0.0.1:9000"
+to = "127.0.0.1:9001"
+words = "delay 10ms loss 5% mansd 4"
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+
+from netem.engine.relay_interface import LinkSpec
+from netem.words.words_to_settings import settings_of
+from noack.config import toml_file
+from noack.config.impairment_files import read_files
+from noack.config.impairments import LinkSettings
+from noack.config.section import Section, Seed
+from noack.core.errors import CallerError
+from noack.runtime.address import parse_address
+
+
+def _settings(value: Any) -> Any:
+    if isinstance(value, LinkSettings):
+        return value
+    if not isinstance(value, str):
+        # Strict validation takes lists for tuples only in JSON, and what is behind this is none.
+        return LinkSettings.model_validate_json(json.dumps(value))
+    try:
+        return settings_of(value)
+    except CallerError as error:
+        raise ValueError(str(error)) from None
+
+
+Side = Annotated[
+    LinkSettings, BeforeValidator(_settings, json_schema_input_type=str | LinkSettings)
+]
+
+
+class LinkTable(Section):
+    """One link of a relay: where it listens, where it sends to, what it does in each direction."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+    """Names the link in reports, and its random streams: letters, digits, _ and -."""
+    listen: str
+    """Where clients send to: HOST:PORT; port 0 takes a free one."""
+    to: str
+    """The server: HOST:PORT."""
+    forward: Side = LinkSettings()
+    """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
+    back: Side = LinkSettings()
+    """From the server back to the clients, likewise."""
+    words: Side | None = None
+    """Short for forward."""
+    seed: Seed = 0
+    """Seed of the link's random streams."""
+    return_path: bool = True
+    """false: one way only; answers are not taken."""
+    idle_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = LinkSpec.idle_s
+    """A client is forgotten after so long without a datagram in either direction."""
+    most_clients: Annotated[int, Field(ge=1, le=1_000_000)] = LinkSpec.most_clients
+    """Datagrams of more clients than that are refused, and counted."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.words is not None and "forward" in self.model_fields_set:
+            raise ValueError("words: is short for forward; give one of them")
+        return self
+
+    def spec(self, folder: Path, place: str) -> LinkSpec:
+        """Return the link for a relay, with its addresses looked up and its files read.
+
+        Args:
+            folder: where relative names of files begin.
+            place: where the table stands, for messages.
+
+        Raises:
+            CallerError: one line.
+        """
+        listen = parse_address(self.listen, f"{place}.listen")
+        return LinkSpec(
+            name=self.name,
+            listen=listen,
+            to=parse_address(self.to, f"{place}.to", listen),
+            forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
+            back=read_files(self.back, folder, f"{place}.back"),
+            seed=self.seed,
+            return_path=self.return_path,
+            idle_s=self.idle_s,
+            most_clients=self.most_clients,
+        )
+
+
+class LinksFile(Section):
+    """Links of one relay."""
+
+    link: Annotated[tuple[LinkTable, ...], Field(min_length=1)]
+    """The links, [[link]] each."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        names: set[str] = set()
+        for number, link in enumerate(self.link):
+            if link.name in names:
+                raise ValueError(f"link.{number}.name: another link has this name already")
+            names.add(link.name)
+        return self
+
+
+def load_links(path: Path) -> tuple[LinkSpec, ...]:
+    """Read a links file.
+
+    Raises:
+        CallerError: one line per mistake, each with file, key, value and remedy.
+    """
+    links = toml_file.validated(LinksFile, toml_file.read(path, LinksFile), str(path)).link
+    specs = tuple(
+        link.spec(path.parent, f"{path}: link.{number}") for number, link in enumerate(links)
+    )
+    listening: dict[object, str] = {}
+    for number, spec in enumerate(specs):
+        if spec.listen[1] and spec.listen in listening:
+            raise CallerError(
+                f'{path}: link.{number}.listen = "{links[number].listen}": '
+                f"link {listening[spec.listen]} listens there already; take another port, or 0"
+            )
+        listening[spec.listen] = spec.name
+    return specs
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of links files, for editors."""
+    return toml_file.json_schema(LinksFile)

@@ -1,0 +1,1 @@
+"""The scenario file: sections, file readers, validation messages, resolution."""

@@ -1,0 +1,73 @@
+"""Matrices from a ``.mat`` file, read by SciPy in a process of its own.
+
+SciPy's reader is compiled, and what is damaged in the right place crashes it: only this process.
+"""
+
+import io
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+
+from noack.core.python_process import python_command
+
+_OF_NUMBERS = {
+    "double", "single", "sparse", "logical",
+    "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
+}  # fmt: skip
+_MODERN = 3
+"""Exit status for a file of v7.3."""
+_PATIENCE_S = 60.0
+
+
+def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
+    """Return the matrices of a ``.mat`` file as the content of a ``.npz`` file.
+
+    Args:
+        content: of the file.
+        most_entries: larger ones are left out, as is what is not of numbers.
+
+    Raises:
+        NotImplementedError: it is of MATLAB's v7.3.
+        ValueError: it cannot be read.
+    """
+    command = python_command("-m", __name__, most_entries)
+    try:
+        done = subprocess.run(
+            command, input=content, capture_output=True, timeout=_PATIENCE_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise ValueError("it cannot be read in time") from None
+    if done.returncode == _MODERN:
+        raise NotImplementedError
+    if done.returncode != 0:
+        raise ValueError("it cannot be read")
+    return done.stdout
+
+
+def _main() -> int:
+    from scipy.io import loadmat, whosmat  # not in the processes that only ask
+
+    file, most_entries = io.BytesIO(sys.stdin.buffer.read()), int(sys.argv[1])
+    warnings.simplefilter("ignore")
+    try:
+        names = [
+            name
+            for name, shape, kind in whosmat(file)  # type: ignore[arg-type] # it takes files, too
+            if np.prod(shape, dtype=float) <= most_entries and kind in _OF_NUMBERS
+        ]
+        file.seek(0)
+        read = loadmat(file, variable_names=names)  # type: ignore[arg-type]
+    except NotImplementedError:
+        return _MODERN
+    found = {
+        name: read[name].toarray() if hasattr(read[name], "toarray") else read[name]
+        for name in names
+    }
+    np.savez(sys.stdout.buffer, allow_pickle=False, **found)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

@@ -1,0 +1,200 @@
+"""Matrices from files: NumPy's ``.npz``, and ``.mat`` up to MATLAB's v7.
+
+A system ẋ = A x + B u, with the gain K of u = K x if it has one. Of a state space that a file holds
+whole, C must be the identity, D zero and the time continuous: the loop measures x.
+"""
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from noack.config.mat_file import matrices_as_npz
+from noack.config.named_file import NamedFile
+from noack.core.linear_systems import Matrix
+from noack.protocol.wire_format import MAX_DIMENSION
+
+NPZ, MAT = ".npz", ".mat"
+GAIN = "gain"
+_GAINS = (GAIN, "K")
+_MOST_ENTRIES = MAX_DIMENSION**2
+_MOST_BYTES = 16 * _MOST_ENTRIES + 65_536
+"""Of an array within an archive, its header included."""
+_NUMBERS = "fiub"
+
+
+def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapping[str, Any]:
+    """Return a scenario's content in which matrices stand in the place of files that have them.
+
+    ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` A and B.
+    What is no table, or otherwise no scenario, is returned as it is.
+
+    Args:
+        content: of a scenario file.
+        folder: where relative names begin.
+        source: names the content in error messages.
+
+    Raises:
+        CallerError: one line; a file cannot be read, or has no such matrices.
+    """
+    read = dict(content)
+    for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
+        section = content.get(table)
+        if isinstance(section, Mapping) and _can_be_read(section):
+            file = NamedFile(section["file"], folder, f"{source}: {table}")
+            read[table] = _replaced(section, keys, file)
+    return read
+
+
+def _can_be_read(section: Mapping[str, Any]) -> bool:
+    """Whether a file is named, as it should be; what is not is the validation's to refuse."""
+    names = section.get("names", {})
+    return (
+        isinstance(section.get("file"), str)
+        and isinstance(names, Mapping)
+        and all(isinstance(name, str) for name in names.values())
+        and names.keys() <= {"A", "B", GAIN}
+    )
+
+
+def _replaced(
+    section: Mapping[str, Any], keys: tuple[str, ...], file: NamedFile
+) -> Mapping[str, Any]:
+    for key in ("A", "B"):
+        if key in section:
+            file.wrong(f"the file has {key}, and so has the scenario; give one or the other")
+    found = read_matrices(file, dict(section.get("names", {})))
+    rest = {key: value for key, value in section.items() if key not in ("file", "names")}
+    return {key: found[key].tolist() for key in keys if key in found} | rest
+
+
+def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> dict[str, Matrix]:
+    """Read A, B and, if there is one, the gain.
+
+    Args:
+        file: of arrays A, B, and gain or K.
+        names: of the arrays, where they are others.
+
+    Raises:
+        CallerError: the file cannot be read, or has no such matrices; or C is not the identity, D
+            not zero, or dt not.
+    """
+    names = names or {}
+    arrays = _arrays(file)
+    found: dict[str, Matrix] = {}
+    for key in ("A", "B"):
+        name = names.get(key, key)
+        if name not in arrays:
+            file.wrong(_missing(name, arrays))
+        found[key] = _matrix(file, name, arrays[name])
+    if GAIN in names and names[GAIN] not in arrays:
+        file.wrong(_missing(names[GAIN], arrays))
+    gains = [name for name in (_GAINS if GAIN not in names else (names[GAIN],)) if name in arrays]
+    if len(gains) > 1:
+        file.wrong(f'has {" and ".join(gains)}; say which by names = {{ gain = "…" }}')
+    for name in gains:
+        found[GAIN] = _matrix(file, name, arrays[name])
+    C, D, dt = (arrays.get(key) for key in ("C", "D", "dt"))
+    if (why := unfit(C, D, dt, len(found["A"]))) is not None:
+        file.wrong(why)
+    return found
+
+
+def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
+    """Why the rest of a state space is not what the loop is about; None if nothing is wrong.
+
+    Args:
+        C: output matrix, or None.
+        D: feedthrough, or None.
+        dt: sampling time; 0 and None are continuous time.
+        n: number of states.
+    """
+    if dt is not None and np.any(np.asarray(dt) != 0):
+        return (
+            f"dt is {np.asarray(dt).ravel()[0]}, so it is a system in discrete time; "
+            "the loop is in continuous time (MATLAB: d2c)"
+        )
+    if C is not None and (np.shape(C) != (n, n) or not np.array_equal(C, np.eye(n))):
+        return (
+            "C is not the identity, but the loop measures the state; where C has an inverse, "
+            "take C A C^-1 and C B for A and B"
+        )
+    if D is not None and np.any(np.asarray(D) != 0):
+        return "D is not zero, but what the loop measures is the state alone"
+    return None
+
+
+def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
+    """Write matrices to a file that :func:`read_matrices` reads.
+
+    Raises:
+        ValueError: the name ends neither in ``.npz`` nor in ``.mat``.
+    """
+    if path.suffix == NPZ:
+        np.savez(path, allow_pickle=False, **matrices)
+    elif path.suffix == MAT:
+        from scipy.io import savemat  # which takes time and memory, in every process
+
+        savemat(path, dict(matrices))
+    else:
+        raise ValueError(_SUFFIXES)
+
+
+_SUFFIXES = f"must end in {NPZ} (NumPy) or {MAT} (MATLAB)"
+
+
+def _arrays(file: NamedFile) -> dict[str, Any]:
+    if file.path.suffix not in (NPZ, MAT):
+        file.wrong(_SUFFIXES)
+    content = file.content()
+    try:
+        if file.path.suffix == MAT:
+            content = matrices_as_npz(content, _MOST_ENTRIES)
+        return _of_npz(content)
+    except NotImplementedError:
+        file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
+    except Exception:  # whatever the libraries meet in what is no such file
+        file.wrong(f"is no {file.path.suffix} file, or a damaged one")
+
+
+def _of_npz(content: bytes) -> dict[str, Any]:
+    """The arrays that are not too large, by name."""
+    found = {}
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for entry in archive.infolist():
+            name = entry.filename.removesuffix(".npy")
+            if name != entry.filename and entry.file_size <= _MOST_BYTES:
+                array = io.BytesIO(archive.read(entry))
+                version = np.lib.format.read_magic(array)
+                read_header = _HEADERS[version]
+                shape, _, kind = read_header(array)
+                if np.prod(shape, dtype=float) <= _MOST_ENTRIES and kind.kind in _NUMBERS + "c":
+                    array.seek(0)
+                    found[name] = np.lib.format.read_array(array, allow_pickle=False)
+    return found
+
+
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+def _matrix(file: NamedFile, name: str, value: Any) -> Matrix:
+    if value.dtype.kind not in _NUMBERS:
+        file.wrong(f"{name} is not of real numbers")
+    if value.ndim != 2 or not value.size:
+        shape = " x ".join(map(str, value.shape)) or "no"
+        file.wrong(f"{name} has {shape} entries; a matrix is needed, with rows and columns")
+    if not np.isfinite(value).all():
+        file.wrong(f"{name} has entries that are not finite")
+    return np.asarray(value, dtype=np.float64)
+
+
+def _missing(name: str, arrays: Mapping[str, Any]) -> str:
+    listed = ", ".join(list(arrays)[:10]) or "none"
+    most = f"{MAX_DIMENSION} x {MAX_DIMENSION}"
+    return f"has no matrix {name} of numbers, at most {most}; it has {listed}"

@@ -1,0 +1,63 @@
+"""A file that a setting names, relative to the file in which the setting stands."""
+
+import hashlib
+from pathlib import Path
+from typing import NoReturn
+
+from noack.core.errors import CallerError
+from noack.core.regular_file import read_regular
+
+MOST_BYTES = 64 * 2**20
+"""Of a file that is read whole."""
+
+
+class NamedFile:
+    """A file, and where it is named.
+
+    Args:
+        name: as the setting has it.
+        folder: where relative names begin.
+        place: the table in which the key ``file`` stands, for messages, e.g.
+            ``run.toml: network.loss``; without it only the file is named.
+    """
+
+    def __init__(self, name: str, folder: Path, place: str = "") -> None:
+        self.path = folder / name
+        self._named = f'{place}.file = "{name}"' if place else name
+
+    def wrong(self, message: str) -> NoReturn:
+        """Refuse what the file says.
+
+        Raises:
+            CallerError: always.
+        """
+        raise CallerError(f"{self._named}: {message}")
+
+    def content(self) -> bytes:
+        """Return the file's bytes.
+
+        Raises:
+            CallerError: it cannot be read.
+        """
+        try:
+            return read_regular(self.path, MOST_BYTES)
+        except (OSError, ValueError) as error:
+            self._unreadable(error)
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file in hexadecimal digits.
+
+        Raises:
+            CallerError: it cannot be read.
+        """
+        try:
+            if self.path.exists() and not self.path.is_file():
+                self.wrong("cannot be read: not a regular file")
+            with self.path.open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except (OSError, ValueError) as error:
+            self._unreadable(error)
+
+    def _unreadable(self, error: OSError | ValueError) -> NoReturn:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise CallerError(f"{self._named}: cannot be read: {reason}") from None

@@ -1,0 +1,230 @@
+"""From a scenario to a run: named models become matrices, drawn quantities become numbers.
+
+The resolved scenario is a scenario again; running it repeats the run's draws exactly.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from noack.config.named_models import NAMED_MODELS
+from noack.config.observability import observer_gain, unseen_mode
+from noack.config.observers import AnyObserver, Luenberger
+from noack.config.scenario import Scenario
+from noack.config.sections.model_section import Model
+from noack.config.setpoint import input_at
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector, discretise, transition
+from noack.core.random_streams import stream
+from noack.protocol.record_tables import entry_names, tables
+
+_SURELY_FINITE = 600.0
+"""‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is still a number; beyond, the exponential itself must tell."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The matrices of a resolved scenario, in the paper's notation (n states, m inputs)."""
+
+    A_model: Matrix
+    """Â, (n, n)."""
+    B_model: Matrix
+    """B̂, (n, m)."""
+    K: Matrix
+    """Gain, (m, n)."""
+    H: Matrix
+    """What both models integrate between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
+    A: Matrix
+    """True plant, (n, n); Â where the plant is not linear."""
+    B: Matrix
+    """True plant, (n, m); B̂ where the plant is not linear."""
+    x0: Vector
+    """x(0), (n,)."""
+    weight: Matrix | None
+    """W of the trigger's norm, (n, n); None is the identity."""
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    setpoint: Vector | None = None
+    """x_r, (n,); None is 0."""
+    setpoint_input: Vector | None = None
+    """u_r, (m,), with Âx_r + B̂u_r = 0; None is 0."""
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.A)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.B.T)
+
+
+def resolve(scenario: Scenario) -> Scenario:
+    """Return the scenario with every named or drawn quantity made explicit.
+
+    Raises:
+        CallerError: the numbers are so large that one step of the plant or model is not finite; no
+            observer can see in the measured outputs what it would have to; or what the plant's
+            system needs is not installed.
+    """
+    scenario.plant.system.require_installed()
+    model = _explicit_model(scenario.model)
+    A, B = np.array(model.A), np.array(model.B)
+    (n, m), plant = B.shape, scenario.plant
+    x0 = np.array(plant.initial_state)
+    if plant.initial_state_halfwidth is not None:
+        halfwidth = np.array(plant.initial_state_halfwidth)
+        x0 += halfwidth * stream(scenario.seeds.initial_state, "initial_state").uniform(-1, 1, n)
+    if plant.draw == "given":
+        A, B = np.array(plant.A), np.array(plant.B)
+    elif plant.draw in ("uniform", "vertex"):
+        rng = stream(scenario.seeds.plant, "plant")
+        A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
+        B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
+    K = np.array(model.gain)
+    _require_finite("plant", A, B, scenario.plant_period_ns)
+    if scenario.mode == "model":
+        H = np.array(model.A) + np.array(model.B) @ K
+        _require_finite("model", H, K.T, scenario.controller_period_ns)
+    drawn: dict[str, object] = {
+        "initial_state": tuple(x0.tolist()),
+        "initial_state_halfwidth": None,
+    }
+    if scenario.is_linear:
+        drawn |= {"draw": "given", "A": _rows(A), "B": _rows(B)}
+    update = {"model": model, "plant": plant.model_copy(update=drawn)}
+    return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
+
+
+def loop_of(resolved: Scenario) -> Loop:
+    """Return the matrices of a resolved scenario."""
+    model, plant = resolved.model, resolved.plant
+    A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
+    H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
+    weight = resolved.trigger.weight
+    setpoint = setpoint_of(resolved)
+    return Loop(
+        A_model=A_model,
+        B_model=B_model,
+        K=K,
+        H=H,
+        A=A_model if plant.A is None else np.array(plant.A),
+        B=B_model if plant.B is None else np.array(plant.B),
+        x0=np.array(plant.initial_state),
+        weight=None if weight is None else np.array(weight),
+        setpoint=None if setpoint is None else setpoint[0],
+        setpoint_input=None if setpoint is None else setpoint[1],
+        state_names=model.state_names or (),
+        input_names=model.input_names or (),
+    )
+
+
+def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
+    """The set-point x_r, (n,), of a resolved scenario, and u_r, (m,); None if it is 0."""
+    given = resolved.controller.setpoint
+    if not any(given or ()):
+        return None
+    x_r = np.array(given)
+    return x_r, input_at(*resolved.model.matrices, x_r)
+
+
+def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
+    """The row types of the tables that runs of a resolved scenario have."""
+    n, m = resolved.model.dimensions
+    acknowledged, predictive = resolved.is_acknowledged, resolved.is_predictive
+    internal = len(resolved.plant.system.internal_names)
+    disturbed = {one.at for one in resolved.plant.disturbances}
+    return tables(
+        n, m, acknowledged=acknowledged, predictive=predictive, internal=internal,
+        disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
+        outputs=0 if resolved.observer is None else resolved.outputs,
+        inputs_reported=resolved.inputs_reported,
+    )  # fmt: skip
+
+
+def _observer(scenario: Scenario, model: Model) -> AnyObserver | None:
+    """The observer, with a gain where it has poles."""
+    observer = scenario.observer
+    if observer is None:
+        return None
+    A, n = np.array(model.A), len(model.A or ())
+    given = scenario.plant.measurement.C
+    C = np.eye(n) if given is None else np.array(given)
+    period_ns = scenario.measurement_period_ns
+    with np.errstate(all="ignore"):
+        step = transition(A, period_ns)
+    if not np.isfinite(step).all():
+        raise CallerError(
+            "model.A: it takes one time between measurements to infinity; check its size"
+        )
+    if (mode := unseen_mode(step, C)) is not None:
+        rate_per_s = np.log(mode) / (period_ns * 1e-9)
+        rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
+        raise CallerError(
+            f"plant.measurement.C: no observer can follow: the mode e^({rate} t) of "
+            "the model does not show in what is measured, and does not decay"
+        )
+    if isinstance(observer, Luenberger) and observer.poles_per_s is not None:
+        try:
+            z = tuple(complex(np.exp(pole * period_ns * 1e-9)) for pole in observer.poles)
+            gain = observer_gain(step, C, z)
+        except ValueError as error:
+            raise CallerError(f"observer.poles_per_s: cannot be placed: {error}") from None
+        return observer.model_copy(update={"gain": _rows(gain), "poles_per_s": None})
+    return observer
+
+
+def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
+    with np.errstate(all="ignore"):
+        if np.linalg.norm(A, 1) * step_ns * 1e-9 < _SURELY_FINITE and np.isfinite(B).all():
+            return
+        try:
+            finite = all(np.isfinite(block).all() for block in discretise(A, B, step_ns))
+        except ValueError:  # scipy's word for an exponential of infinite entries
+            finite = False
+    if not finite:
+        sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
+        raise CallerError(
+            f"{key}: these matrices take one step to infinity, with entries of {sizes}; "
+            "check their units"
+        )
+
+
+def _explicit_model(model: Model) -> Model:
+    if model.name is not None:
+        named = NAMED_MODELS[model.name](model.parameters)
+        return Model(
+            A=_rows(named.A),
+            B=_rows(named.B),
+            gain=model.gain or _rows(named.K),
+            state_names=model.state_names or named.state_names,
+            input_names=model.input_names or named.input_names,
+            allow_unstable=model.allow_unstable,
+        )
+    n, m = np.array(model.B).shape
+    return model.model_copy(
+        update={
+            "state_names": model.state_names or entry_names("x", n),
+            "input_names": model.input_names or entry_names("u", m),
+        }
+    )
+
+
+def _perturbation(
+    rng: np.random.Generator,
+    draw: Literal["uniform", "vertex"],
+    halfwidth: tuple[tuple[float, ...], ...] | None,
+    shape: tuple[int, int],
+) -> Matrix:
+    # Drawn for every entry, so that widening one entry's interval leaves the other draws alone.
+    unit = rng.uniform(-1.0, 1.0, shape)
+    if draw == "vertex":
+        unit = np.where(unit < 0, -1.0, 1.0)
+    return np.zeros(shape) if halfwidth is None else np.array(halfwidth) * unit
+
+
+def _rows(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())

@@ -1,0 +1,189 @@
+"""Scenario files: TOML in, frozen scenario out, and one clear line for every mistake."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+from noack.config import toml_file
+from noack.config.impairment_files import read_impairment, read_loss
+from noack.config.matrix_files import with_matrices
+from noack.config.scenario import Scenario
+from noack.config.sections.network_section import Acknowledgements, Network
+from noack.config.system_files import read_system
+from noack.core.errors import CallerError, printable
+
+_ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
+_ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
+"""Numbers or names in a row, which the TOML writer puts on a line each."""
+
+
+MOST_RECORDED_BYTES = 2**28
+"""Of the scenario file that a run writes, in which losses and delays of files are numbers."""
+
+
+def load(
+    path: Path, overrides: Iterable[str] = (), most_bytes: int = toml_file.MOST_BYTES
+) -> Scenario:
+    """Read and validate a scenario file.
+
+    Args:
+        path: the TOML file.
+        overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
+        most_bytes: that the file may have.
+
+    Raises:
+        CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
+    """
+    content = toml_file.read(path, Scenario, most_bytes)
+    keys = [_apply(content, override) for override in overrides]
+    try:
+        return completed(content, path)
+    except CallerError as error:
+        raise CallerError(_attributed(str(error), path, keys) if keys else str(error)) from None
+
+
+def completed(content: Mapping[str, Any], path: Path, source: str | None = None) -> Scenario:
+    """Validate parsed content and read the files that it names.
+
+    Args:
+        content: of a scenario file.
+        path: of the scenario file; the files that it names lie beside it.
+        source: names the content in error messages; the path unless given.
+
+    Raises:
+        CallerError: one line per mistake.
+    """
+    source = source or str(path)
+    content = with_matrices(content, path.parent, source)
+    return _with_files(validate(content, source), path, source)
+
+
+def validate(content: Mapping[str, Any], source: str) -> Scenario:
+    """Validate parsed content; ``source`` names it in error messages.
+
+    Raises:
+        CallerError: one line per mistake.
+    """
+    return toml_file.validated(Scenario, content, source)
+
+
+def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
+    """Replace the names of files by what they say; relative ones lie beside the scenario."""
+    network, place = scenario.network, f"{source}: network"
+    update: dict[str, Any] = _read(network, path.parent, place)
+    if (back := network.acknowledgements) is not None:
+        read = _read(back, path.parent, f"{place}.acknowledgements")
+        update["acknowledgements"] = back.model_copy(update=read)
+    system = read_system(scenario.plant.system, path.parent, f"{source}: plant.system")
+    return scenario.model_copy(
+        update={
+            "network": network.model_copy(update=update),
+            "plant": scenario.plant.model_copy(update={"system": system}),
+        }
+    )
+
+
+def _read(section: Network | Acknowledgements, folder: Path, place: str) -> dict[str, Any]:
+    impairments = tuple(
+        read_impairment(impairment, folder, f"{place}.impairments.{number}")
+        for number, impairment in enumerate(section.impairments)
+    )
+    return {"loss": read_loss(section.loss, folder, f"{place}.loss"), "impairments": impairments}
+
+
+def dumps(scenario: Scenario) -> str:
+    """Return the scenario as TOML that :func:`load` reads back to an equal scenario."""
+    text = tomli_w.dumps(scenario.model_dump(mode="json", exclude_none=True), indent=2)
+    return _ROW.sub(lambda row: f"[{', '.join(re.findall(_ENTRY, row[1]))}]", text)
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of scenario files, for editors."""
+    return toml_file.json_schema(Scenario)
+
+
+def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
+    """Name ``--set`` where a key that was set is wrong, or the file would be right without it.
+
+    Args:
+        lines: mistakes of a file with settings.
+        path: of the file.
+        keys: that were set.
+    """
+    try:
+        completed(toml_file.read(path), path)
+        alone = True
+    except CallerError:
+        alone = False
+
+    def said_of(line: re.Match[str]) -> str:
+        if any(re.match(rf"{re.escape(key)}[.:=\s]", line["rest"]) for key in keys):
+            return f"--set {line['rest']}"
+        if not alone:
+            return line[0]
+        place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
+        shared = [_shared(place, key.split(".")) for key in keys]
+        nearest = [key for key, parts in zip(keys, shared, strict=True) if parts == max(shared)]
+        return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
+
+    file = re.escape(printable(str(path)))
+    return re.sub(rf"^(?P<file>{file}): (?P<rest>.*)", said_of, lines, flags=re.MULTILINE)
+
+
+def _shared(one: Sequence[str], other: Sequence[str]) -> int:
+    """How many parts two keys begin with alike."""
+    return sum(
+        1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
+    )
+
+
+def _apply(content: dict[str, Any], override: str) -> str:
+    """Put ``key=value`` into the content; return the key."""
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        shown = printable(override)
+        raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
+    put(content, key.strip(), value_of(text, f"--set {key}"), f"--set {override}")
+    return key.strip()
+
+
+def value_of(text: str, source: str) -> Any:
+    """Return the value that a text on the command line stands for; a bare word is a string.
+
+    Raises:
+        CallerError: it is none of TOML; ``source`` names it.
+    """
+    try:
+        return toml_file.parsed(f"value = {text}", source)["value"]
+    except CallerError:
+        if text.lstrip()[:1] in tuple("{[\"'") or text.strip().isdecimal():
+            raise
+        return text
+
+
+def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
+    """Put a value in the place of a key, whose parts dots divide; tables are made as needed.
+
+    Args:
+        content: of a scenario file, changed in place.
+        key: e.g. ``trigger.beta``.
+        value: as parsed from TOML.
+        source: names the setting in error messages.
+
+    Raises:
+        CallerError: part of the key is a value, not a table; or it has too many parts.
+    """
+    table = content
+    *path, last = key.split(".")
+    if len(path) >= toml_file.MOST_LEVELS:
+        raise CallerError(f"{source}: the key has more than {toml_file.MOST_LEVELS} parts")
+    for part in path:
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            whole = " (a list is set as a whole)" if isinstance(table, list) else ""
+            raise CallerError(printable(f"{source}: {part} is not a table{whole}"))
+    table[last] = value

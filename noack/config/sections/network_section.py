@@ -1,0 +1,91 @@
+"""The lossy network between sensor and controller, and the way back of the baseline."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.config.impairments import (
+    Impairment,
+    LinkSettings,
+    Loss,
+    Lossless,
+    LossOf,
+    Mansd,
+    require_scores,
+)
+from noack.config.section import Section
+
+
+class Acknowledgements(Section):
+    """The way back from controller to sensor, of the acknowledgement baseline."""
+
+    loss: Loss = Lossless()
+    """What is lost of the acknowledgements."""
+    mansd: Mansd | None = None
+    """At most so many successive acknowledgements are lost; without it, any number."""
+    impairments: tuple[Impairment, ...] = ()
+    """What else happens to them, in this order, after the loss."""
+    timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
+    """After a transmission, the sensor waits so long for its acknowledgement before it transmits
+    again. By default five measurement periods, and the longest delay there and back."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_scores(self.impairments, self.loss)
+        return self
+
+    @property
+    def link(self) -> LinkSettings:
+        """The link from controller to sensor."""
+        return LinkSettings(
+            impairments=(LossOf(loss=self.loss), *self.impairments), mansd=self.mansd
+        )
+
+
+class Network(Section):
+    """The lossy network between sensor and controller."""
+
+    mansd: Mansd
+    """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
+    loss: Loss
+    """What is lost, before the cap."""
+    impairments: tuple[Impairment, ...] = ()
+    """What else happens to the updates, in this order, after the loss."""
+    limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
+    """At most so many updates are delayed at once; more are dropped."""
+    enforce_mansd: bool = True
+    """false: the network ignores the cap, to see what a violated assumption does."""
+    initial_sync: Literal["first_packet", "known_state"] = "first_packet"
+    """How the paper's delivered t_0 is met. first_packet: the network passes the first packet of a
+    flow. known_state: sensor and controller start from x(0)."""
+    protocol: Literal["none", "ack"] = "none"
+    """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
+    the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
+    acknowledgements: Acknowledgements | None = None
+    """The way back, for protocol = "ack"; by default nothing is lost on it. Of no effect where
+    protocol = "none" is said."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_scores(self.impairments, self.loss)
+        if self.acknowledgements is not None and "protocol" not in self.model_fields_set:
+            raise ValueError(
+                'acknowledgements: there are none unless protocol = "ack"; '
+                'say protocol = "none" to go without'
+            )
+        return self
+
+    @property
+    def way_back(self) -> Acknowledgements:
+        """The way back from controller to sensor, as given or by default."""
+        return self.acknowledgements or Acknowledgements()
+
+    @property
+    def link(self) -> LinkSettings:
+        """The link from sensor to controller."""
+        return LinkSettings(
+            impairments=(LossOf(loss=self.loss), *self.impairments),
+            mansd=self.mansd if self.enforce_mansd else None,
+            first_delivered=self.initial_sync == "first_packet",
+            limit=self.limit,
+        )

@@ -1,0 +1,83 @@
+"""The true plant, and what it does without a controller."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.config.disturbances import AnyDisturbance
+from noack.config.matrices import Row, Rows, require_non_negative
+from noack.config.observers import Measurement
+from noack.config.plant_systems import AnySystem, Linear
+from noack.config.section import Section
+from noack.config.sections.matrix_file_section import require_read
+from noack.config.sections.rates import RateHz, require_whole_period
+
+
+class Watchdog(Section):
+    """What the plant does when no actuation has come for too long."""
+
+    timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
+    """The newest actuation is too old when its model state is older than this, in simulated time;
+    by default 50 periods of the controller."""
+    policy: Literal["hold", "zero", "model"] = "hold"
+    """hold: the plant goes on with the newest input; zero: with none; model: with that which the
+    controller's model asks for, propagated from the newest actuation, which then carries x_c."""
+
+
+class Plant(Section):
+    """The true plant, unknown to sensor and controller, and how it is drawn."""
+
+    system: AnySystem = Linear()
+    """What it is: a table with ``kind``; a linear system unless given."""
+    draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
+    """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
+    one end of its half-width; given: the matrices A and B below."""
+    uncertainty_A: Rows | None = None
+    """Half-widths of the uncertainty box around Â, n x n."""
+    uncertainty_B: Rows | None = None
+    """Half-widths of the uncertainty box around B̂, n x m."""
+    A: Rows | None = None
+    """The true A, n x n, for draw = "given"."""
+    B: Rows | None = None
+    """The true B, n x m, for draw = "given"."""
+    file: str | None = None
+    """An .npz or .mat file of the true A and B, as model.file is."""
+    names: dict[Literal["A", "B"], str] | None = None
+    """Names of the arrays in the file, where they are others."""
+    initial_state: Row
+    """x(0), n entries."""
+    initial_state_halfwidth: Row | None = None
+    """x(0) is drawn uniformly within these distances of initial_state; n entries."""
+    rate_hz: RateHz = 500.0
+    """Steps per second of simulated time."""
+    measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
+    """A measurement is sent every so many steps."""
+    measurement: Measurement = Measurement()
+    disturbances: tuple[AnyDisturbance, ...] = ()
+    """What disturbs it, one added to the other."""
+    watchdog: Watchdog = Watchdog()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_whole_period(self.rate_hz, "rate_hz")
+        require_read(self.file, self.names)
+        for key in ("A", "B"):
+            matrix = getattr(self, key)
+            if self.draw == "given" and matrix is None:
+                raise ValueError(f'{key}: draw = "given" needs both matrices A and B')
+            if self.draw != "given" and matrix is not None:
+                raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
+        if self.draw != "nominal" and not isinstance(self.system, Linear):
+            raise ValueError(
+                f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is'
+            )
+        box = (self.uncertainty_A or ()) + (self.uncertainty_B or ())
+        if self.draw in ("uniform", "vertex") and not box:
+            raise ValueError(
+                f'uncertainty_A: draw = "{self.draw}" needs uncertainty_A or uncertainty_B'
+            )
+        for key in ("uncertainty_A", "uncertainty_B"):
+            for row in getattr(self, key) or ():
+                require_non_negative(row, key)
+        require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
+        return self

@@ -1,0 +1,98 @@
+"""What a run is besides its loop: certificates, recovery, changes, seeds, ports, real time."""
+
+from typing import Annotated, Any, Self
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.config.section import Section, Seed
+from noack.core.clock import NS_PER_S
+
+Port = Annotated[int, Field(ge=0, le=65535)]
+
+
+class Certificate(Section):
+    """What the certificates of a run allow for, beyond the run's own schedule."""
+
+    late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
+    """Updates and inputs may be late by so many steps of the plant."""
+
+
+class Recovery(Section):
+    """What becomes of a run when one of its processes dies."""
+
+    rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
+    """The run goes on without its sensor, controller, network or recorder for so long (wall time),
+    within which another may take its place; the launcher starts one by itself. 0: the run ends.
+    By default 0 for what the launcher has started, and 60 for what people start. Without its plant
+    there is no run."""
+
+
+class ScheduledChange(Section):
+    """Settings that are others from a time on, while the run goes on."""
+
+    at_s: Annotated[FiniteFloat, Field(ge=0, le=1e7)]
+    """Simulated time from which on they are in force."""
+    set: Annotated[dict[str, Any], Field(min_length=1)]
+    """The new values by their keys, e.g. "network.loss.probability" = 0.9: those of network.loss,
+    network.mansd, controller.setpoint, and the numbers of the trigger."""
+
+    @property
+    def at_ns(self) -> int:
+        """That time in nanoseconds."""
+        return round(self.at_s * NS_PER_S)
+
+
+class Seeds(Section):
+    """Seeds of the named random streams; they are independent of each other."""
+
+    plant: Seed = 0
+    """Draw of the true plant from its uncertainty box."""
+    initial_state: Seed = 0
+    """Draw of x(0)."""
+    loss: Seed = 0
+    """The network's losses."""
+    disturbance: Seed = 0
+    """The plant's random disturbances."""
+    noise: Seed = 0
+    """The measurements' noise."""
+
+
+class Ports(Section):
+    """UDP ports on the loopback interface, and the control plane's TCP port; 0 takes a free one."""
+
+    plant: Port = 0
+    """Where the plant receives actuation."""
+    sensor: Port = 0
+    """Where the sensor receives measurements."""
+    netem: Port = 0
+    """Where the network takes the sensor's updates."""
+    controller: Port = 0
+    """Where the controller receives what survives."""
+    control: Port = 0
+    """TCP port of the zenoh control plane."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        taken: dict[int, str] = {}
+        for key in ("plant", "sensor", "netem", "controller"):
+            port = getattr(self, key)
+            if port and port in taken:
+                raise ValueError(
+                    f"{key}: port {port} is already given to {taken[port]}; "
+                    "take another, or 0 for any"
+                )
+            taken[port] = key
+        return self
+
+
+class Realtime(Section):
+    """Real-time settings of the loop's processes; each is taken where the system permits it."""
+
+    enabled: bool = True
+    """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
+    fifo_priority: Annotated[int, Field(ge=1, le=98)] = 50
+    """SCHED_FIFO priority."""
+    pin_cores: bool = True
+    """With SCHED_FIFO: neighbours in the loop run on different cores."""
+    spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
+    """Busy-wait this long before each deadline; starves the others on a shared core."""

@@ -1,0 +1,133 @@
+"""Models from state-space objects of python-control and SciPy, and files of them.
+
+An object has the matrices A, B, C and D and, in discrete time, dt: ``control.StateSpace``,
+``scipy.signal.StateSpace``, or a tuple (A, B, C, D) or (A, B). The loop is in continuous time and
+measures the state, so that C must be the identity and D zero. Its input is u = K x: the gain that
+``control.lqr`` and ``scipy.signal.place_poles`` give is that of u = -K x.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from noack.config.matrices import require_shape
+from noack.config.matrix_files import GAIN, unfit, write_matrices
+from noack.config.sections.model_section import Model, instability
+from noack.config.validation_messages import brief
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix
+
+
+def model_of(
+    system: Any,
+    gain: Any,
+    *,
+    state_names: Sequence[str] | None = None,
+    input_names: Sequence[str] | None = None,
+) -> Model:
+    """Return the model of a loop, to be put into a scenario.
+
+    Args:
+        system: A, (n, n) per second, and B, (n, m), as above.
+        gain: K of u = K x, (m, n).
+        state_names: for plots; by default those of a python-control object that has its own.
+        input_names: likewise.
+
+    Raises:
+        CallerError: the object is no such system; the shapes do not fit; or u = K x does not
+            stabilise it.
+    """
+    states = state_names or _labels(system, "state_labels")
+    inputs = input_names or _labels(system, "input_labels")
+    matrices = matrices_of(system, gain)
+    try:
+        return Model(
+            A=_rows(matrices["A"]),
+            B=_rows(matrices["B"]),
+            gain=_rows(matrices[GAIN]),
+            state_names=None if states is None else tuple(states),
+            input_names=None if inputs is None else tuple(inputs),
+        )
+    except ValidationError as error:
+        raise CallerError(f"the system: {brief(error)}") from None
+
+
+def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
+    """Write a file that ``model.file`` or ``plant.file`` of a scenario can name.
+
+    Args:
+        path: ends in ``.npz`` or ``.mat``.
+        system: as in :func:`model_of`.
+        gain: K of u = K x, (m, n); without it the scenario has to give it.
+
+    Raises:
+        CallerError: as in :func:`model_of`; or the file cannot be written.
+    """
+    try:
+        write_matrices(Path(path), matrices_of(system, gain))
+    except (OSError, ValueError) as error:
+        raise CallerError(f"{path}: cannot be written: {error}") from None
+
+
+def matrices_of(system: Any, gain: Any = None) -> dict[str, Matrix]:
+    """Return the matrices of a system by name: A, (n, n), B, (n, m), and the gain if given, (m, n).
+
+    Args:
+        system: as in :func:`model_of`.
+        gain: K of u = K x, (m, n).
+
+    Raises:
+        CallerError: as in :func:`model_of`.
+    """
+    if isinstance(system, tuple):
+        if len(system) not in (2, 4):
+            raise CallerError(f"the system: a tuple of {len(system)}; give (A, B) or (A, B, C, D)")
+        A, B, C, D = (*system, None, None)[:4]
+        dt = None
+    else:
+        missing = [key for key in ("A", "B", "C", "D") if not hasattr(system, key)]
+        if missing:
+            raise CallerError(
+                f"the system: a {type(system).__name__} has no {missing[0]}; give a state space, "
+                "e.g. with .to_ss(), control.ss, or a tuple (A, B, C, D)"
+            )
+        A, B, C, D, dt = system.A, system.B, system.C, system.D, getattr(system, "dt", None)
+    found = {"A": _matrix("A", A), "B": _matrix("B", B)}
+    n, m = found["B"].shape
+    try:
+        require_shape(_rows(found["A"]), "A", (n, n), "B has a row for each state")
+        if gain is not None:
+            found[GAIN] = _matrix(GAIN, gain)
+            require_shape(_rows(found[GAIN]), GAIN, (m, n), "a row per input, a column per state")
+    except ValueError as error:
+        raise CallerError(f"the system: {error}") from None
+    if (why := unfit(C, D, dt, n)) is not None:
+        raise CallerError(f"the system: {why}")
+    if gain is not None and (why := instability(found["A"], found["B"], found[GAIN])) is not None:
+        raise CallerError(f"gain: {why}")
+    return found
+
+
+def _matrix(name: str, value: Any) -> Matrix:
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CallerError(f"{name}: is not a matrix of real numbers") from None
+    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+        raise CallerError(
+            f"{name}: a matrix of finite numbers is needed, by rows: [[1, 2], [3, 4]]"
+        )
+    return found
+
+
+def _rows(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def _labels(system: Any, key: str) -> Sequence[str] | None:
+    """Names that somebody has given, and not those that python-control numbers by itself."""
+    labels = getattr(system, key, None)
+    return None if not labels or any("[" in label for label in labels) else labels

@@ -1,0 +1,140 @@
+"""Settings files: TOML in, a frozen model out, and one clear line for every mistake."""
+
+import json
+import re
+import tomllib
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import date, time
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from noack.config.validation_messages import explain
+from noack.core.errors import CallerError, printable
+from noack.core.regular_file import read_regular
+
+M = TypeVar("M", bound=BaseModel)
+
+MOST_BYTES = 2**20
+"""Of a settings file."""
+MOST_LEVELS = 32
+"""Parts of a key with dots; and tables and lists that lie one within the other."""
+
+_STRING = re.compile(
+    r"""
+      (?P<comment> \# [^\n]*+ )
+    | \"{3} (?: [^"\\] | \\.? | "(?!"") )*+ (?: \"{3,5} )?
+    | '{3} (?: [^'] | '(?!'') )*+ (?: '{3,5} )?
+    | " (?: [^"\\\n] | \\[^\n]? )*+ "?
+    | ' [^'\n]*+ '?
+    """,
+    re.VERBOSE | re.DOTALL,
+)
+"""Strings and comments of TOML; one that does not end where it must ends where it could have."""
+_TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
+_MOST_LOOKED_AT = 100
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
+
+
+def read(
+    path: Path, model: type[BaseModel] = BaseModel, most_bytes: int = MOST_BYTES
+) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Args:
+        path: of the file.
+        model: what it describes; where there is no such file, the message names files that do.
+        most_bytes: that it may have.
+
+    Raises:
+        CallerError: there is no such file, it is too large, no regular file, or no TOML.
+    """
+    try:
+        text = read_regular(path, most_bytes).decode("utf-8")
+    except FileNotFoundError:
+        raise CallerError(_missing(path, model)) from None
+    except (OSError, ValueError) as error:
+        raise CallerError(f"{path}: cannot be read: {error}") from None
+    return parsed(text, str(path))
+
+
+def parsed(text: str, source: str) -> dict[str, Any]:
+    """Parse TOML; ``source`` names it in error messages.
+
+    A key of n parts takes :mod:`tomllib` memory for n² of them, so that long ones are refused
+    before it sees the text.
+
+    Raises:
+        CallerError: it is no TOML, or a key in it has too many parts.
+    """
+    bare = _STRING.sub(lambda found: "" if found["comment"] else "_", text)
+    if _LONG_KEY.search(bare):
+        raise CallerError(f"{source}: a key has more than {MOST_LEVELS} parts")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise CallerError(f"{source}: {_TOO_DEEP}") from None
+    except ValueError as error:
+        raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
+
+
+def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
+    """Validate parsed content; ``source`` names it in error messages.
+
+    Raises:
+        CallerError: one line per mistake, each with file, key, value and remedy.
+    """
+    if _is_deeper(content, MOST_LEVELS):
+        raise CallerError(f"{source}: {_TOO_DEEP}")
+    try:
+        text = json.dumps(content, default=_unfit)
+    except TypeError as error:
+        raise CallerError(printable(f"{source}: {error}")) from None
+    except ValueError:  # Python writes no integer of thousands of digits
+        raise CallerError(f"{source}: an integer is too large") from None
+    try:
+        # Through JSON, because strict validation takes arrays for tuples only there.
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise CallerError("\n".join(explain(error, source, model))) from None
+
+
+def json_schema(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the JSON Schema of a file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | model.model_json_schema()
+
+
+def _is_deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists lie within each other more than so many levels deep."""
+    if not isinstance(value, dict | list | tuple):
+        return False
+    inner = value.values() if isinstance(value, dict) else value
+    return levels == 0 or any(_is_deeper(one, levels - 1) for one in inner)
+
+
+def _missing(path: Path, model: type[BaseModel]) -> str:
+    """Say that there is no such file, and which files of the same kind are in its folder."""
+    needed = {name for name, field in model.model_fields.items() if field.is_required()}
+    others = []
+    for other in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:
+        with suppress(CallerError):
+            if needed <= read(other).keys():
+                others.append(str(other))
+    names = ", ".join(others[:10])
+    return f"{path}: no such file" + (f"; there are {names}" if names else "")
+
+
+def _unfit(value: object) -> None:
+    """Say why a value is none that JSON has.
+
+    Raises:
+        TypeError: always.
+    """
+    if isinstance(value, type):
+        written = json.dumps({"kind": "python", "file": "my_plant.py", "name": value.__name__})
+        raise TypeError(f"{value.__name__}: a class is given by its file and its name: {written}")
+    if isinstance(value, date | time):
+        raise TypeError(f"{value}: a date or time is no value of a setting; write text in quotes")
+    raise TypeError(f"a value of type {type(value).__name__} is no value of a setting")

@@ -1,0 +1,252 @@
+"""Words for mistakes in a settings file: ``file: key = value: what is wrong; what is right``."""
+
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from noack.core.errors import printable
+
+_PATTERNS = {
+    r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
+    "or digit, at most 64",
+    r"^[a-z][a-z0-9_]{0,31}$": "use small letters, digits and _, beginning with a letter, "
+    "at most 32",
+    r"^[A-Za-z_][\w.:-]*$": "use an entry point's name, or package.module:Class",
+    "^[0-9a-f]{64}$": "use 64 hexadecimal digits, in small letters",
+}
+_MOST_LINES = 50
+_MATRIX = "should be a list; a matrix is a list of rows, e.g. [[0.0, 1.0], [2.0, 3.0]]"
+_LISTS = {
+    float: "should be a list of numbers, e.g. [1.0, 0.0]",
+    int: "should be a list of numbers, e.g. [1, 2]",
+    str: 'should be a list of names, e.g. ["a", "b"]',
+    tuple: _MATRIX,
+}
+"""By what an entry of the list is."""
+_PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
+
+
+def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
+    """Return one line per mistake, and one for all beyond the first fifty.
+
+    Args:
+        error: what the validation raised.
+        source: names the file.
+        root: the model that the whole file was validated against.
+    """
+    mistakes = error.errors(include_url=False)
+    places = [mistake["loc"] for mistake in mistakes]
+    shown = [
+        printable(f"{source}: {_explain(mistake, root)}")
+        for mistake in mistakes[:_MOST_LINES]
+        if not (mistake["type"] == "too_short" and _has_inner(mistake["loc"], places))
+    ]
+    more = len(mistakes) - _MOST_LINES
+    return [*shown, printable(f"{source}: {more} more mistakes")] if more > 0 else shown
+
+
+def brief(error: ValidationError) -> str:
+    """Return the first mistake, ``key: what is wrong``, without the value, which may be secret."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    message = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+    return printable(f"{place}: {message}" if place else message)
+
+
+def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
+    """Whether an entry of this list is itself wrong, which is why the list seems too short."""
+    return any(len(other) > len(place) and other[: len(place)] == place for other in places)
+
+
+def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
+    at = _locate(mistake["loc"], root)
+    key = ".".join(map(str, at.path))
+    value, kind = mistake["input"], mistake["type"]
+    shown = f"{key} = {_show(value)}"
+    if kind == "missing":
+        return f"{key}: missing{_purpose(at.section, str(at.path[-1]))}"
+    if kind == "extra_forbidden":
+        return f"{shown}: unknown key; {_nearest(str(at.path[-1]), at.section)}"
+    if kind == "value_error":
+        return _own_check(key, value, str(mistake["ctx"]["error"]))
+    chosen = kind in ("union_tag_invalid", "union_tag_not_found")
+    if chosen and isinstance(value, Mapping):
+        return _choice(key, value, at)
+    if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
+        return f"{shown}: should be a table{_table_example(at)}"
+    if kind == "too_short":
+        least = mistake["ctx"]["min_length"]
+        return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
+    if kind == "string_pattern_mismatch" and mistake["ctx"]["pattern"] in _PATTERNS:
+        return f"{shown}: {_PATTERNS[mistake['ctx']['pattern']]}"
+    if kind == "tuple_type":
+        return f"{shown}: {_LISTS.get(_entry_of(at), 'should be a list of tables')}"
+    message = mistake["msg"].replace("Input should", "should")
+    return f"{shown}: {message[0].lower() + message[1:]}{_share(value, at)}"
+
+
+class _Place(NamedTuple):
+    """Where in a file something is wrong."""
+
+    path: Sequence[Any]
+    """Of the key."""
+    section: type[BaseModel] | None
+    """In which the key lies."""
+    choices: Mapping[str, type[BaseModel]]
+    """What a table there may be, by the value of the key that chooses."""
+    discriminator: str
+    """The key that chooses."""
+    kind: Any
+    """The annotation of the value."""
+
+
+def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
+    """Find a place; pydantic names chosen tables within the path, which are no keys of the file."""
+    kind: Any = root
+    path: list[Any] = []
+    section: type[BaseModel] | None = None
+    for part in place:
+        choices, _ = _choices(kind)
+        if part in choices:
+            kind = choices[part]
+            continue
+        path.append(part)
+        kind, section = _within(kind, part)
+    return _Place(path, section, *_choices(kind), kind)
+
+
+def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
+    """The annotation of an entry of ``kind``, and the section that it lies in."""
+    section = _section_of(kind)
+    if section is not None:
+        field = section.model_fields.get(str(part))
+        return (None if field is None else field.annotation), section
+    entries = [entry for inner in _alternatives(kind) for entry in get_args(inner)]
+    return (entries[0] if isinstance(part, int) and entries else None), None
+
+
+def _entry_of(at: _Place) -> Any:
+    """What the entries of the list are that a value should be; of a row, what it is itself."""
+    lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
+    if isinstance(at.path[-1], int) or not lists:
+        return tuple
+    entry = _alternatives(get_args(lists[0])[0])[0]
+    return get_origin(entry) or entry
+
+
+def _share(value: Any, at: _Place) -> str:
+    """Suggest a share where a percentage was given for a number that is at most 1."""
+    field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
+    limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
+    if not any(1 in (getattr(one, "le", None), getattr(one, "lt", None)) for one in limits):
+        return ""
+    percent = _PERCENT.fullmatch(value) if isinstance(value, str) else None
+    if percent is not None:
+        value = float(percent[1])
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return f"; {value:g} % is {value / 100:g}" if is_number and 1 < value <= 100 else ""
+
+
+def _metadata(kind: Any) -> list[Any]:
+    """What is said of the alternatives of an annotation, e.g. that they are at most 1."""
+    found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
+    return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """What a value may be, without metadata: A and B for ``Annotated[A | B, ...]``."""
+    if get_origin(kind) is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return [inner for one in get_args(kind) for inner in _alternatives(one)]
+    return [kind]
+
+
+def sections_of(kind: Any) -> list[type[BaseModel]]:
+    """Return the tables that a value of an annotation may be."""
+    return [
+        one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)
+    ]
+
+
+def _section_of(kind: Any) -> type[BaseModel] | None:
+    sections = sections_of(kind)
+    return sections[0] if len(sections) == 1 else None
+
+
+def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
+    """The tables that a value may be, by the key that all of them have a name of their own for."""
+    sections = sections_of(kind)
+    if len(sections) < 2:
+        return {}, ""
+    key = next(
+        name for name, field in sections[0].model_fields.items()
+        if get_origin(field.annotation) is Literal
+    )  # fmt: skip
+    return {get_args(one.model_fields[key].annotation)[0]: one for one in sections}, key
+
+
+def _own_check(key: str, value: Any, message: str) -> str:
+    """A section's own check says ``inner key: what is wrong``."""
+    inner, colon, rest = message.partition(": ")
+    if not colon or not isinstance(value, Mapping):
+        shown = f" = {_show(value)}" if isinstance(value, str) else ""
+        return f"{key}{shown}: {message}"
+    path = f"{key}.{inner}" if key else inner
+    for part in inner.split("."):
+        try:
+            value = value[int(part) if isinstance(value, list) else part]
+        except (KeyError, IndexError, ValueError, TypeError):
+            return f"{path}: {rest}"
+    return f"{path} = {_show(value)}: {rest}"
+
+
+def _choice(key: str, value: Any, at: _Place) -> str:
+    known = ", ".join(at.choices)
+    key = f"{key}.{at.discriminator}"
+    if not isinstance(value, Mapping) or at.discriminator not in value:
+        return f"{key}: missing; one of {known}"
+    chosen = value[at.discriminator]
+    close = difflib.get_close_matches(str(chosen), at.choices, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"{key} = {_show(chosen)}: must be one of {known}{hint}"
+
+
+def _table_example(at: _Place) -> str:
+    if at.choices:
+        chosen = list(at.choices)[1]
+        needed = (
+            f", {name} = ..." for name, field in at.choices[chosen].model_fields.items()
+            if field.is_required() and name != at.discriminator
+        )  # fmt: skip
+        return f', e.g. {{ {at.discriminator} = "{chosen}"{"".join(needed)} }}'
+    in_list = any(isinstance(part, int) for part in at.path)
+    return "" if in_list else f", [{'.'.join(map(str, at.path))}]"
+
+
+def _purpose(section: type[BaseModel] | None, key: str) -> str:
+    """What a missing key is for."""
+    field = section.model_fields.get(key) if section is not None else None
+    inner = _section_of(field.annotation) if field is not None else None
+    text = (inner.__doc__ if inner is not None else field.description if field else None) or ""
+    purpose = " ".join(text.split("\n\n")[0].split()).rstrip(".")
+    if purpose[1:2].islower() or purpose.startswith("A "):  # a word, not M or UDP
+        purpose = purpose[0].lower() + purpose[1:]
+    return f" ({purpose})" if purpose else ""
+
+
+def _nearest(key: str, section: type[BaseModel] | None) -> str:
+    known = sorted(section.model_fields) if section is not None else []
+    close = difflib.get_close_matches(key, known, n=1)
+    return f"did you mean {close[0]}?" if close else f"the keys here are {', '.join(known)}"
+
+
+def _show(value: Any) -> str:
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,68 @@
+"""What sensor and controller integrate between updates: dx/dt = H(x − x_r), exactly.
+
+The set-point x_r may change at times that both know, so that both models change alike.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterable
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Propagator, Vector
+
+
+class ModelFlow:
+    """Takes a model's state from one time to another.
+
+    Args:
+        H: what both models integrate, shape (n, n), per second.
+        steps_ns: steps to prepare now.
+        setpoint: x_r at first, shape (n,); None is 0.
+    """
+
+    def __init__(
+        self, H: Matrix, steps_ns: Iterable[int] = (), setpoint: Vector | None = None
+    ) -> None:
+        self.propagate = Propagator(H, steps_ns)
+        self._since_ns: list[int] = []
+        self._setpoints = [setpoint]
+        self._moved = setpoint is not None
+
+    def change(self, since_ns: int, setpoint: Vector | None) -> None:
+        """Set another set-point from a time on, which is not before those of earlier changes."""
+        if not _same(self._setpoints[-1], setpoint):
+            self._since_ns.append(since_ns)
+            self._setpoints.append(setpoint)
+            self._moved = True
+
+    def setpoint(self, t_ns: int) -> Vector | None:
+        """x_r at a time; None is 0."""
+        return self._setpoints[bisect_right(self._since_ns, t_ns)]
+
+    @property
+    def moved(self) -> bool:
+        """Whether there ever is a set-point other than 0."""
+        return self._moved
+
+    def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
+        """Return the state at ``to_ns`` of a model that is in ``x``, (n,), at ``from_ns``."""
+        if not self._moved:
+            return self.propagate(x, to_ns - from_ns)
+        place = bisect_right(self._since_ns, from_ns)
+        while place < len(self._since_ns) and self._since_ns[place] < to_ns:
+            x = self._about(self._setpoints[place], x, self._since_ns[place] - from_ns)
+            from_ns = self._since_ns[place]
+            place += 1
+        return self._about(self._setpoints[place], x, to_ns - from_ns)
+
+    def _about(self, setpoint: Vector | None, x: Vector, dt_ns: int) -> Vector:
+        if setpoint is None or dt_ns == 0:
+            return self.propagate(x, dt_ns)
+        moved: Vector = setpoint + self.propagate(x - setpoint, dt_ns)
+        return moved
+
+
+def _same(one: Vector | None, other: Vector | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return bool(np.array_equal(one, other))

@@ -1,0 +1,1 @@
+"""What the processes exchange: wire format, topology, machine interface, record tables."""

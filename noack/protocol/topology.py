@@ -1,0 +1,48 @@
+"""The picture: who sends which flow to whom. Nothing else is ever sent in the loop.
+
+plant ──measurement──▶ sensor ──update──▶ netem ──what survives──▶ controller
+▲                                                                    │
+└────────────────────────────── actuation ───────────────────────────┘
+
+The acknowledgement baseline (``network.protocol = "ack"``) has one way more, over the same sockets:
+
+sensor ◀──what survives── netem ◀──acknowledgement── controller
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from noack.protocol.wire_format import Flow
+
+
+class Leg(NamedTuple):
+    """What a process receives, and what it sends to whom."""
+
+    receives: Flow
+    sends: Flow
+    to: str
+
+
+LEGS: Mapping[str, Leg] = {
+    "plant": Leg(Flow.ACTUATION, Flow.MEASUREMENT, "sensor"),
+    "sensor": Leg(Flow.MEASUREMENT, Flow.UPDATE, "netem"),
+    "netem": Leg(Flow.UPDATE, Flow.UPDATE, "controller"),
+    "controller": Leg(Flow.UPDATE, Flow.ACTUATION, "plant"),
+}
+
+SENDER: Mapping[str, str] = {leg.to: role for role, leg in LEGS.items()}
+"""From whom each process receives."""
+
+ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
+"""To whom each process sends acknowledgements, in the acknowledgement baseline alone."""
+
+ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
+"""From whom each process receives them."""
+
+LOOP_ROLES = tuple(LEGS)
+PLANT = "plant"
+CHANGEABLE = ("sensor", "netem", "controller")
+"""Processes whose settings may change during a run."""
+RECORDER = "recorder"
+COORDINATOR = "coordinator"
+ROLES = (*LOOP_ROLES, RECORDER)

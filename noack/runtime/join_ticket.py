@@ -1,0 +1,141 @@
+"""The ticket: what a process needs to join a run, handed over by the launcher.
+
+It holds the run's secret key, so it never travels on a command line or in the environment: the
+launcher writes it to its children's standard input. For processes that a person starts, it lies in
+a file that only its owner can read, in the user's runtime directory.
+"""
+
+import contextlib
+import json
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from pydantic import Field, ValidationError
+
+from noack.config.scenario import Scenario
+from noack.config.section import Section, Seed
+from noack.config.validation_messages import brief
+from noack.core.errors import CallerError, PeerError
+from noack.protocol.wire_format import KEY_BYTES
+from noack.runtime.lock_file import held
+from noack.runtime.private_folder import open_private, private_folder, require_name
+
+DEFAULT_SESSION = "default"
+
+
+class _Fields(Section):
+    """A ticket as JSON."""
+
+    run_id: Seed
+    key: Annotated[str, Field(pattern=rf"^[0-9a-f]{{{2 * KEY_BYTES}}}$")]
+    endpoint: str
+    run_dir: str
+    launched: bool
+    scenario: Scenario
+
+
+class Ticket(NamedTuple):
+    """Admission to a run."""
+
+    run_id: int
+    key: bytes
+    endpoint: str
+    """zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``."""
+    run_dir: str
+    launched: bool
+    """Whether a launcher holds the process's standard input as its lifeline."""
+    scenario: Scenario
+    """Resolved."""
+
+    def fields(self) -> dict[str, Any]:
+        """The ticket as what JSON can hold."""
+        scenario = self.scenario.model_dump(mode="json")
+        return self._asdict() | {"key": self.key.hex(), "scenario": scenario}
+
+    def dumps(self) -> str:
+        """The ticket as one line of JSON."""
+        return json.dumps(self.fields())
+
+
+def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bool) -> Ticket:
+    """Return a ticket with a fresh run id and key."""
+    return Ticket(
+        run_id=secrets.randbits(64),
+        key=secrets.token_bytes(KEY_BYTES),
+        endpoint=endpoint,
+        run_dir=str(run_dir),
+        launched=launched,
+        scenario=scenario,
+    )
+
+
+def loads(text: str) -> Ticket:
+    """Read a ticket back.
+
+    Raises:
+        CallerError: the text is not a ticket.
+    """
+    try:
+        fields = _Fields.model_validate_json(text)
+    except ValidationError as error:
+        raise CallerError(f"not a ticket of this version of noack: {brief(error)}") from None
+    return Ticket(**dict(fields) | {"key": bytes.fromhex(fields.key)})
+
+
+def ticket_path(session: str) -> Path:
+    """Where the ticket of a session lies that a person's processes join.
+
+    Raises:
+        CallerError: the name is not fit for a file.
+    """
+    require_name(session, "session")
+    return private_folder() / f"{session}.json"
+
+
+@contextmanager
+def published(ticket: Ticket, session: str) -> Iterator[Path]:
+    """Keep the ticket in its file, readable by its owner only, while the context lasts.
+
+    The file is locked: of several who publish at once under one name, one succeeds.
+
+    Raises:
+        CallerError: the folder is not the user's own, or another run is open in the session.
+    """
+    path = ticket_path(session)
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held("", session, ticket.fields()))
+        except FileExistsError:
+            raise CallerError(
+                f"session {session!r}: another run is open in it; choose --session NAME"
+            ) from None
+        yield path
+
+
+def wait_for_ticket(
+    session: str, timeout_s: float, stop: Callable[[], bool], on_wait: Callable[[Path], None]
+) -> Ticket:
+    """Wait until a recorder or launcher has published the session's ticket, and return it.
+
+    Raises:
+        CallerError: the folder or the file is not the user's own.
+        PeerError: none came in time.
+    """
+    path = ticket_path(session)
+    deadline_s = time.monotonic() + timeout_s
+    told = False
+    while True:
+        with contextlib.suppress(FileNotFoundError), open_private() as folder:
+            return loads(folder.read_text(path.name))
+        if stop() or time.monotonic() > deadline_s:
+            raise PeerError(
+                f"no run to join in session {session!r}: start `noack record SCENARIO` first"
+            )
+        if not told:
+            on_wait(path)
+            told = True
+        time.sleep(0.05)

@@ -1,0 +1,101 @@
+"""Files that tell of something that runs, and can be reached: its owner's alone, while it runs.
+
+They lie in the user's runtime directory. Whoever puts one there holds a lock on it, which the
+system releases however that process ends; a file without a lock is of one that died, and is removed
+by whoever finds it.
+"""
+
+import fcntl
+import json
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from noack.runtime.private_folder import PrivateFolder, open_private
+
+_SUFFIX = ".json"
+
+
+class Held(NamedTuple):
+    """A file whose owner runs."""
+
+    path: Path
+    written_ns: int
+    content: bytes
+
+
+@contextmanager
+def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
+    """Keep a file while the context lasts.
+
+    Args:
+        kind: folder of the runtime directory that the file lies in; "" for that directory itself.
+        name: of the file, without suffix.
+        content: what it says, as JSON.
+
+    Raises:
+        CallerError: the folder cannot be made, or is not the user's own.
+        FileExistsError: one that runs has a file of this name.
+    """
+    with open_private(*_inside(kind), create=True) as folder:
+        scratch, name = f"{name}.{secrets.token_hex(8)}", name + _SUFFIX
+        with os.fdopen(folder.create(scratch), "w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            json.dump(content, file)
+            file.flush()
+            try:
+                _put(folder, scratch, name)
+            finally:
+                folder.remove(scratch)
+            try:
+                yield folder.path / name
+            finally:
+                folder.remove_same(name, os.fstat(file.fileno()))
+
+
+def running(kind: str) -> list[Held]:
+    """Return the files of a kind whose owner runs, by name.
+
+    Raises:
+        CallerError: the folder, or a file in it, is not the user's own.
+    """
+    try:
+        with open_private(*_inside(kind)) as folder:
+            names = sorted(name for name in folder.names() if name.endswith(_SUFFIX))
+            return [file for name in names if (file := _alive(folder, name)) is not None]
+    except FileNotFoundError:
+        return []
+
+
+def _inside(kind: str) -> tuple[str, ...]:
+    return (kind,) if kind else ()
+
+
+def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
+    """Give the file its name, unless one that runs has it."""
+    for attempt in range(2):
+        try:
+            folder.link(scratch, name)
+            return
+        except FileExistsError:
+            if attempt or _alive(folder, name) is not None:
+                raise
+
+
+def _alive(folder: PrivateFolder, name: str) -> Held | None:
+    """Return a file if its owner runs; the file of one that does not is removed."""
+    try:
+        descriptor = folder.open(name)
+    except FileNotFoundError:
+        return None
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(file.fileno())
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return Held(folder.path / name, status.st_mtime_ns, file.read())
+        folder.remove_same(name, status)
+    return None

@@ -1,0 +1,155 @@
+"""The user's runtime directory: files that only their owner can read.
+
+Without ``XDG_RUNTIME_DIR`` it lies where everybody may write. Whoever uses it therefore opens each
+folder once, checks what has been opened, and reaches files through that descriptor: another user
+who replaces a folder by one of his own, or by a link, replaces nothing that is in use.
+"""
+
+import os
+import re
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+from noack.core.errors import CallerError
+
+
+def private_folder() -> Path:
+    """Return where the user's private files lie; the folder need not exist yet."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(base or tempfile.gettempdir()) / f"noack-{os.getuid()}"
+
+
+def require_name(name: str, what: str) -> None:
+    """Check that a name is fit for a file.
+
+    Raises:
+        CallerError: it is not.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise CallerError(f"{what} {name!r}: use letters, digits, _ and -, at most 64")
+
+
+class PrivateFolder:
+    """An open folder that belongs to the user and is closed to others.
+
+    Args:
+        path: of the folder, for messages and for what runs in this process only.
+        descriptor: of the folder, to be given to functions of :mod:`os` as ``dir_fd``.
+    """
+
+    def __init__(self, path: Path, descriptor: int) -> None:
+        self.path, self.descriptor = path, descriptor
+
+    def create(self, name: str) -> int:
+        """Create a file for writing, in the place of any of this name; return its descriptor."""
+        with suppress(FileNotFoundError):
+            self.remove(name)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        return os.open(name, flags, 0o600, dir_fd=self.descriptor)
+
+    def open(self, name: str) -> int:
+        """Open a file for reading; return its descriptor.
+
+        Raises:
+            CallerError: it is not a file of the user's.
+            FileNotFoundError: there is none.
+        """
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(name, flags, dir_fd=self.descriptor)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise CallerError(f"{self.path / name}: cannot be read ({error.strerror})") from None
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.getuid():
+            os.close(descriptor)
+            raise CallerError(f"{self.path / name}: must be a file of yours")
+        return descriptor
+
+    def read_text(self, name: str) -> str:
+        """Return what a file contains; raises what :meth:`open` raises."""
+        with os.fdopen(self.open(name)) as file:
+            return file.read()
+
+    def names(self) -> list[str]:
+        """Return the names of all files."""
+        return os.listdir(self.descriptor)  # noqa: PTH208 - a Path has no descriptor
+
+    def link(self, name: str, other: str) -> None:
+        """Give a file a second name.
+
+        Raises:
+            FileExistsError: there is a file of that name.
+        """
+        os.link(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+
+    def replace(self, name: str, other: str) -> None:
+        """Rename a file; one that has the other name is removed."""
+        os.replace(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
+
+    def remove(self, name: str) -> None:
+        """Remove a file.
+
+        Raises:
+            FileNotFoundError: there is none.
+        """
+        os.unlink(name, dir_fd=self.descriptor)
+
+    def remove_same(self, name: str, status: os.stat_result) -> None:
+        """Remove a file unless another has taken its place."""
+        with suppress(FileNotFoundError):
+            now = os.stat(name, dir_fd=self.descriptor, follow_symlinks=False)
+            if os.path.samestat(now, status):
+                self.remove(name)
+
+
+@contextmanager
+def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
+    """Open the user's private folder, or one inside it, while the context lasts.
+
+    Args:
+        inside: names of the folders on the way to the one wanted.
+        create: make the folders that do not exist.
+
+    Raises:
+        CallerError: a folder cannot be made, belongs to another user, is a link, or is open to
+            others.
+        FileNotFoundError: it does not exist, and is not to be made.
+    """
+    path = private_folder()
+    with ExitStack() as stack:
+        descriptor: int | None = None
+        for folder in (path, *(path := path / name for name in inside)):
+            name = folder if descriptor is None else folder.name
+            descriptor = _open_folder(folder, name, descriptor, create=create)
+            stack.callback(os.close, descriptor)
+        assert descriptor is not None
+        yield PrivateFolder(path, descriptor)
+
+
+def _open_folder(path: Path, name: Path | str, parent: int | None, *, create: bool) -> int:
+    if create:
+        try:
+            os.mkdir(name, 0o700, dir_fd=parent)
+        except FileExistsError:
+            pass
+        except OSError as error:
+            raise CallerError(f"{path}: cannot be made ({error.strerror})") from None
+    wrong = CallerError(f"{path}: must be a folder of yours, no link, closed to others (mode 700)")
+    try:
+        descriptor = os.open(
+            name, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=parent
+        )
+    except FileNotFoundError:
+        raise
+    except OSError:  # a link, no folder, or one that we may not read
+        raise wrong from None
+    status = os.fstat(descriptor)
+    if status.st_uid != os.getuid() or status.st_mode & 0o077:
+        os.close(descriptor)
+        raise wrong
+    return descriptor

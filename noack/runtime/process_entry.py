@@ -1,0 +1,129 @@
+"""A process's way into a run and out of it: ticket, command line, exit status."""
+
+import argparse
+import json
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+
+from noack.core.errors import ExitStatus, NoackError, NoAnswerError
+from noack.runtime.command_line import Parser, failed
+from noack.runtime.control_plane import Plane
+from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
+from noack.runtime.process_life import HORIZON, Node, lifeline_cut
+from noack.runtime.signals import Signals
+
+_TICKET_TIMEOUT_S = 24 * 3600.0
+"""A person may take long to start the recorder; who does not want to wait, interrupts."""
+
+TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
+
+
+def run_process(
+    role: str,
+    body: Callable[[Node], None],
+    session: str = DEFAULT_SESSION,
+    *,
+    as_json: bool = False,
+) -> ExitStatus:
+    """Join a run as ``role``, do ``body``, and return the exit status.
+
+    A mistake or a peer's fault becomes one line on standard error, with no traceback; ``as_json``
+    also a document on standard output.
+    """
+    with Signals().handled() as signals:
+        try:
+            ticket = _ticket(role, session, signals)
+            node = _admitted(role, ticket, signals)
+            with node.plane:
+                try:
+                    body(node)
+                except Exception as error:
+                    node.fail(error)
+                    raise
+                finally:
+                    node.plane.leave(node.ended)
+        except NoackError as error:
+            if signals.received is None:
+                return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
+        except Exception:
+            traceback.print_exc()
+            print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
+            return ExitStatus.FAILED
+        if signals.received is None and not ticket.launched:
+            print(f"noack {role}: ended: {node.ended}", file=sys.stderr)
+            return ExitStatus.OK if node.ended == HORIZON else ExitStatus.FAILED
+        return signals.status
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that every process takes."""
+    parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
+    parser.add_argument("--json", action="store_true", help="print the final report as JSON")
+
+
+def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
+    """Command line of one process that does nothing but join a run."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    parser = Parser(
+        prog=f"noack {role}",
+        description=f"The {role} of a run: joins the run that `noack record SCENARIO` has opened.",
+    )
+    add_options(parser)
+    try:
+        options = parser.parse_args(given)
+    except NoackError as error:
+        return failed(str(error), error.exit_status, who=f"noack {role}", as_json="--json" in given)
+    return join_run(role, body, options)
+
+
+def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
+    """Join a run with the options of :func:`add_options`."""
+
+    def body_and_report(node: Node) -> None:
+        body(node)
+        if options.json:
+            print(json.dumps(node.report, indent=2))
+
+    return run_process(role, body_and_report, options.session, as_json=options.json)
+
+
+def _ticket(role: str, session: str, signals: Signals) -> Ticket:
+    if os.environ.pop(TICKET_ON_STDIN, None):
+        return loads(sys.stdin.buffer.readline().decode())
+    ticket = wait_for_ticket(
+        session,
+        _TICKET_TIMEOUT_S,
+        lambda: signals.received is not None,
+        lambda path: print(
+            f"noack {role}: waiting for `noack record SCENARIO` (session {session!r}); Ctrl-C ends",
+            file=sys.stderr,
+        ),
+    )
+    print(f"noack {role}: joining run of {ticket.scenario.name!r}", file=sys.stderr)
+    return ticket
+
+
+def _admitted(role: str, ticket: Ticket, signals: Signals) -> Node:
+    """Connect to a run and ask to be let in.
+
+    A launched process tries again as long as its launcher waits. On a busy machine a connection may
+    not come about in time, or without what zenoh should have told of the coordinator; then nothing
+    is ever answered over it.
+
+    Raises:
+        PeerError: this process is not let in, or there is no answer.
+    """
+    while True:
+        try:
+            with ExitStack() as stack:
+                plane = stack.enter_context(Plane(ticket, role))
+                node = Node(role, ticket, plane, signals)
+                node.knock()
+                stack.pop_all()
+                return node
+        except NoAnswerError:
+            if not ticket.launched or signals.received or lifeline_cut():
+                raise

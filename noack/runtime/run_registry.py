@@ -1,0 +1,115 @@
+"""Runs that go on now, and how their owner reaches them from another terminal.
+
+The launcher keeps a file for each (:mod:`noack.runtime.lock_file`). It holds what opens the run's
+control plane, from which the key that authenticates the loop's datagrams cannot be found.
+"""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import zenoh
+from pydantic import TypeAdapter, ValidationError
+
+from noack.config.validation_messages import brief
+from noack.core.errors import CallerError, PeerError
+from noack.runtime import lock_file
+from noack.runtime.control_messages import Answer, heard
+from noack.runtime.control_plane import secret_of
+from noack.runtime.join_ticket import Ticket
+from noack.runtime.zenoh_session import Secret, answer_to, cause_of, open_star
+
+_KIND = "runs"
+_ANSWER_S = 10.0
+
+
+class OpenRun(NamedTuple):
+    """How to reach a run."""
+
+    run_id: str
+    """As its control plane's keys have it."""
+    run_dir: str
+    session: str | None
+    """Name of the session that people's processes join; None if all were launched."""
+    endpoint: str
+    """zenoh endpoint of the control plane."""
+    user: str
+    password: str
+
+
+_OPEN_RUN = TypeAdapter(OpenRun)
+
+
+@contextmanager
+def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
+    """Keep a run's file while the context lasts.
+
+    Raises:
+        CallerError: the folder is not the user's own.
+        OSError: the file cannot be written.
+    """
+    secret = secret_of(ticket)
+    run_id = f"{ticket.run_id:016x}"
+    run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
+    with lock_file.held(_KIND, run_id, run._asdict()) as path:
+        yield path
+
+
+def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
+    """Return the newest run of this user that goes on.
+
+    Args:
+        session: the one of this session.
+        run_dir: the one with this run directory.
+
+    Raises:
+        CallerError: there is none.
+    """
+    newest_first = sorted(lock_file.running(_KIND), key=lambda file: file.written_ns, reverse=True)
+    found = [_read(file) for file in newest_first]
+    fitting = [
+        run
+        for run in found
+        if (session is None or run.session == session)
+        and (run_dir is None or Path(run.run_dir) == run_dir.resolve())
+    ]
+    if fitting:
+        return fitting[0]
+    if not found:
+        raise CallerError("no run goes on; start one, e.g. `noack demo`")
+    which = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
+    others = ", ".join(run.run_dir for run in found)
+    raise CallerError(f"no run goes on {which}; there is {others}")
+
+
+def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Ask a run for a change of settings, or with none what they are; return its answer.
+
+    Raises:
+        CallerError: what was asked for is wrong; one line per mistake.
+        PeerError: the run does not answer.
+    """
+    secret = Secret(run.user, run.password)
+    try:
+        star = open_star(run.endpoint, secret, listen=False)
+    except zenoh.ZError as error:
+        raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
+    try:
+        question = json.dumps({"settings": dict(settings)})
+        answer = answer_to(star, f"noack/{run.run_id}/knobs", question, _ANSWER_S)
+    finally:
+        star.close()  # type: ignore[no-untyped-call]
+    if answer is None:
+        raise PeerError(f"{run.run_dir}: the run does not answer")
+    return heard(Answer, answer)
+
+
+def _read(file: lock_file.Held) -> OpenRun:
+    try:
+        return _OPEN_RUN.validate_json(file.content, strict=True)
+    except ValidationError as error:
+        raise PeerError(
+            f"{file.path}: what tells of a run cannot be read: {brief(error)}"
+        ) from None

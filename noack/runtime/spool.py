@@ -1,0 +1,160 @@
+"""The spool: batches of the record on disk as they arrive, readable up to the last whole one.
+
+One file per table and writer, a sequence of chunks ``first row (u64), bytes (u64), rows``, little
+endian. A killed writer leaves at most one broken chunk at the end, which readers ignore. The same
+rows may come twice, from two writers; row numbers tell.
+"""
+
+import contextlib
+import os
+import struct
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from noack.core.errors import MachineError, why
+
+_CHUNK = struct.Struct("<QQ")
+
+
+class SpoolWriter:
+    """Appends batches to the spool.
+
+    Args:
+        folder: the spool's directory; it is created in the run directory.
+        writer: names this writer's files.
+
+    Raises:
+        MachineError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, writer: str) -> None:
+        self._folder = folder
+        self._writer = writer
+        self._files: dict[str, BinaryIO] = {}
+        with self._named():
+            folder.mkdir(exist_ok=True)
+
+    def append(self, table: str, first: int, payload: bytes) -> None:
+        """Write one batch through to the operating system.
+
+        Raises:
+            MachineError: the disk is full or the folder cannot be written.
+        """
+        with self._named():
+            _write_whole(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
+
+    def prepare(self, tables: Iterable[str]) -> None:
+        """Open the files of tables before there is anything to write.
+
+        Raises:
+            MachineError: the folder cannot be written.
+        """
+        with self._named():
+            for table in tables:
+                self._open(table)
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        """Say why the system refuses, and where."""
+        try:
+            yield
+        except OSError as error:
+            raise MachineError(
+                f"{self._folder}: the record cannot be written: {why(error)}"
+            ) from None
+
+    def require_present(self) -> None:
+        """Check that the files are where they were made; what is written elsewhere is lost.
+
+        Raises:
+            MachineError: one was deleted or moved.
+        """
+        for table, file in self._files.items():
+            path = self._path(table)
+            try:
+                present = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            except FileNotFoundError:
+                present = False
+            if not present:
+                raise MachineError(f"{path}: was deleted or moved during the run")
+
+    def _path(self, table: str) -> Path:
+        return self._folder / f"{table}.{self._writer}"
+
+    def _open(self, table: str) -> BinaryIO:
+        file = self._files.get(table)
+        if file is None:
+            file = self._files[table] = self._path(table).open("ab", buffering=0)
+        return file
+
+    def close(self) -> None:
+        """Close all files."""
+        for file in self._files.values():
+            file.close()
+        self._files.clear()
+
+
+def _write_whole(file: BinaryIO, chunk: bytes) -> None:
+    """Write a chunk whole or not at all: the rest of one must not be read as rows later.
+
+    Raises:
+        OSError: the system does not take all of it; the error says why.
+    """
+    written = 0
+    try:
+        while written < len(chunk):
+            written += file.write(chunk[written:])
+    except OSError:
+        file.truncate(file.tell() - written)
+        raise
+
+
+def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
+    """Yield ``(first row, rows)`` of every whole batch of a table, of all writers."""
+    for path in sorted(folder.glob(f"{table}.*")):
+        with path.open("rb") as file:
+            yield from _whole_chunks(file)
+
+
+class SpoolTail:
+    """Reads a spool while it is written, and what was written before its files were removed.
+
+    Args:
+        folder: the spool's directory; it need not exist yet.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._files: dict[str, BinaryIO] = {}
+
+    def read(self) -> Iterator[tuple[str, int, bytes]]:
+        """Yield ``(table, first row, rows)`` of every whole batch that was not read before."""
+        for path in sorted(self._folder.glob("*.*")):
+            if path.name not in self._files:
+                with contextlib.suppress(FileNotFoundError):  # removed a moment ago
+                    self._files[path.name] = path.open("rb")
+        for name, file in self._files.items():
+            for first, payload in _whole_chunks(file):
+                yield name.partition(".")[0], first, payload
+
+    def close(self) -> None:
+        """Close all files."""
+        for file in self._files.values():
+            file.close()
+        self._files.clear()
+
+
+def _whole_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield the batches that are whole; the file is left after the last of them."""
+    size = os.fstat(file.fileno()).st_size
+    while True:
+        start = file.tell()
+        head = file.read(_CHUNK.size)
+        if len(head) == _CHUNK.size:
+            first, length = _CHUNK.unpack(head)
+            if file.tell() + length <= size:
+                yield first, file.read(length)
+                continue
+        file.seek(start)
+        return

@@ -1,0 +1,309 @@
+"""UDP sockets: bound to loopback, with large kernel buffers, never blocking."""
+
+import errno
+import socket
+import struct
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Generic, TypeVar
+
+from noack.core.errors import CallerError
+from noack.protocol.machine_interface import Notice
+from noack.protocol.wire_format import MAX_DATAGRAM_BYTES, Decoder, Encoder, Flow, Message, flow_of
+from noack.runtime.address import Address, text_of
+from noack.runtime.peer_sockets import FloodWatch, open_beside
+from noack.runtime.unknown_sources import SourceCount
+
+LOOPBACK = "127.0.0.1"
+
+# The default receive buffer holds 256 small datagrams; 4 MiB holds some 10,000. What overflows is
+# lost without a trace, and an unintended loss breaks the MANSD guarantee.
+_BUFFER_BYTES = 4 * 1024 * 1024
+_SO_RCVBUFFORCE = 33
+_STRANGERS_BYTES = 128 * 1024
+"""For the queue of what comes from elsewhere; the kernel doubles it. It holds some 300 datagrams,
+about as many as are looked at between two turns of housekeeping."""
+_STRANGERS_QUEUED = 4096
+"""How many of that queue are looked at in the end: all, unless the flood goes on."""
+_SO_MEMINFO = 55
+_MEMINFO_WORDS = 9
+_MEMINFO_DROPS = 8
+_IN_A_ROW = 8
+"""Datagrams that are looked at before deadlines are again: some 50 µs."""
+SHED = "shed"
+"""Why a datagram was rejected that the kernel dropped, as too many came from elsewhere."""
+MAX_UDP_BYTES = 65_535
+
+T = TypeVar("T")
+
+
+def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
+    """Return a non-blocking UDP socket bound to ``host:port`` (port 0: any free one).
+
+    Args:
+        port: the port.
+        key: the scenario key or option that set the port, for the error message.
+        host: the local address.
+
+    Raises:
+        CallerError: the port is taken or not permitted.
+    """
+    endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        endpoint.bind((host, port))
+    except OSError as error:
+        endpoint.close()
+        reason = {
+            errno.EADDRINUSE: "is already taken by another program",
+            errno.EACCES: "needs privileges that this user does not have",
+        }.get(error.errno or 0, f"cannot be bound ({error.strerror})")
+        raise CallerError(
+            f"UDP port {host}:{port} {reason}; set {key} to another port, or to 0 for any"
+        ) from None
+    endpoint.setblocking(False)
+    enlarge_buffer(endpoint)
+    return endpoint
+
+
+def enlarge_buffer(endpoint: socket.socket) -> int:
+    """Ask for a 4 MiB receive buffer; return what the kernel granted, in bytes."""
+    try:
+        endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
+    except OSError:
+        with suppress(OSError):
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+    return endpoint.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+
+
+def free_tcp_port(host: str = LOOPBACK) -> int:
+    """Return a TCP port that is free now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
+    """Raise CallerError if a TCP port cannot be listened on."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise CallerError(
+                f"control plane: TCP port {host}:{port} cannot be bound ({error.strerror}); "
+                f"set {key} to another port, or to 0 for any"
+            ) from None
+
+
+def drops_of(endpoint: socket.socket) -> int | None:
+    """Datagrams that the kernel dropped at a socket; None if it does not say.
+
+    The count is exact whenever it is asked for, which the one that comes with datagrams
+    (SO_RXQ_OVFL) is only after one more has come; and it costs nothing per datagram.
+    """
+    try:
+        found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
+    except OSError:
+        return None
+    words = struct.unpack(f"={len(found) // 4}I", found[: len(found) // 4 * 4])
+    return words[_MEMINFO_DROPS] if len(words) > _MEMINFO_DROPS else None
+
+
+class CountingSocket(ABC, Generic[T]):
+    """A bound socket with one destination that accounts for what passes through it.
+
+    What it sends with stays unconnected: a connected one would fail a send for an earlier one's
+    ICMP error, which in the network emulator is a loss beyond the cap.
+
+    Args:
+        endpoint: from :func:`bind`.
+        destination: where it sends.
+        peers: who sends to it; what comes from elsewhere is kept apart
+        (:mod:`noack.runtime.peer_sockets`).
+    """
+
+    def __init__(
+        self, endpoint: socket.socket, destination: Address, peers: Sequence[Address]
+    ) -> None:
+        self._endpoint = endpoint
+        self._destination = destination
+        self._peers = frozenset(peers)
+        self._beside = open_beside(endpoint, peers)
+        self._strange: int | None = None
+        if self._beside:
+            self._strange = endpoint.fileno()
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _STRANGERS_BYTES)
+            for one in self._beside:
+                enlarge_buffer(one)
+        self._sockets = {one.fileno(): one for one in (*self._beside, endpoint)}
+        self._everyone = list(self._sockets)
+        self._only_peers = [one.fileno() for one in self._beside]
+        self._flood = FloodWatch()
+        self._sources = SourceCount(peers)
+        self._sent = 0
+        self.send_errors: Counter[str] = Counter()
+        # First what came before there were sockets beside this one: it may be the peers'.
+        self.watched: Sequence[int] = self._everyone[::-1]
+        """File descriptors to wait on now, the most important first."""
+
+    @abstractmethod
+    def judge(self, data: bytes, source: Address) -> T | None:
+        """Return the message that a datagram is, None if it is none; counts what is rejected.
+
+        Args:
+            data: as received, cut at :attr:`most_bytes`.
+            source: from where.
+        """
+
+    most_bytes = MAX_DATAGRAM_BYTES + 1
+    """What is longer than any datagram of the loop is cut, and rejected by its length."""
+
+    def receive(self, readable: int) -> T | None:
+        """Take the next message, and some datagrams before it that are none.
+
+        Args:
+            readable: which of the file descriptors has something.
+
+        Returns:
+            None if there was no message among the next few datagrams.
+        """
+        endpoint, strange = self._sockets[readable], readable == self._strange
+        for _ in range(_IN_A_ROW):
+            try:
+                data, source = endpoint.recvfrom(self.most_bytes)
+            except OSError:  # nothing there any more, or an ICMP error, which is nobody's
+                return None
+            self._sources.add(source)
+            message = self.judge(data, source)
+            if strange and source not in self._peers and self._spend():
+                return message
+            if message is not None:
+                return message
+        return None
+
+    def _spend(self) -> bool:
+        """Note that a stranger's datagram was looked at; whether it was the last for now."""
+        self._flood.left -= 1
+        if self._flood.left > 0:
+            return False
+        self.watched = self._only_peers
+        return True
+
+    def put(self, data: bytes, destination: Address | None = None) -> None:
+        """Send a datagram; a failure is counted, as nobody would learn of it anyway."""
+        try:
+            self._endpoint.sendto(data, destination or self._destination)
+            self._sent += 1
+        except OSError as error:
+            self.send_errors[str(error)] += 1
+
+    def tend(self, now_ns: int) -> Sequence[Notice]:
+        """Begin the next interval of housekeeping; return what the log should say of the last."""
+        if self._strange is None:
+            return ()
+        line = self._flood.next_interval(self._shed())
+        self.watched = self._everyone
+        return () if line is None else (Notice(now_ns, "info", line),)
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        self._look_at_the_rest()
+        receiving = self._beside or (self._endpoint,)
+        drops = [drops_of(one) for one in receiving]
+        return {
+            "local": text_of(self._endpoint.getsockname()),
+            "destination": text_of(self._destination),
+            "sent": self._sent,
+            "send_errors": dict(self.send_errors),
+            "received_from": self._sources.report(),
+            "shielded": bool(self._beside),
+            "lost_in_kernel": None if None in drops else sum(n for n in drops if n is not None),
+        }
+
+    def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
+        """Add to what was rejected what the kernel has shed before anybody looked at it."""
+        shed = {SHED: self._shed()} if self._strange is not None else {}
+        return {reason: n for reason, n in (*by_reason.items(), *shed.items()) if n}
+
+    def close(self) -> None:
+        """Close the sockets that it opened itself."""
+        for one in self._beside:
+            one.close()
+
+    def _shed(self) -> int:
+        return drops_of(self._endpoint) or 0
+
+    def _look_at_the_rest(self) -> None:
+        """Name what was kept waiting, so that every datagram is accounted for."""
+        if self._strange is None:
+            return
+        with suppress(OSError):
+            for _ in range(_STRANGERS_QUEUED):
+                data, source = self._endpoint.recvfrom(self.most_bytes)
+                self._sources.add(source)
+                self.judge(data, source)
+
+
+class MessageSocket(CountingSocket[Message]):
+    """A process's one socket in the loop: receives one flow, sends another.
+
+    Where updates are acknowledged, acknowledgements come or go beside them.
+
+    Args:
+        endpoint: a bound socket, from :func:`bind`.
+        decoder: takes the flow that the process receives.
+        encoder: makes the datagrams that it sends.
+        sends: the flow that it sends.
+        source: who sends to it; what comes from elsewhere is never acted on.
+        destination: where it sends.
+        acknowledgements: takes acknowledgements, and who sends them.
+        acknowledges_to: where it sends them.
+    """
+
+    def __init__(
+        self,
+        endpoint: socket.socket,
+        decoder: Decoder,
+        encoder: Encoder,
+        sends: Flow,
+        *,
+        source: Address,
+        destination: Address,
+        acknowledgements: tuple[Decoder, Address] | None = None,
+        acknowledges_to: Address | None = None,
+    ) -> None:
+        peers = [source] if acknowledgements is None else [source, acknowledgements[1]]
+        super().__init__(endpoint, destination, peers)
+        self._decoder = decoder
+        self._encoder = encoder
+        self._sends = sends
+        self._source = source
+        self._acknowledgements = acknowledgements
+        self._acknowledges_to = acknowledges_to
+
+    def judge(self, data: bytes, source: Address) -> Message | None:
+        """Decode a datagram; see :class:`noack.protocol.wire_format.Decoder`."""
+        if self._acknowledgements is not None and flow_of(data) == Flow.ACKNOWLEDGEMENT:
+            decoder, peer = self._acknowledgements
+            return decoder.decode(data, from_peer=source == peer)
+        return self._decoder.decode(data, from_peer=source == self._source)
+
+    def send(self, message: Message) -> None:
+        """Send a message."""
+        if message.flow is Flow.ACKNOWLEDGEMENT and self._acknowledges_to is not None:
+            self.put(self._encoder.encode(message), self._acknowledges_to)
+            return
+        if message.flow is not self._sends:
+            raise ValueError(f"this process sends {self._sends.name}, not {message.flow.name}")
+        self.put(self._encoder.encode(message))
+
+    def report(self) -> dict[str, object]:
+        """Counters, for the run's summary."""
+        report = super().report() | {"sends": self._sends.name.lower()}
+        rejected = {reason.value: n for reason, n in self._decoder.rejected.items()}
+        report |= {"accepted": self._decoder.accepted, "rejected": self.rejected(rejected)}
+        if self._acknowledgements is not None:
+            report["acknowledgements"] = self._acknowledgements[0].report()
+        return report

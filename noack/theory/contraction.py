@@ -1,0 +1,118 @@
+"""Coordinates in which a linear system contracts: ‖L e^{Gs} Y‖ ≤ ‖L Y‖ e^{−νs}.
+
+Any invertible L will do for which ν, minus the logarithmic norm of L G L^{−1}, is positive: LᵀL is
+a Lyapunov function then. Whatever rounding did to an L that was found, ν is computed after.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from noack.core.linear_systems import Matrix, spectral_abscissa
+
+Stack = NDArray[np.float64]
+
+EPSILON = 8 * float(np.finfo(float).eps)
+"""Times n and the product of the factors' magnitudes: more than the rounding of a product."""
+
+
+class Decay(NamedTuple):
+    """A system's L and ν."""
+
+    factor: Matrix
+    """L, (n, n)."""
+    inverse: Matrix
+    """L^{−1}."""
+    rate_per_s: float
+    """ν > 0."""
+
+    @property
+    def stretch(self) -> float:
+        """‖e^{Gs}‖ ≤ this."""
+        return float(np.linalg.norm(self.factor, 2) * np.linalg.norm(self.inverse, 2))
+
+    def bounds(self, C: Matrix, states: Stack) -> Stack:
+        """Of ‖C e^{Gs} Y‖ at all s ≥ 0, for a stack of Y, (k, n, r) → (k,)."""
+        return self.seen(C) * self.sizes(states)
+
+    def seen(self, C: Matrix) -> float:
+        """‖C L^{−1}‖."""
+        return float(np.linalg.norm(C @ self.inverse, 2))
+
+    def sizes(self, states: Stack) -> Stack:
+        """‖L Y‖ for a stack of Y, (k, n, r) → (k,), in the Frobenius norm."""
+        return frobenius_norms(product(self.factor, states))
+
+
+def decay_of(generator: Matrix) -> Decay | None:
+    """The better one of two that are tried; None if none stands its check to working precision.
+
+    Args:
+        generator: G, (n, n), per second.
+    """
+    rounding = EPSILON * len(generator) * float(np.linalg.norm(generator))
+    if not spectral_abscissa(generator) < -rounding:
+        return None
+    candidates = (_lyapunov_factor(generator), _modal_factor(generator))
+    found = [_checked(generator, factor) for factor in candidates if factor is not None]
+    decays = [decay for decay in found if decay is not None]
+    return min(decays, key=lambda decay: decay.stretch / decay.rate_per_s, default=None)
+
+
+def _checked(generator: Matrix, factor: Matrix) -> Decay | None:
+    """L with its ν, rounding taken off; None if ν is not positive."""
+    try:
+        inverse = np.asarray(np.linalg.inv(factor))
+    except np.linalg.LinAlgError:
+        return None
+    turned = factor @ generator @ inverse
+    # Of the products; and L times its inverse is the identity to the rounding of that product.
+    product = np.abs(factor) @ np.abs(generator) @ np.abs(inverse)
+    identity = np.linalg.norm(np.abs(factor) @ np.abs(inverse)) * np.linalg.norm(turned)
+    rounding = EPSILON * len(generator) * float(np.linalg.norm(product) + identity)
+    if not math.isfinite(rounding):
+        return None
+    rate = -logarithmic_norm(turned) - rounding
+    return Decay(factor, inverse, rate) if rate > 0 else None
+
+
+def _lyapunov_factor(generator: Matrix) -> Matrix | None:
+    """Of (G+νI)ᵀP + P(G+νI) = −I, ν half of G's decay rate; it depends smoothly on G."""
+    from scipy.linalg import cholesky, solve_continuous_lyapunov
+
+    n = len(generator)
+    shifted = generator - 0.5 * spectral_abscissa(generator) * np.eye(n)
+    try:
+        P = solve_continuous_lyapunov(shifted.T, -np.eye(n))
+        return np.asarray(cholesky(0.5 * (P + P.T)))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+
+
+def _modal_factor(generator: Matrix) -> Matrix | None:
+    """The inverse of G's real eigenvectors: best for modes of very different speed."""
+    values, vectors = np.linalg.eig(generator)
+    columns = np.where(values.imag < 0, vectors.imag, vectors.real)
+    try:
+        return np.asarray(np.linalg.inv(columns))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def logarithmic_norm(generator: Matrix) -> float:
+    """μ with ‖e^{Gs}‖ ≤ e^{μs}, for the Euclidean norm."""
+    return float(np.linalg.eigvalsh(0.5 * (generator + generator.T)).max())
+
+
+def product(matrix: Matrix, stack: Stack) -> Stack:
+    """M Y for a stack of Y, (k, n, r) → (k, q, r): one product of M with all columns."""
+    k, n, r = stack.shape
+    columns = stack.transpose(1, 0, 2).reshape(n, k * r)
+    return np.asarray((matrix @ columns).reshape(len(matrix), k, r).transpose(1, 0, 2))
+
+
+def frobenius_norms(stack: Stack) -> Stack:
+    """Of a stack of matrices, (k, q, r) → (k,)."""
+    return np.asarray(np.sqrt(np.einsum("kij,kij->k", stack, stack)))

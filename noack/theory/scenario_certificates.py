@@ -1,0 +1,353 @@
+"""Certificates of a scenario: which claims stand, on which assumptions, under which conditions."""
+
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.theory.assumptions import Assumption, below, certificate_assumptions
+from noack.theory.box import BoxGains
+from noack.theory.certificate import (
+    Background,
+    Conditions,
+    Constants,
+    Level,
+    Plant,
+    VoidError,
+    solve,
+)
+from noack.theory.enclosure import NotDecayingError
+from noack.theory.gains import ErrorGains, PlantGains, error_gains
+
+OWN_PLANT = "the scenario's plant"
+BOX = "every plant of the uncertainty box"
+_SLOWER = 0.9
+_SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
+
+_RESOLUTION = 1e-3
+_TOO_LARGE = "the numbers on the way to it are too large or too small for floating point"
+
+Change = Callable[[Conditions, float], Conditions]
+"""Sets a time of the conditions."""
+
+PlantAt = Callable[[ErrorGains, Matrix, float], Plant]
+"""A plant, given the models' side, where x starts, and α."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is guaranteed of a loop."""
+
+    scope: str
+    """Of which plants."""
+    beta: float
+    alpha_per_s: float
+    floor: float
+    weighted: bool
+    """Whether the trigger's norm is weighted."""
+    conditions: Conditions
+    assumptions: tuple[Assumption, ...]
+    constants: Constants | None
+    """None if there is no certificate."""
+    floor_constants: Constants | None
+    """From ``floor_from_s`` on, with ε in the place of βe^{−αt} and no decay."""
+    void: str | None
+    """Why there is no certificate."""
+
+    @property
+    def source(self) -> str:
+        """What to call it beside a claim."""
+        return "certificate" if self.scope == OWN_PLANT else "box certificate"
+
+    @property
+    def floor_from_s(self) -> float:
+        """When βe^{−αt} falls below the floor ε; infinite without a floor."""
+        return _floor_from_s(self.beta, self.alpha_per_s, self.floor)
+
+    @property
+    def inter_event_s(self) -> float | None:
+        """No two events are closer than this."""
+        found = [c.inter_event_s for c in (self.constants, self.floor_constants) if c is not None]
+        known = [value for value in found if value is not None]
+        return min(known) if known and len(known) == len(found) else None
+
+    @property
+    def level(self) -> str:
+        """What bounds of errors are multiples of: βe^{−αt}, or without decay β or the floor ε."""
+        rate = 0.0 if self.constants is None else self.constants.rate_per_s
+        if rate:
+            return f"βe^(−{rate:.3g}t)"
+        return "ε" if self.floor > self.beta else "β"
+
+    def sensor_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_s‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.overshoot * level)
+
+    def controller_error(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖e_c‖_W at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.delta * level)
+
+    def state(self, t_s: Matrix) -> Matrix:
+        """Bound of ‖x‖ at times (k,); NaN without a certificate."""
+        return self._envelope(t_s, lambda c, level: c.state)
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything, as JSON knows it."""
+        found = asdict(self)
+        for key, value in (
+            ("constants", self.constants),
+            ("floor_constants", self.floor_constants),
+        ):
+            found[key] = None if value is None else value._asdict()
+        found["conditions"] = self.conditions._asdict()
+        found["assumptions"] = [assumption._asdict() for assumption in self.assumptions]
+        found["inter_event_s"] = self.inter_event_s
+        found["floor_from_s"] = None if self.floor == 0 else self.floor_from_s
+        return found
+
+    def _envelope(self, t_s: Matrix, scale: Callable[[Constants, float], float]) -> Matrix:
+        if self.constants is None:
+            return np.full(len(t_s), np.nan)
+        level = max(self.beta, self.floor if self.constants.rate_per_s == 0 else 0.0)
+        bound = scale(self.constants, level) * np.exp(-self.constants.rate_per_s * t_s)
+        if self.floor_constants is not None:
+            late = scale(self.floor_constants, self.floor)
+            bound = np.where(t_s < self.floor_from_s, bound, late)
+        return np.asarray(bound)
+
+
+def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
+    return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
+
+
+def certify(resolved: Scenario, conditions: Conditions, start_error: float = 0.0) -> Certificate:
+    """The certificate of a scenario's own plant; see :class:`Scope`."""
+    return own_plant(resolved, start_error).certificate(conditions)
+
+
+def certify_box(
+    resolved: Scenario, conditions: Conditions, start_error: float = 0.0
+) -> Certificate | None:
+    """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
+    scope = box(resolved, start_error)
+    return None if scope is None else scope.certificate(conditions)
+
+
+def own_plant(resolved: Scenario, start_error: float = 0.0) -> "Scope":
+    """A scenario's own plant."""
+    loop = loop_of(resolved)
+
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
+
+    return Scope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
+
+
+def box(resolved: Scenario, start_error: float = 0.0) -> "Scope | None":
+    """All plants in the scenario's uncertainty box; None if it has none."""
+    loop, plant = loop_of(resolved), resolved.plant
+    if plant.uncertainty_A is None and plant.uncertainty_B is None:
+        return None
+    half_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
+    half_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
+
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+        return BoxGains(error, loop.A_model, loop.B_model, half_A, half_B, start, alpha_per_s)
+
+    closed_loop = loop.A_model + loop.B_model @ loop.K
+    return Scope(BOX, resolved, closed_loop, plant_at, start_error)
+
+
+def outside_box(resolved: Scenario) -> str | None:
+    """Where the scenario's plant lies outside its own uncertainty box; None if it does not."""
+    loop, plant = loop_of(resolved), resolved.plant
+    for name, true, model, halfwidth in (
+        ("A", loop.A, loop.A_model, plant.uncertainty_A),
+        ("B", loop.B, loop.B_model, plant.uncertainty_B),
+    ):
+        if plant.uncertainty_A is None and plant.uncertainty_B is None:
+            return None
+        half = np.zeros_like(true) if halfwidth is None else np.array(halfwidth)
+        slack = 1e-12 * (1.0 + np.abs(model))
+        for i, j in np.argwhere(np.abs(true - model) > half + slack):
+            apart = abs(true[i, j] - model[i, j])
+            return (
+                f"the plant lies outside: {name}[{i + 1}, {j + 1}] is {apart:.3g} from the "
+                f"model's, the half-width is {half[i, j]:.3g}"
+            )
+    return None
+
+
+class Scope:
+    """Plants for which certificates are made; what depends on no condition is computed once.
+
+    Args:
+        name: of which plants.
+        resolved: the scenario.
+        closed_loop: A + BK, the box's centre for a box, (n, n).
+        plant_at: gives their gains.
+        start_error: at the start the plant feels an input already, of an earlier run: sup‖u − Kx‖,
+            scaled, as long as it does. The certificate stands only if its own π is no less, and
+            then that input is one of those it is about.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        resolved: Scenario,
+        closed_loop: Matrix,
+        plant_at: PlantAt,
+        start_error: float = 0.0,
+    ) -> None:
+        self._start_error = start_error
+        self.name = name
+        self._resolved = resolved
+        self._loop = loop_of(resolved)
+        self._held = not self._loop.H.any()
+        self._decay = {
+            "the models": math.inf if self._held else -spectral_abscissa(self._loop.H),
+            "A + BK": -spectral_abscissa(closed_loop),
+        }
+        self._plant_at = plant_at
+        self._errors: dict[float, ErrorGains] = {}
+        self._plants: dict[tuple[float, float, bytes], Plant] = {}
+
+    def certificate(self, conditions: Conditions) -> Certificate:
+        """The certificate under some conditions; a void one says why."""
+        trigger = self._resolved.decaying
+        first: Constants | None = None
+        late: Constants | None = None
+        void = None
+        try:
+            with np.errstate(all="ignore"):
+                first = self._first_phase(conditions)
+                if 0 < trigger.floor < trigger.beta and first.rate_per_s == trigger.alpha_per_s:
+                    late = self._after_floor(conditions, first)
+        except (NotDecayingError, VoidError) as error:
+            first, void = None, str(error)
+        except (OverflowError, np.linalg.LinAlgError):
+            first, void = None, _TOO_LARGE
+        if first is not None and first.input_error < self._start_error:
+            void = (
+                f"at its start the input was {self._start_error:.3g} from Kx, and a certificate "
+                f"is of {first.input_error:.3g} at the most"
+            )
+            first, late = None, None
+        if not all(_finite(constants) for constants in (first, late)):
+            first, late, void = None, None, _TOO_LARGE
+        assumptions = certificate_assumptions(
+            self._resolved, conditions, self._decay, self._held, first, void
+        )
+        return Certificate(
+            self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
+            self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
+        )  # fmt: skip
+
+    def largest(self, conditions: Conditions, change: Change, most_s: float = 10.0) -> float:
+        """The largest time for which ``change`` of the conditions leaves a certificate.
+
+        ``most_s`` if there always is one, 0 if there never is.
+        """
+
+        def stands(value_s: float) -> bool:
+            return self.certificate(change(conditions, value_s)).constants is not None
+
+        if stands(most_s):
+            return most_s
+        low, high = 0.0, most_s
+        while high > 1e-6 and high - low > _RESOLUTION * high:
+            middle = math.sqrt(low * high) if low > 0 else high / 4
+            low, high = (middle, high) if stands(middle) else (low, middle)
+        return low
+
+    def _first_phase(self, conditions: Conditions) -> Constants:
+        trigger, decay = self._resolved.decaying, min(self._decay.values())
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        start = self._loop.x0[:, None]
+        if not self._held and below(alpha, decay) and floor < beta:
+            try:
+                return self._solve(conditions, alpha, alpha, start, Level(beta, beta))
+            except NotDecayingError:
+                if floor > 0:
+                    raise
+                return self._slower(conditions, alpha, start)
+        # A slower decay, or none, is certified instead; then no threshold is there to be reached.
+        slower = 0.0 if self._held or floor > 0 else max(_SLOWER * decay, 0.0)
+        level = Level(max(beta, floor), floor or None)
+        return self._solve(conditions, slower, slower, start, level)
+
+    def _slower(self, conditions: Conditions, alpha_per_s: float, start: Matrix) -> Constants:
+        """Bounds that fall more slowly than the threshold: of a box too large for α.
+
+        Raises:
+            NotDecayingError: there are none, either.
+        """
+        for share in _SHARES_OF_ALPHA:
+            rate = share * alpha_per_s
+            with contextlib.suppress(NotDecayingError):
+                level = Level(self._resolved.decaying.beta, None)
+                return self._solve(conditions, rate, rate, start, level)
+        raise NotDecayingError("the uncertainty box is too large for the loop's gains")
+
+    def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
+        """Once the threshold is the floor: from any state the first phase leaves, without decay.
+
+        What the first phase leaves falls like e^{−αt}: what was there τ before t_ε is greater than
+        at t_ε by e^{ατ}. The models' side keeps α, so that its kernels, e^{(H+αI)τ}, bring that
+        factor along wherever something of the first phase reaches into this one.
+        """
+        trigger = self._resolved.decaying
+        beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
+        share, from_s = floor / beta, _floor_from_s(beta, alpha, floor)
+        before_s = max(conditions.sampling_s, first.inter_event_s or 0.0)
+        started = conditions.start_s + before_s <= from_s
+        background = Background(
+            sensor_error=floor * first.overshoot,
+            mismatch=share * first.mismatch,
+            input_error=share * max(first.input_error, 0.0 if started else first.start_error),
+            inter_event_s=first.inter_event_s or 0.0,
+        )
+        found = self._solve(
+            conditions._replace(start_s=max(conditions.start_s - from_s, 0.0)),
+            alpha,
+            0.0,
+            share * first.state * np.eye(self._loop.n),
+            Level(floor, floor),
+            background,
+        )
+        return found._replace(rate_per_s=0.0)
+
+    def _solve(
+        self,
+        conditions: Conditions,
+        error_alpha_per_s: float,
+        plant_alpha_per_s: float,
+        start: Matrix,
+        level: Level,
+        background: Background | None = None,
+    ) -> Constants:
+        if error_alpha_per_s not in self._errors:
+            self._errors[error_alpha_per_s] = error_gains(self._loop, error_alpha_per_s)
+        error = self._errors[error_alpha_per_s]
+        key = (error_alpha_per_s, plant_alpha_per_s, start.tobytes())
+        if key not in self._plants:
+            self._plants[key] = self._plant_at(error, start, plant_alpha_per_s)
+        background = background or Background(input_error=self._start_error)
+        return solve(error, self._plants[key], conditions, level, background)
+
+
+def _finite(constants: Constants | None) -> bool:
+    """Whether every constant is a number; only the inter-event time may be without end."""
+    if constants is None:
+        return True
+    numbers = constants._replace(inter_event_s=None)
+    endless = constants.inter_event_s
+    return all(math.isfinite(v) for v in numbers if v is not None) and not (
+        endless is not None and math.isnan(endless)
+    )

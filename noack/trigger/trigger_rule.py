@@ -1,0 +1,65 @@
+"""All guards of a policy, as data: how the rule that follows an event depends on that event.
+
+A policy is this and nothing else, so that it can be interpreted, sampled, followed exactly and
+compiled, with one meaning.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector, norm
+from noack.trigger.self_triggered_interval import Forecast, interval_ns
+from noack.trigger.trigger_condition import NEVER_NS, Form, Guard, Reserve
+
+
+class Guards(NamedTuple):
+    """A policy's guards; :class:`noack.trigger.trigger_condition.Guard` has the names' meaning."""
+
+    form: Form
+    level: float = 0.0
+    """c ≥ 0; it decays from t₀ = 0 on."""
+    rate_per_s: float = 0.0
+    """ρ ≥ 0."""
+    floor: float = 0.0
+    """f ≥ 0."""
+    from_event: bool = False
+    """Instead, t₀ is the event's time, and c is ‖P z‖ just after it."""
+    grid_ns: float = 0.0
+    reserve: Reserve | None = None
+    idle_ns: float = -math.inf
+    """For so long after an event the comparison does not count."""
+    longest_ns: float = NEVER_NS
+    """So long after an event the next one is due; with a forecast, at the latest."""
+    shortest_ns: float = 0.0
+    """With a forecast: it is not due before."""
+    forecast: Forecast | None = None
+    weight: Matrix | None = None
+    """W of the ‖x‖_W that the forecast begins with, (n, n); None is the identity."""
+
+    @property
+    def fading_per_s(self) -> float:
+        """α of a threshold that decays from the run's start on; of others 0."""
+        return 0.0 if self.from_event else self.rate_per_s
+
+    def after(self, t_ns: float, x: Vector) -> Guard:
+        """The guard after an event, or from the start on.
+
+        Args:
+            t_ns: time of the event.
+            x: the plant's state there, shape (n,).
+        """
+        level, since_ns, due_ns = self.level, 0.0, self.longest_ns
+        if self.from_event:
+            # To the last bit what it is compared with, so that the event itself is not above it.
+            level, since_ns = norm(self.form.up @ np.concatenate([x, np.zeros_like(x)])), t_ns
+        if self.forecast is not None:
+            size = norm(x if self.weight is None else self.weight @ x)
+            due_ns = interval_ns(
+                self.forecast, size, t_ns * 1e-9, self.shortest_ns, self.longest_ns
+            )
+        return Guard(
+            self.form, level, self.rate_per_s, since_ns, self.floor,
+            t_ns + self.idle_ns, t_ns + due_ns, self.grid_ns, self.reserve,
+        )  # fmt: skip

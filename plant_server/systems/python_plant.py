@@ -1,0 +1,197 @@
+"""A class of the user's own, given by its differential equation or stepping by itself.
+
+Its code runs in this process. Whatever it raises ends the plant's motion, not the run.
+"""
+
+import sys
+import traceback
+from collections.abc import Callable
+from importlib import import_module, metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from noack.config.plant_systems import Python
+from noack.config.system_files import unchanged
+from noack.core.errors import CallerError, one_line
+from noack.core.linear_systems import Vector
+from plant_server.ode_integrator import OdeSystem
+from plant_server.system import System, SystemFailedError
+
+GROUP = "noack.plants"
+"""The group of entry points in which packages name their plants."""
+_ALIKE = 1e-6
+"""How far x(0) of the scenario and of the class may be apart, relative to its size."""
+
+
+class PythonSystem:
+    """An object of a user's class, at x(0).
+
+    It has either ``derivative(t_s, z, u)``, dz/dt under the held input, and if z is not x also
+    ``state(x0)`` and ``output(z)``; or ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, and
+    ``z`` if that is to be on record. ``docs/plants.md`` has examples.
+
+    Args:
+        settings: of a loaded scenario.
+        x0: x(0), shape (n,).
+        m: number of inputs.
+
+    Raises:
+        CallerError: there is no such class, it cannot be made, or it is not as it must be.
+    """
+
+    def __init__(self, settings: Python, x0: Vector, m: int) -> None:
+        self._place = f'plant.system.name = "{settings.name}"'
+        self._recorded = len(settings.on_record)
+        parameters = {
+            key: _listed(value) if isinstance(value, tuple) else value
+            for key, value in settings.parameters.items()
+        }
+        try:
+            made, self.about = _found(settings)
+            plant = made(**parameters)
+            self._system = self._system_of(plant, x0, m)
+            self.x, self.z = x0, np.zeros(self._recorded)
+            self._look(self._system)
+        except CallerError:
+            raise
+        except SystemFailedError as error:
+            raise CallerError(str(error)) from None
+        except (Exception, SystemExit) as error:
+            raise CallerError(self._said(error)) from None
+        if not np.all(np.abs(self.x - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
+            raise CallerError(
+                f"{self._place}: x is {self.x.tolist()} at the start; "
+                f"plant.initial_state is {x0.tolist()}"
+            )
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Go on for one step."""
+        try:
+            self._system.advance(u, t_ns, dt_ns)
+            self._look(self._system)
+        except (Exception, SystemExit) as error:
+            if isinstance(error, SystemFailedError):
+                raise
+            raise SystemFailedError(self._said(error)) from None
+
+    def _look(self, system: System) -> None:
+        self.x = _vector("x", system.x, len(self.x))
+        if self._recorded:
+            self.z = _vector("z", system.z, self._recorded)
+
+    def _system_of(self, plant: Any, x0: Vector, m: int) -> System:
+        if hasattr(plant, "derivative") == hasattr(plant, "advance"):
+            both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
+            raise TypeError(f"it has {both} advance; one of them is needed")
+        if hasattr(plant, "advance"):
+            return _Stepping(plant, x0)
+        z0 = np.array(plant.state(x0.copy()) if hasattr(plant, "state") else x0, dtype=np.float64)
+        if z0.ndim != 1:
+            raise ValueError(f"state(x0) has shape {z0.shape}; a vector is needed")
+        if self._recorded and self._recorded != len(z0):
+            raise ValueError(
+                f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}"
+            )
+        derivative = self._derivative(plant, len(z0))
+        derivative(0.0, z0, np.zeros(m))  # what is wrong with it is better known now
+        output = plant.output if hasattr(plant, "output") else np.copy
+        return OdeSystem(derivative, z0, output=output)
+
+    def _derivative(self, plant: Any, size: int) -> Callable[[float, Vector, Vector], Vector]:
+        def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
+            try:
+                found = plant.derivative(t_s, _frozen(z), _frozen(u))
+                return _vector("derivative(t_s, z, u)", found, size)
+            except (Exception, SystemExit) as error:
+                raise SystemFailedError(self._said(error)) from None
+
+        return derivative
+
+    def _said(self, error: BaseException) -> str:
+        """What went wrong, and where in code that is not ours."""
+        frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
+        where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+        return f"{self._place}: {type(error).__name__}: {one_line(error)}{where}"
+
+
+class _Stepping:
+    """An object that steps by itself."""
+
+    def __init__(self, plant: Any, x0: Vector) -> None:
+        self._plant = plant
+        plant.start(x0.copy())
+
+    @property
+    def x(self) -> Any:
+        return self._plant.x
+
+    @property
+    def z(self) -> Any:
+        return self._plant.z
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        self._plant.advance(u.copy(), t_ns * 1e-9, dt_ns * 1e-9)
+
+
+def _frozen(values: Vector) -> Vector:
+    """A copy that cannot be written to: the integrator counts on its own."""
+    copy = values.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+def _vector(what: str, value: Any, size: int) -> Vector:
+    """A copy of what a class returned, if it has the right shape."""
+    given = np.array(value)
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{what} is not of real numbers")
+    found = given.astype(np.float64)
+    if found.shape != (size,):
+        raise ValueError(f"{what} has shape {found.shape}, expected ({size},)")
+    return found
+
+
+def _found(settings: Python) -> tuple[Any, str]:
+    """The class that the settings name, and what it is, in words."""
+    if settings.file is not None:
+        path = unchanged(settings)
+        return _within(_executed(path), settings.name), f"class {settings.name} of {path.name}"
+    module, colon, name = settings.name.partition(":")
+    if colon:
+        return _within(import_module(module), name), f"class {settings.name}"
+    known = metadata.entry_points(group=GROUP)
+    if settings.name not in known.names:
+        there = ", ".join(sorted(known.names)) or "none"
+        raise LookupError(
+            f"no installed package has an entry point of this name in the group {GROUP} (there "
+            f"are: {there}); write package.module:Class, or name a file, too"
+        )
+    entry = known[settings.name]
+    version = f", {entry.dist.name} {entry.dist.version}" if entry.dist else ""
+    return entry.load(), f"class {entry.value}{version}"
+
+
+def _within(module: ModuleType, name: str) -> Any:
+    if not hasattr(module, name):
+        raise LookupError(f"{Path(module.__file__ or module.__name__).name} has no {name}")
+    return getattr(module, name)
+
+
+def _executed(path: Path) -> ModuleType:
+    """A module of its own of a source file; what stands beside it cannot be imported by it."""
+    module = ModuleType(f"noack_plant_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses look there
+    exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
+    return module
+
+
+def _is_ours(frame: traceback.FrameSummary) -> bool:
+    return frame.filename == __file__ or "importlib" in frame.filename
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(one) for one in value] if isinstance(value, tuple) else value

@@ -1,0 +1,134 @@
+"""Random scenarios, small enough that every pattern of dropouts can be tried one by one."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from cosim.analysis.adversary.loss_patterns import Pattern
+from cosim.analysis.adversary.objective import Measure, Objective, measure_of
+from cosim.analysis.adversary.segments import SegmentFlow
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.linear_systems import Matrix
+from tests.noack.theory.loops import System, systems
+
+ALL_LOST = (False,) * 1000
+
+_ATTEMPTS = 6
+_PROBES = (ALL_LOST, (), (False, True) * 500)
+
+
+def scenario_of(
+    system: System, horizon_s: float, mode: str = "model", floor: float = 0.0
+) -> Scenario:
+    """The scenario of a random loop, whose models follow its H."""
+    return resolve(
+        validate(
+            {
+                "name": "random",
+                "mode": mode,
+                "horizon_s": round(horizon_s, 3),
+                "model": {
+                    "A": rows(system.H - system.B @ system.K),
+                    "B": rows(system.B),
+                    "gain": rows(system.K),
+                    "allow_unstable": True,
+                },
+                "plant": {
+                    "draw": "given",
+                    "A": rows(system.A),
+                    "B": rows(system.B),
+                    "initial_state": system.x0.tolist(),
+                },
+                "trigger": {
+                    "beta": system.beta,
+                    "alpha_per_s": system.alpha,
+                    "floor": floor,
+                    "weight": rows(system.weight),
+                },
+                "network": {
+                    "mansd": system.mansd,
+                    "loss": {"model": "bernoulli", "probability": 0.5},
+                    "initial_sync": "known_state" if system.known_start else "first_packet",
+                },
+            },
+            "random",
+        )
+    )
+
+
+def rows(matrix: Matrix) -> list[list[float]]:
+    return [[float(value) for value in row] for row in matrix]
+
+
+@st.composite
+def scenarios(draw: st.DrawFn, most_events: int, **fixed: Any) -> Scenario:
+    """Loops with at most about so many events, and with a threshold low enough for half of that."""
+    system = draw(systems(**{"mismatch": 0.5} | fixed))
+    horizon_s = 20.0 / float(np.abs(np.linalg.eigvals(system.H)).max())
+    mode = draw(st.sampled_from(["model", "model", "model", "zoh"]))
+    floor_share = draw(st.sampled_from([0.0, 0.0, 0.5]))
+    for _ in range(_ATTEMPTS):
+        resolved = scenario_of(system, horizon_s, mode, floor_share * system.beta)
+        probes = [simulate(resolved, pattern).event_s for pattern in _PROBES]
+        event_s = max(probes, key=len)
+        if len(event_s) >= most_events / 2:
+            break
+        system = replace(system, beta=system.beta / 4)
+    if len(event_s) <= most_events:
+        return resolved
+    return resolved.model_copy(update={"horizon_s": float(event_s[most_events]) * 0.999})
+
+
+def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
+    """Run one pattern with the reference simulator, delivering where the cap asks for it."""
+    mansd, known_start = resolved.network.mansd, resolved.network.initial_sync == "known_state"
+    dropped = 0
+
+    def delivered(event: int) -> bool:
+        nonlocal dropped
+        arrives = (event == 0 and not known_start) or dropped >= mansd
+        arrives = arrives or event >= len(wanted) or wanted[event]
+        dropped = 0 if arrives else dropped + 1
+        return arrives
+
+    return simulate_continuous(
+        continuous_loop_of(resolved),
+        horizon_s=resolved.horizon_s,
+        delivered=delivered,
+        known_start=known_start,
+    )
+
+
+def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
+    """All admissible patterns, one after the other, each from the start: nothing is left out.
+
+    Counts like an odometer: the last update that was lost is delivered in the next pattern, and
+    everything after it that may be lost is lost.
+    """
+    first = int(resolved.network.initial_sync == "first_packet")
+    prefix: Pattern = ()
+    while True:
+        run = simulate(resolved, prefix + ALL_LOST)
+        yield run
+        decided = tuple(run.delivered.tolist())
+        lost = [i for i in range(first, len(decided)) if not decided[i]]
+        if not lost:
+            return
+        prefix = (*decided[: lost[-1]], True)
+
+
+def flow_of(
+    resolved: Scenario, objective: Objective
+) -> tuple[ContinuousLoop, Measure, SegmentFlow]:
+    system = continuous_loop_of(resolved)
+    measure = measure_of(system, objective)
+    known_start = resolved.network.initial_sync == "known_state"
+    flow = SegmentFlow(system, measure, resolved.horizon_s, known_start=known_start)
+    return system, measure, flow

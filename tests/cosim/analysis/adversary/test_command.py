@@ -1,0 +1,58 @@
+"""What ``noack adversary`` prints and how it ends."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cosim.cli import app
+from noack.core.errors import ExitStatus
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+SHORT = ["--horizon", "6"]
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    scenario = str(SCENARIOS / "lane_following.toml")
+    result = CliRunner().invoke(app, ["adversary", scenario, *arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_json_tells_everything() -> None:
+    status, stdout, stderr = run("--json", *SHORT)
+    assert status == ExitStatus.OK, stderr
+    document = json.loads(stdout)
+    assert document["horizon_s"] == 6.0
+    assert set(document["worst"]) == {"error", "state", "cost", "inter-event"}
+    for worst in document["worst"].values():
+        assert worst["exact"]
+        assert len(worst["pattern"]) == len(worst["event_s"])
+        assert worst["delivered"] == [i for i, fate in enumerate(worst["pattern"]) if fate == "D"]
+        assert worst["delivered"][0] == 0
+        assert 0 < worst["tightness"] <= 1
+    error = document["worst"]["error"]
+    assert error["lossless"] < error["value"] <= error["certified"]
+    assert document["certificate"]["conditions"]["sampling_s"] == 0
+
+
+def test_a_person_sees_the_patterns_of_one_objective() -> None:
+    status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8", *SHORT)
+    assert status == ExitStatus.OK
+    assert "not all patterns were tried" in stdout
+    assert "D····" in stdout
+    assert "cost" not in stdout
+
+
+def test_values_of_the_scenario_can_be_replaced() -> None:
+    status, stdout, _ = run("--objective", "error", "--set", "network.mansd=0", "--json", *SHORT)
+    assert status == ExitStatus.OK
+    assert json.loads(stdout)["worst"]["error"]["value"] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_mistake_is_one_line() -> None:
+    status, _, stderr = run("--horizon", "-1")
+    assert status == ExitStatus.CALLER
+    assert stderr.startswith("noack: ")
+    assert "horizon_s" in stderr
+    assert len(stderr.splitlines()) == 1

@@ -1,0 +1,64 @@
+"""Values of runs against dense sampling, against scipy's quadrature, and in closed form."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.integrate import quad
+
+from cosim.analysis.adversary.objective import Objective, measure_of
+from cosim.analysis.adversary.pattern_evaluation import evaluate
+from noack.config.scenario import Scenario
+from tests.cosim.analysis.adversary.scenarios import scenarios, simulate
+
+POINTS = 4001
+
+
+@pytest.mark.parametrize("objective", [Objective.ERROR, Objective.STATE])
+@given(resolved=scenarios(12))
+@settings(max_examples=40)
+def test_a_supremum_is_just_above_all_samples(objective: Objective, resolved: Scenario) -> None:
+    """Between samples a norm can only rise by their spacing squared times its curvature."""
+    run = simulate(resolved, (False,) * 20)
+    measure = measure_of(run.system, objective)
+    found = evaluate(run, measure)
+    t_s = np.linspace(0.0, run.horizon_s, POINTS)
+    just_before_s = np.nextafter(run.event_s[run.event_s > 0], 0)
+    t_s = np.sort(np.concatenate([t_s, just_before_s]))
+    samples, level = run.at(t_s), measure.level(t_s)
+    if objective is Objective.ERROR:
+        norms = run.e_c_norm(samples) / run.system.trigger.beta
+    else:
+        norms = np.linalg.norm(samples.x, axis=1)
+    highest = (norms / level).max()
+    assert found.value >= highest * (1 - 1e-9)
+    assert found.value == pytest.approx(highest, rel=1e-3)
+    assert found.at_s is not None
+    at = np.abs(t_s - found.at_s).argmin()
+    assert norms[at] / level[at] == pytest.approx(highest, rel=1e-2)
+
+
+@given(resolved=scenarios(8))
+@settings(max_examples=25)
+def test_the_integral_is_the_quadratures(resolved: Scenario) -> None:
+    run = simulate(resolved, (True, False) * 10)
+
+    def square(t_s: float) -> float:
+        return float(np.sum(run.at(np.array([t_s])).x ** 2))
+
+    stops = [0.0, *run.event_s[run.event_s > 0].tolist(), run.horizon_s]
+    expected = sum(quad(square, a, b, epsabs=1e-13, epsrel=1e-12)[0] for a, b in pairwise(stops))
+    found = evaluate(run, measure_of(run.system, Objective.COST))
+    assert found.value == pytest.approx(expected, rel=1e-10)
+
+
+@given(resolved=scenarios(12))
+@settings(max_examples=20)
+def test_the_shortest_time_between_two_events(resolved: Scenario) -> None:
+    run = simulate(resolved, (False,) * 20)
+    found = evaluate(run, measure_of(run.system, Objective.INTER_EVENT))
+    between_s = [b - a for a, b in pairwise(run.event_s)]
+    assert -found.value == min(between_s, default=math.inf)
+    assert (found.at_s is None) == (not between_s)

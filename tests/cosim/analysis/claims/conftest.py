@@ -1,0 +1,77 @@
+"""Runs whose conditions are known, and ways to spoil their records."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.virtual_time import Network, simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.protocol.wire_format import read_header
+
+MS = 1_000_000
+
+Make = Callable[..., Scenario]
+
+
+def changed(record: RunRecord, **tables: Rows) -> RunRecord:
+    """A record with some tables exchanged."""
+    rows = {table: tables.get(table, record[table]) for table in record.tables}
+    return RunRecord(record.scenario, rows, record.notices, record.reports, record.kind)
+
+
+def of_scenario(record: RunRecord, scenario: Scenario) -> RunRecord:
+    """The same rows, said to be of another scenario."""
+    rows = {table: record[table] for table in record.tables}
+    return RunRecord(scenario, rows, record.notices, record.reports, record.kind)
+
+
+def network_of(decide: Callable[[int], int | None]) -> Network:
+    """A network that decides by an update's number: how many ms it takes, or None."""
+
+    def network(data: bytes, now_ns: int) -> int | None:
+        header = read_header(data)
+        assert header is not None
+        delay_ms = decide(header.sequence)
+        return None if delay_ms is None else delay_ms * MS
+
+    return network
+
+
+@pytest.fixture
+def make() -> Make:
+    """A double integrator with a plant of its own, 100 Hz; ``changes`` by section."""
+
+    def scenario(**changes: Any) -> Scenario:
+        content: dict[str, Any] = {
+            "name": "claims", "horizon_s": 6.0,
+            "model": {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "gain": [[-1.0, -1.8]]},
+            "plant": {
+                "initial_state": [1.0, 0.0], "rate_hz": 100.0, "draw": "given",
+                "A": [[0.0, 1.0], [0.2, 0.1]], "B": [[0.0], [1.1]],
+            },
+            "controller": {"rate_hz": 100.0},
+            "trigger": {"beta": 0.02, "alpha_per_s": 0.25},
+            "network": {"mansd": 2, "loss": {"model": "bernoulli", "probability": 0.5}},
+            "certificate": {"late_periods": 0},
+        }  # fmt: skip
+        for section, values in changes.items():
+            if isinstance(values, dict):
+                content[section] = content[section] | values
+            else:
+                content[section] = values
+        return resolve(validate(content, "test"))
+
+    return scenario
+
+
+@pytest.fixture
+def run(make: Make) -> RunRecord:
+    """A run that keeps to its schedule; 50 events or so."""
+    record = simulate(make())
+    assert np.isfinite(record["plant_step"]["x"]).all()
+    return record

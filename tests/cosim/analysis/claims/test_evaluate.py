@@ -1,0 +1,416 @@
+"""Claims against runs: held, violated, void, each where it should be; none violated by chance."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from cosim.analysis.claims.claim_evaluation import Claim, Claims, ClaimVerdict, as_json
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.linear_systems import spectral_abscissa
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    OWNER,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+from tests.cosim.analysis.claims.conftest import Make, changed, network_of, of_scenario
+
+HELD, VIOLATED, VOID = ClaimVerdict.HELD, ClaimVerdict.VIOLATED, ClaimVerdict.VOID
+
+CERTIFIED = (
+    "the sensor's error follows its threshold",
+    "the controller's error is bounded",
+    "the state is bounded and decays",
+    "events keep their distance",
+)
+
+
+def certified(record: RunRecord) -> dict[str, Claim]:
+    return {c.what: c for c in Claims(record).judge() if c.source == "certificate"}
+
+
+def verdicts(record: RunRecord) -> dict[str, ClaimVerdict]:
+    return {what: claim.verdict for what, claim in certified(record).items()}
+
+
+def from_I1(record: RunRecord) -> list[Claim]:
+    return [claim for claim in Claims(record).judge() if claim.source == "(I1)"]
+
+
+# --- held -----------------------------------------------------------------------------------------
+
+
+def test_a_run_that_keeps_to_its_schedule_holds_what_is_certified(run: RunRecord) -> None:
+    assert verdicts(run) == dict.fromkeys(CERTIFIED, HELD)
+    for claim in Claims(run).judge():
+        assert claim.since_s is None
+        assert claim.ratio is not None
+        assert 0 <= claim.ratio <= 1
+        if claim.certified is not None and claim.what != "events keep their distance":
+            assert claim.observed == pytest.approx(claim.certified * claim.ratio)
+
+
+def test_what_is_observed_is_what_would_have_been_enough(run: RunRecord) -> None:
+    """From the record itself, not from the joined one."""
+    claims, rows = certified(run), run[SENSOR_MEASUREMENT]
+    trigger = run.scenario.trigger
+    growth = np.exp(trigger.alpha_per_s * rows["t_ns"] * 1e-9)
+    errors = np.linalg.norm(rows["x_s"] - rows["x"], axis=1) * growth / trigger.beta
+    assert claims[CERTIFIED[0]].observed == pytest.approx(errors.max(), rel=1e-9)
+    sizes = np.linalg.norm(rows["x"], axis=1) * growth
+    assert claims[CERTIFIED[2]].observed == pytest.approx(sizes.max(), rel=1e-9)
+    event_s = rows["t_ns"][rows["event"] >= 0] * 1e-9
+    assert claims[CERTIFIED[3]].observed == pytest.approx(np.diff(event_s).min(), rel=1e-6)
+
+
+def test_the_identity_s_claims_hold_on_every_run(make: Make) -> None:
+    """Whatever is lost, late or overtaken; even where everything else is void."""
+    network = network_of(lambda n: None if n % 7 else 13 * (n % 5))
+    for mode in ("model", "zoh"):
+        record = simulate(make(mode=mode), network)
+        assert [claim.verdict for claim in from_I1(record)] == [HELD, HELD]
+
+
+def test_a_quiet_run_claims_what_it_can(make: Make) -> None:
+    """One event, at t = 0: there is no time between two."""
+    record = simulate(make(trigger={"beta": 100.0}))
+    claim = certified(record)["events keep their distance"]
+    assert (claim.verdict, claim.ratio, claim.observed) == (HELD, None, None)
+
+
+# --- violated -------------------------------------------------------------------------------------
+
+
+def test_a_run_of_another_plant_violates_what_is_certified_of_this_one(make: Make) -> None:
+    """The certificate is of a plant that is the model and starts a tenth as far away."""
+    run = simulate(make())
+    plant = {"A": [[0.0, 1.0], [0.0, 0.0]], "B": [[0.0], [1.0]], "initial_state": [0.1, 0.0]}
+    other = of_scenario(run, make(plant=plant))
+    claims = certified(other)
+    state = claims["the state is bounded and decays"]
+    assert state.verdict is VIOLATED
+    assert state.since_s == 0.0
+    assert state.ratio is not None
+    assert state.ratio > 1
+    assert claims["events keep their distance"].verdict is VIOLATED
+    assert [claim.verdict for claim in from_I1(other)] == [HELD, HELD]  # it asks for no plant
+
+
+def test_a_violation_is_told_from_its_first_moment_on(run: RunRecord) -> None:
+    rows = run[SENSOR_MEASUREMENT].copy()
+    rows["e_s_norm"][150:152] = 5.0
+    claim = certified(changed(run, **{SENSOR_MEASUREMENT: rows}))[CERTIFIED[0]]
+    assert claim.verdict is VIOLATED
+    assert claim.since_s == pytest.approx(1.5)
+
+
+def test_a_controller_that_is_not_the_model_violates_the_identity(run: RunRecord) -> None:
+    ticks = run[CONTROLLER_STEP].copy()
+    ticks["x_c"][200] += 1e-3
+    claims = from_I1(changed(run, **{CONTROLLER_STEP: ticks}))
+    assert claims[0].verdict is VIOLATED
+    assert claims[0].since_s == pytest.approx(2.01, abs=0.011)
+
+
+def test_a_printed_bound_that_is_exceeded_is_not_refuted(make: Make) -> None:
+    """eq:LossEv3 assumes ‖e_s‖ ≤ βe^{−αt} at all times; tested five times a second, it is not."""
+    lossy = {"loss": {"model": "worst_case"}}
+    seldom = make(plant={"measure_every": 20}, network=lossy, trigger={"beta": 1e-3})
+    record = simulate(seldom)
+    printed = {c.source: c for c in Claims(record).judge()}
+    exceeded = printed["eq:LossEv3"]
+    assert exceeded.verdict is ClaimVerdict.NOT_APPLICABLE
+    assert exceeded.ratio is not None
+    assert exceeded.ratio > 1
+    assert exceeded.since_s is not None
+    assert "continuous trigger" in exceeded.why
+
+
+# --- void -----------------------------------------------------------------------------------------
+
+
+def test_more_losses_than_allowed_make_every_certified_claim_void(make: Make) -> None:
+    record = simulate(make(), network_of(lambda n: None if 10 <= n < 14 else 0))
+    rows = record[SENSOR_MEASUREMENT]
+    one_too_many_s = float(rows["t_ns"][rows["event"] == 12][0] * 1e-9)
+    for claim in certified(record).values():
+        assert claim.verdict is VOID
+        assert claim.since_s == pytest.approx(one_too_many_s)
+        assert claim.why == "4 updates lost in a row, 2 allowed"
+    assert [claim.verdict for claim in from_I1(record)] == [HELD, HELD]
+
+
+def test_what_happens_after_a_claim_is_void_is_not_judged(run: RunRecord) -> None:
+    """And what happened before is."""
+    rows = run[SENSOR_MEASUREMENT].copy()
+    rows["e_s_norm"][[100, 400]] = 5.0
+    late = np.delete(rows, slice(300, 310))
+    for spoilt, verdict, since_s in (
+        (late, VIOLATED, 1.0),
+        (np.delete(late, 100), VOID, 0.99),  # that one is missing, too
+    ):
+        claim = certified(changed(run, **{SENSOR_MEASUREMENT: spoilt}))[CERTIFIED[0]]
+        assert (claim.verdict, claim.since_s) == (verdict, pytest.approx(since_s))
+    rows["e_s_norm"][100] = 0.0
+    claim = certified(changed(run, **{SENSOR_MEASUREMENT: np.delete(rows, slice(300, 310))}))[
+        CERTIFIED[0]
+    ]
+    assert (claim.verdict, claim.since_s) == (VOID, pytest.approx(2.99))
+    assert claim.ratio is not None
+    assert claim.ratio < 1
+
+
+def test_without_a_certificate_the_claim_is_void_and_says_why(make: Make) -> None:
+    record = simulate(make(model={"gain": [[0.0, 0.0]], "allow_unstable": True}, horizon_s=1.0))
+    (claim,) = certified(record).values()
+    assert claim.verdict is VOID
+    assert "grows" in claim.why
+
+
+def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -> None:
+    record = simulate(
+        make(
+            horizon_s=1.0,
+            model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True},
+            plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
+        )
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        claims = Claims(record)
+        document = as_json(claims.judge())
+        envelopes = claims.envelopes()
+    assert {claim["verdict"] for claim in document if claim["source"] == "certificate"} == {"void"}
+    json.dumps(document, allow_nan=False)
+    assert [envelope.label for envelope in envelopes] == ["bound from (I1)"]
+
+
+# --- records that lack something ------------------------------------------------------------------
+
+
+def without(run: RunRecord, *processes: str) -> RunRecord:
+    gone = {table: run[table][:0] for table in run.tables if OWNER[table] in processes}
+    return changed(run, **gone)
+
+
+def test_nothing_is_claimed_of_a_run_without_measurements(run: RunRecord) -> None:
+    assert Claims(without(run, "sensor")).judge() == []
+    assert Claims(without(run, "sensor", "plant", "controller", "netem")).judge() == []
+
+
+@pytest.mark.parametrize("process", ["plant", "controller"])
+def test_without_a_process_no_certified_claim_is_judged(run: RunRecord, process: str) -> None:
+    """What the others recorded may be judged; of the conditions too little is known."""
+    claims = certified(without(run, process))
+    assert set(verdicts(without(run, process)).values()) <= {VOID}
+    for claim in claims.values():
+        assert claim.since_s == 0.0
+
+
+def test_a_controller_that_dies_makes_claims_void_rather_than_violated(make: Make) -> None:
+    """The plant diverges under its last input: nobody promised anything of that."""
+    whole = simulate(make(network={"mansd": 0}), network_of(lambda n: 0))
+    died_ns = 1_500_000_000
+    steps, sensor = whole[PLANT_STEP].copy(), whole[SENSOR_MEASUREMENT].copy()
+    late = steps["t_ns"] > died_ns
+    steps["actuation"][late] = steps["actuation"][~late][-1]
+    steps["x"][late] *= np.exp(steps["t_ns"][late, None] * 1e-9 * 5)
+    sensor["x"][sensor["t_ns"] > died_ns] = steps["x"][late]
+    record = changed(
+        whole,
+        **{PLANT_STEP: steps, SENSOR_MEASUREMENT: sensor},
+        **{
+            table: whole[table][whole[table]["now_ns"] < died_ns - 40_000_000]
+            for table in (CONTROLLER_STEP, CONTROLLER_DELIVERY)
+        },
+    )
+    state = certified(record)["the state is bounded and decays"]
+    assert state.verdict is VOID
+    assert state.since_s is not None
+    assert state.since_s <= died_ns * 1e-9 + 0.03
+
+
+# --- what else is said ----------------------------------------------------------------------------
+
+
+def test_envelopes_are_at_the_measurements(run: RunRecord) -> None:
+    claims = Claims(run)
+    k = len(run[SENSOR_MEASUREMENT])
+    found = {(e.label, e.quantity): e for e in claims.envelopes()}
+    for envelope in found.values():
+        points = 2 if envelope.quantity == "inter_event" else k
+        assert envelope.t_s.shape == envelope.values.shape == (points,)
+    own = "certified for the scenario's plant"
+    assert {("bound from (I1)", "e_c"), (own, "e_c"), (own, "x")} <= set(found)
+    error = claims.joined.e_c_norm
+    known = np.isfinite(found["bound from (I1)", "e_c"].values)
+    assert known.sum() > k - 3
+    for label in ("bound from (I1)", own):
+        bound = found[label, "e_c"].values
+        assert (error[known] <= bound[known] * (1 + 1e-9) + 1e-12).all()
+
+
+def test_a_long_run_s_clock_does_not_violate_the_distance_of_events(run: RunRecord) -> None:
+    """At 1e7 s, a float tells apart 2 ns: differences are taken of whole nanoseconds."""
+    rows = run[SENSOR_MEASUREMENT].copy()
+    rows["t_ns"] += 10**16
+    shifted = Claims(changed(run, **{SENSOR_MEASUREMENT: rows}))
+    _, passed_s = shifted._inter_event_s
+    np.testing.assert_array_equal(passed_s, Claims(run)._inter_event_s[1])
+
+
+def test_numbers_that_are_none_are_null() -> None:
+    claim = Claim("w", "s", "b", math.inf, math.nan, np.float64(0.5), HELD, None, "")
+    (found,) = as_json([claim])
+    assert found == {
+        "what": "w", "source": "s", "bound": "b", "certified": None, "observed": None,
+        "ratio": 0.5, "verdict": "held", "since_s": None, "why": "", "from_s": 0.0, "until_s": None,
+    }  # fmt: skip
+    assert type(found["ratio"]) is float
+
+
+# --- no certificate is violated, whatever the scenario --------------------------------------------
+
+
+@st.composite
+def scenarios(draw: st.DrawFn) -> Scenario:
+    """Loops of every kind with schedules of every kind; late by up to what is allowed."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    n, m = int(rng.integers(1, 4)), int(rng.integers(1, 3))
+    H = rng.uniform(-1, 1, (n, n)) * 2
+    H -= (spectral_abscissa(H) + rng.uniform(0.5, 2)) * np.eye(n)
+    B, K = rng.uniform(-1, 1, (n, m)), rng.uniform(-1, 1, (m, n))
+    apart = draw(st.sampled_from([0.0, 0.1, 0.3]))
+    far_A, far_B = apart * rng.uniform(-1, 1, (n, n)), apart * rng.uniform(-1, 1, (n, m))
+    while spectral_abscissa(H + far_A + far_B @ K) > -0.3:
+        far_A, far_B = far_A / 2, far_B / 2
+    speed = float(np.abs(np.linalg.eigvals(H)).max())
+    step_ns = round(draw(st.sampled_from([2, 5, 10])) / speed) * 1_000_000 + 1_000_000
+    tick_ns = round(step_ns * draw(st.sampled_from([0.5, 1.0, 1.5, 2.0])))
+    beta, decay = draw(st.sampled_from([0.01, 0.1, 0.5])), -spectral_abscissa(H)
+    content: dict[str, Any] = {
+        "name": "random", "horizon_s": 9 / speed, "mode": draw(st.sampled_from(["model", "zoh"])),
+        "model": {"A": (H - B @ K).tolist(), "B": B.tolist(), "gain": K.tolist()},
+        "plant": {
+            "draw": "given", "A": (H - B @ K + far_A).tolist(), "B": (B + far_B).tolist(),
+            "initial_state": rng.uniform(-1, 1, n).tolist(), "rate_hz": 1e9 / step_ns,
+            "measure_every": draw(st.integers(1, 3)),
+        },
+        "controller": {
+            "rate_hz": 1e9 / tick_ns, "phase": draw(st.sampled_from([0.0, 0.5, 0.9])),
+        },
+        "trigger": {
+            "beta": beta, "alpha_per_s": draw(st.sampled_from([0.3, 0.8, 2.0])) * decay,
+            "floor": beta * draw(st.sampled_from([0.0, 0.0, 0.1, 0.99, 2.0])),
+        },
+        "network": {
+            "mansd": draw(st.integers(0, 4)), "loss": {"model": "worst_case"},
+            "initial_sync": draw(st.sampled_from(["first_packet", "known_state"])),
+        },
+        "certificate": {"late_periods": draw(st.integers(0, 3))},
+    }  # fmt: skip
+    return resolve(validate(content, "test"))
+
+
+def hostile(resolved: Scenario, seed: int) -> Any:
+    """Loses all it may, or some, and is as late as is allowed, or less."""
+    rng = np.random.default_rng(seed)
+    late_ns = resolved.certificate.late_periods * resolved.plant_period_ns
+    known = resolved.network.initial_sync == "known_state"
+    share, events, run = float(rng.choice([0.5, 1.0])), 0, 0
+
+    def network(data: bytes, now_ns: int) -> int | None:
+        nonlocal events, run
+        first, events = events == 0, events + 1
+        if (known or not first) and run < resolved.network.mansd and rng.uniform() < share:
+            run += 1
+            return None
+        run = 0
+        # At the tick before the one that would be too late.
+        return int(rng.integers(0, late_ns + 1)) if late_ns else 0
+
+    return network
+
+
+def test_no_simulated_run_violates_its_certificate() -> None:
+    """Nor leaves its conditions, nor the bounds of (I1)."""
+    judged: dict[ClaimVerdict, int] = {}
+
+    @settings(
+        deadline=None, max_examples=20, phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(scenarios(), st.integers(0, 2**32))
+    def check(resolved: Scenario, seed: int) -> None:
+        claims = Claims(simulate(resolved, hostile(resolved, seed)))
+        for claim in claims.judge():
+            if claim.source in ("certificate", "(I1)"):
+                assert claim.verdict is not VIOLATED, claim
+                assert claim.verdict is HELD or claim.bound == "none", claim
+                judged[claim.verdict] = judged.get(claim.verdict, 0) + 1
+
+    check()
+    assert judged[HELD] > 10 * judged.get(VOID, 0)
+
+
+# --- what cannot be judged ------------------------------------------------------------------------
+
+
+def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
+    """They presuppose M − 1; what follows from (I1) alone does not, and is judged to the end."""
+    record = simulate(
+        make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2})
+    )
+    claims = Claims(record).judge()
+    since = {claim.since_s for claim in claims if claim.verdict is VOID}
+    theorems = [claim for claim in claims if claim.source.startswith("Theorem")]
+    assert theorems
+    assert {claim.verdict for claim in theorems} == {VOID}
+    events = record[SENSOR_MEASUREMENT]
+    event_s = events["t_ns"][events["event"] >= 0] * 1e-9
+    # t_0 arrives; of the next ones, the third is too many.
+    assert list(since) == pytest.approx([event_s[3]])
+    assert {claim.verdict for claim in claims if claim.source == "(I1)"} == {HELD}
+
+
+def test_nothing_at_all_is_within_every_bound(make: Make) -> None:
+    """x(0) = 0: every error, and the bounds that follow from the errors, are 0 all along."""
+    record = simulate(make(plant={"initial_state": [0.0, 0.0]}))
+    for claim in Claims(record).judge():
+        assert claim.verdict is HELD, claim
+        assert claim.ratio is None or claim.ratio <= 1
+
+
+def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
+    """The measurements go on when the controller's record ends: from 2 s on ‖e_c‖ is unknown."""
+    ticks, taken = run[CONTROLLER_STEP], run[CONTROLLER_DELIVERY]
+    cut = changed(
+        run, controller_step=ticks[ticks["t_ns"] < 2_000_000_000],
+        controller_delivery=taken[taken["now_ns"] < 2_000_000_000],
+    )  # fmt: skip
+    unknown = [c for c in Claims(cut).judge() if "e_c" in c.bound or c.source == "(I1)"]
+    assert unknown
+    for claim in unknown:
+        assert claim.verdict is not HELD
+        assert claim.since_s is not None
+        assert claim.since_s <= 2.02
+
+
+def test_a_state_beyond_floating_point_is_not_held(make: Make) -> None:
+    unstable = make(
+        model={"A": [[400.0, 0.0], [0.0, 0.0]], "gain": [[0.0, 0.0]], "allow_unstable": True},
+        plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        claims = Claims(simulate(unstable)).judge()
+    assert claims
+    assert all(claim.verdict is not HELD for claim in claims), claims

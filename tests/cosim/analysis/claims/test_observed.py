@@ -1,0 +1,348 @@
+"""What a record shows of the conditions that it was made under: whole records, and spoilt ones."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosim.analysis.claims.condition_reader import observe
+from cosim.analysis.claims.observed_conditions import Observed
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.scenario import Scenario
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NO_SEQUENCE,
+    OWNER,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    tables,
+)
+from noack.theory.certificate import Conditions
+from noack.theory.run_conditions import nominal_conditions
+from tests.cosim.analysis.claims.conftest import Make, changed, network_of
+
+PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]
+
+
+def allowed(record: RunRecord) -> Conditions:
+    return nominal_conditions(record.scenario, 0)
+
+
+def left(record: RunRecord) -> tuple[float, str]:
+    found = observe(record).left(allowed(record))
+    assert found is not None
+    return found
+
+
+def event_s(record: RunRecord, number: int) -> float:
+    rows = record[SENSOR_MEASUREMENT]
+    return float(rows["t_ns"][rows["event"] == number][0] * 1e-9)
+
+
+def busy(
+    step_ns: int, tick_ns: int, every: int, phase: float, sync: str, horizon_s: float, make: Make
+) -> Scenario:
+    """All but every measurement is an event."""
+    return make(
+        horizon_s=horizon_s,
+        plant={"rate_hz": 1e9 / step_ns, "measure_every": every},
+        controller={"rate_hz": 1e9 / tick_ns, "phase": phase},
+        trigger={"beta": 1e-12},
+        network={"initial_sync": sync},
+    )
+
+
+def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make) -> None:
+    @settings(max_examples=60)
+    @given(
+        st.sampled_from(PERIODS_NS), st.sampled_from(PERIODS_NS), st.integers(1, 4),
+        st.sampled_from([0.0, 0.1, 0.5, 0.99]) | st.floats(0, 0.999),
+        st.sampled_from(["first_packet", "known_state"]),
+    )  # fmt: skip
+    def check(step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> None:
+        resolved = busy(step_ns, tick_ns, every, phase, sync, 0.3, make)
+        record = simulate(resolved)
+        assert observe(record).left(nominal_conditions(resolved, 0)) is None
+
+    check()
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "tick_ns", "every", "phase"),
+    [
+        (2_000_000, 2_000_000, 1, 0.5),  # the demo's
+        (2_000_000, 3_000_000, 1, 0.0),
+        (5_000_000, 7_000_000, 3, 0.5),
+        (4_000_000, 5_000_000, 2, 0.0168),
+        (7_000_000, 2_000_000, 1, 0.9),
+        (2_000_000, 2_020_000, 1, 0.3),
+    ],
+)
+def test_a_schedule_s_worst_case_really_happens(
+    step_ns: int, tick_ns: int, every: int, phase: float, make: Make
+) -> None:
+    """What is presupposed is what occurs, to the nanosecond: nothing is allowed for nothing."""
+    resolved = busy(step_ns, tick_ns, every, phase, "first_packet", 1.5, make)
+    seen, presupposed = observe(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
+    for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
+        assert seen[name] == pytest.approx(getattr(presupposed, name), abs=1e-12), name
+
+
+def test_late_periods_are_added() -> None:
+    none, two = (nominal_conditions(_plain(rate), late) for rate, late in ((100.0, 0), (100.0, 2)))
+    assert two.delay_s - none.delay_s == pytest.approx(0.02)
+    assert two.hold_s - none.hold_s == pytest.approx(0.02)
+    assert two.start_s - none.start_s == pytest.approx(0.02)
+    assert (two.sampling_s, two.spacing_s) == (none.sampling_s, none.spacing_s) == (0.01, 0.01)
+
+
+def _plain(rate_hz: float) -> Scenario:
+    from noack.config.resolution import resolve
+    from noack.config.scenario_file import validate
+
+    return resolve(
+        validate(
+            {
+                "name": "plain", "horizon_s": 1.0, "model": {"name": "double_integrator"},
+                "plant": {"initial_state": [1.0, 0.0], "rate_hz": rate_hz},
+                "controller": {"rate_hz": rate_hz},
+                "trigger": {"beta": 0.5, "alpha_per_s": 0.25},
+                "network": {"mansd": 2, "loss": {"model": "lossless"}},
+            },
+            "test",
+        )
+    )  # fmt: skip
+
+
+# --- each condition, left at the right time -------------------------------------------------------
+
+
+def test_too_many_losses_in_a_row_are_told_at_the_one_too_many(make: Make) -> None:
+    lost = {4, 5, 8, 9, 10, 11}  # two are allowed
+    record = simulate(make(), network_of(lambda n: None if n in lost else 0))
+    when_s, why = left(record)
+    assert when_s == pytest.approx(event_s(record, 10))
+    assert why == "4 updates lost in a row, 2 allowed"
+    assert observe(record).summary()["dropouts"] == 4
+
+
+def test_losses_of_the_end_count_although_nothing_follows_them(make: Make) -> None:
+    record = simulate(make(), network_of(lambda n: None if n >= 20 else 0))
+    assert record[SENSOR_MEASUREMENT]["event"].max() > 25
+    when_s, why = left(record)
+    assert when_s == pytest.approx(event_s(record, 22))
+    assert "lost in a row" in why
+
+
+def test_a_late_update_is_told_at_its_event(make: Make) -> None:
+    record = simulate(make(), network_of(lambda n: 33 if n == 7 else 0))
+    when_s, why = left(record)
+    assert when_s == pytest.approx(event_s(record, 7))
+    # 33 ms later, at the tick after that, and the plant's step after the tick.
+    assert why == "an update was felt after 0.04 s, 0.01 s allowed"
+
+
+def test_an_update_that_was_overtaken_is_lost(make: Make) -> None:
+    record = simulate(make(), network_of(lambda n: 2000 if n in (7, 8, 9) else 0))
+    when_s, why = left(record)
+    assert when_s == pytest.approx(event_s(record, 9))
+    assert why == "3 updates lost in a row, 2 allowed"
+
+
+def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
+    """Every other update is just under way long enough for the next one to pass it."""
+    resolved = make()
+    allowance_s = 0.4
+    record = simulate(resolved, network_of(lambda n: 500 if n % 2 else 0))
+    observed = observe(record)
+    taken = set(record[CONTROLLER_DELIVERY]["sequence"].tolist())
+    overtaken = [n for n in range(len(observed.losses.t_s) - 2) if n not in taken]
+    assert overtaken
+    assert observed.losses.runs(0.0).largest() == 1
+    assert observed.losses.runs(allowance_s).largest() == 0
+
+
+def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None:
+    """The network passed it, nobody took it: lost in a socket, or by a controller that died."""
+    whole = simulate(make(), network_of(lambda n: 0))
+    deliveries = whole[CONTROLLER_DELIVERY]
+    record = changed(whole, **{CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})
+    when_s, why = left(record)
+    assert when_s == pytest.approx(event_s(record, 12))
+    assert "an update was felt after" in why
+
+
+def test_missing_measurements_are_told_at_the_last_before_them(run: RunRecord) -> None:
+    rows = run[SENSOR_MEASUREMENT]
+    assert left(changed(run, **{SENSOR_MEASUREMENT: np.delete(rows, slice(100, 103))})) == (
+        pytest.approx(0.99), "no measurement for 0.04 s, 0.01 s allowed",
+    )  # fmt: skip
+    assert left(changed(run, **{SENSOR_MEASUREMENT: rows[5:]})) == (
+        0.0, "no measurement for 0.05 s, 0.01 s allowed",
+    )  # fmt: skip
+    assert left(changed(run, **{SENSOR_MEASUREMENT: rows[:300]})) == (
+        pytest.approx(2.99), "no measurement for 3.01 s, 0.01 s allowed",
+    )  # fmt: skip
+
+
+def held(run: RunRecord, first: int, last: int, by: int) -> RunRecord:
+    """Steps ``first`` to ``last`` − 1 hold inputs ``by`` steps older than they did."""
+    steps = run[PLANT_STEP].copy()
+    steps["actuation"][first:last] -= by
+    return changed(run, **{PLANT_STEP: steps})
+
+
+def test_an_old_input_is_told_when_it_is_too_old(run: RunRecord) -> None:
+    assert observe(run).summary()["hold_s"] == pytest.approx(0.015)
+    assert left(held(run, 200, 210, 3)) == (
+        pytest.approx(2.0), "an input was 0.045 s old, 0.015 s allowed",
+    )  # fmt: skip
+
+
+def test_an_input_of_the_future_is_too_far_from_now_as_well(run: RunRecord) -> None:
+    """A plant that is late by 3.5 steps latches what the controller meant for later."""
+    assert observe(held(run, 200, 203, -2)).left(allowed(run)) is None
+    assert left(held(run, 200, 203, -4)) == (
+        pytest.approx(2.0), "an input was 0.035 s old, 0.015 s allowed",
+    )  # fmt: skip
+
+
+def test_an_update_that_the_model_had_late_is_late_even_if_the_plant_was_later(
+    run: RunRecord,
+) -> None:
+    deliveries = run[CONTROLLER_DELIVERY].copy()
+    deliveries["model_t_ns"][5] += 30_000_000
+    when_s, why = left(changed(run, **{CONTROLLER_DELIVERY: deliveries}))
+    assert when_s == pytest.approx(deliveries["t_ns"][5] * 1e-9)
+    assert why == "an update was felt after 0.03 s, 0.01 s allowed"
+
+
+def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
+    for sync in ("first_packet", "known_state"):
+        resolved = make(network={"initial_sync": sync})
+        record = simulate(resolved, network_of(lambda n: 500 if n < 3 else 0))
+        found = observe(record)
+        if sync == "known_state":  # nobody has to tell the controller where to begin
+            assert found.start_s == pytest.approx(0.01)
+            continue
+        assert found.start_s > 0.01
+        when_s, why = left(record)
+        assert when_s == 0.0
+        assert why.startswith("the plant felt no input until")
+
+
+def test_what_the_start_brings_late_is_the_start_s(make: Make) -> None:
+    """The first update, 60 ms late, is felt with the first input of all."""
+    record = simulate(make(trigger={"beta": 0.1}), network_of(lambda n: 0 if n else 60))
+    assert event_s(record, 1) > 0.07
+    found = observe(record)
+    assert found.start_s == pytest.approx(0.07)
+    assert found.delay.largest() == pytest.approx(0.01)
+
+
+# --- records that lack something ------------------------------------------------------------------
+
+
+def without(run: RunRecord, *processes: str) -> RunRecord:
+    gone = {table: run[table][:0] for table in run.tables if OWNER[table] in processes}
+    return changed(run, **gone)
+
+
+@pytest.mark.parametrize("process", ["plant", "sensor", "controller"])
+def test_without_a_process_nothing_is_certain(run: RunRecord, process: str) -> None:
+    when_s, _ = left(without(run, process))
+    assert when_s == 0.0
+
+
+def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
+    run: RunRecord,
+) -> None:
+    whole, blind = observe(run), observe(without(run, "netem"))
+    assert blind.losses.runs(0.0).largest() == whole.losses.runs(0.0).largest() == 2
+    assert blind.hold.largest() == whole.hold.largest()
+
+
+def test_an_empty_record_has_conditions_too(run: RunRecord) -> None:
+    empty = without(run, "plant", "sensor", "netem", "controller")
+    found = observe(empty)
+    assert set(found.summary().values()) == {None}
+    assert found.left(allowed(run)) is not None
+
+
+def until(run: RunRecord, end_s: float, *names: str) -> RunRecord:
+    cut = {name: run[name][run[name]["now_ns"] < end_s * 1e9] for name in names}
+    return changed(run, **cut)
+
+
+def test_a_controller_that_died_holds_its_last_input_for_ever(make: Make) -> None:
+    """Its own last rows are lost with it; the plant's record of its inputs is not."""
+    run = simulate(make(), network_of(lambda n: 0))
+    died_s, known_s = 3.0, 2.96
+    steps = run[PLANT_STEP].copy()
+    last = int(steps["actuation"][steps["t_ns"] < died_s * 1e9].max())
+    steps["actuation"] = np.minimum(steps["actuation"], last)
+    record = until(
+        until(changed(run, **{PLANT_STEP: steps}), died_s, PLANT_ACTUATION),
+        known_s, CONTROLLER_STEP, CONTROLLER_DELIVERY,
+    )  # fmt: skip
+    found = observe(record)
+    assert found.hold.largest() == pytest.approx(6.01 - 2.985)  # the last tick before it died
+    limit = allowed(run)
+    late = found.hold.t_s[found.hold.value > limit.hold_s + 1e-9]
+    assert late[0] == pytest.approx(died_s)
+
+
+def test_ticks_that_nobody_knows_are_as_old_as_can_be(run: RunRecord) -> None:
+    ticks, inputs = run[CONTROLLER_STEP], run[PLANT_ACTUATION]
+    gap = slice(300, 310)
+    record = changed(run, **{CONTROLLER_STEP: np.delete(ticks, gap)})
+    assert observe(record).hold.largest() == pytest.approx(0.015)  # the plant knows when they were
+    record = changed(record, **{PLANT_ACTUATION: np.delete(inputs, gap)})
+    when_s, why = left(record)
+    assert when_s == pytest.approx(3.01)
+    assert "an input was" in why
+
+
+def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) -> None:
+    """What is no number is not received: at 400 Hz e^{709} is passed within 0.4 s."""
+    record = simulate(
+        make(
+            horizon_s=1.0,
+            model={"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True},
+            plant={"initial_state": [1.0], "A": [[2000.0]], "B": [[1.0]]},
+        )
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        found: Observed = observe(record)
+    when_s, _ = found.left(allowed(record)) or (np.nan, "")
+    assert when_s <= 0.4
+    assert found.sampling.largest() == pytest.approx(0.65, abs=0.02)
+
+
+def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
+    resolved = make()
+    n, m = 2, 1
+    rows = {table: np.zeros(0, dtype) for table, dtype in tables(n, m).items()}
+    found = observe(RunRecord(resolved, rows, [], {}))
+    assert found.start_s == np.inf
+    assert found.losses.runs(0.0).largest() is None
+    one = rows | {PLANT_STEP: np.zeros(1, tables(n, m)[PLANT_STEP])}
+    one[PLANT_STEP]["actuation"] = NO_SEQUENCE
+    assert observe(RunRecord(resolved, one, [], {})).start_s == np.inf
+    assert NETEM_PACKET in rows
+
+
+def test_what_is_overtaken_as_the_run_ends_is_not_lost(make: Make) -> None:
+    """The controller has the newer update, but no step is left in which the plant could feel it."""
+    busy = make(trigger={"beta": 1e-6}, horizon_s=1.0)
+    events = simulate(busy, network_of(lambda n: 0))[SENSOR_MEASUREMENT]["event"]
+    late = int(events.max()) - 1
+    assert (events[-2:] == [late, late + 1]).all()  # an event at each of the last measurements
+    record = simulate(busy, network_of(lambda n: 18 if n == late else 0))
+    assert late not in record[CONTROLLER_DELIVERY]["sequence"]
+    assert late + 1 in record[CONTROLLER_DELIVERY]["sequence"]
+    assert observe(record).losses.runs(0.02).largest() == 0

@@ -1,0 +1,152 @@
+"""Claims about runs whose settings change: up to the change, and of the run that follows it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.assumption_monitor import Guard
+from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.claims.claims_by_part import RunClaims, _start_error
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, PLANT_STEP
+
+CONTENT: dict[str, Any] = {
+    "name": "changing",
+    "horizon_s": 6.0,
+    "model": {"name": "double_integrator"},
+    "plant": {
+        "initial_state": [1.0, 0.0],
+        "rate_hz": 100.0,
+        "draw": "uniform",
+        "uncertainty_A": [[0.0, 0.0], [0.0, 0.1]],
+    },
+    "controller": {"rate_hz": 100.0},
+    "trigger": {"beta": 0.05, "alpha_per_s": 0.2},
+    "network": {"mansd": 1, "loss": {"model": "bernoulli", "probability": 0.3}},
+}
+
+
+def run_with(*changes: tuple[float, dict[str, Any]], **more: Any) -> RunRecord:
+    listed = [{"at_s": at_s, "set": settings} for at_s, settings in changes]
+    return simulate(resolve(validate(CONTENT | {"changes": listed} | more, "here")))
+
+
+def test_without_changes_the_claims_are_those_of_the_run() -> None:
+    record = run_with()
+    assert RunClaims(record).judge() == Claims(record).judge()
+
+
+def test_a_change_of_the_loss_alone_touches_no_claim() -> None:
+    claims = RunClaims(run_with((2.0, {"network.loss.probability": 0.9}))).judge()
+    assert {(claim.from_s, claim.until_s) for claim in claims} == {(0.0, None)}
+    assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
+
+
+def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
+    record = run_with((2.005, {"trigger.beta": 0.04, "network.mansd": 2}))
+    claims = RunClaims(record).judge()
+    deliveries = record[CONTROLLER_DELIVERY]["t_ns"]
+    first_s = int(deliveries[deliveries >= 2_005_000_000][0]) / 1e9
+    assert {(claim.from_s, claim.until_s) for claim in claims} == {(0.0, 2.005), (first_s, None)}
+    assert {claim.verdict for claim in claims} == {ClaimVerdict.HELD}
+    before, after = (
+        [one for one in claims if (one.from_s > 0) is later and one.source == "certificate"]
+        for later in (False, True)
+    )
+    assert [one.what for one in before] == [one.what for one in after]
+    delta = {one.what: one.certified for one in after}["the controller's error is bounded"]
+    # βe^{−αt} in the run's own time: what is certified of its first instant is of that threshold.
+    own = next(part for part in RunClaims(record).parts[1:] if isinstance(part, Claims))
+    beta = 0.04 * np.exp(-0.2 * first_s)
+    assert own.record.scenario.decaying.beta == pytest.approx(beta)
+    envelope = own.certificates[0].controller_error(np.zeros(1))
+    assert envelope == pytest.approx([delta * beta])
+    # One more may be lost in a row, and is one more that may be missing.
+    missing = [
+        part.certificates[0].constants for part in RunClaims(record).parts
+        if isinstance(part, Claims)
+    ]  # fmt: skip
+    assert missing[0] is not None
+    assert missing[1] is not None
+    assert missing[1].missing_events == missing[0].missing_events + 1
+
+
+def test_at_a_set_point_the_claims_are_of_the_deviations() -> None:
+    claims = RunClaims(run_with((2.005, {"controller.setpoint": [3.0, 0.0]}))).judge()
+    after = [one for one in claims if one.from_s > 0]
+    assert {one.verdict for one in after} == {ClaimVerdict.HELD}
+    assert any(one.source == "box certificate" for one in after)
+
+
+def test_a_plant_that_does_not_rest_where_its_model_does_is_certified_nothing() -> None:
+    plant = CONTENT["plant"] | {"uncertainty_A": [[0.0, 0.0], [0.3, 0.0]]}
+    claims = RunClaims(run_with((2.005, {"controller.setpoint": [3.0, 0.0]}), plant=plant)).judge()
+    after = [one for one in claims if one.from_s > 0]
+    void = [one for one in after if one.verdict is ClaimVerdict.VOID]
+    assert {one.source for one in void} == {"certificate", "box certificate"}
+    assert all("constant disturbance" in one.why for one in void)
+    identity = next(one for one in after if one.source == "(I1)")
+    assert identity.verdict is ClaimVerdict.HELD
+
+
+def test_two_set_points_at_once_are_neither() -> None:
+    # Who reads the deviations from the wrong one sees a state that never decays.
+    record = run_with((0.0, {"controller.setpoint": [3.0, 0.0]}), horizon_s=12.0)
+    (first, own) = RunClaims(record).parts
+    assert isinstance(own, Claims)
+    assert np.abs(own.record[PLANT_STEP]["x"][-1]).max() < 0.05
+    assert np.abs(record[PLANT_STEP]["x"][-1]).max() > 2.9
+    assert isinstance(first, Claims)
+    assert first.judge() == [] or all(one.ratio is None for one in first.judge())
+
+
+def test_until_a_delivery_nothing_is_claimed_and_that_is_said() -> None:
+    record = run_with((5.995, {"trigger.beta": 0.04}))
+    (last,) = [one for one in RunClaims(record).judge() if one.from_s > 0]
+    assert last.verdict is ClaimVerdict.VOID
+    assert (last.from_s, last.until_s, last.since_s) == (5.995, None, 5.995)
+    assert "no update was delivered after it" in last.why
+
+
+def test_a_process_that_never_heard_of_a_change_leaves_nothing_to_claim() -> None:
+    record = run_with((2.005, {"trigger.beta": 0.04}))
+    rows = {table: record[table] for table in record.tables}
+    rows[CONTROLLER_SETTING] = rows[CONTROLLER_SETTING][:0]
+    deaf = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
+    (last,) = [one for one in RunClaims(deaf).judge() if one.from_s > 0]
+    assert "not every process heard of it" in last.why
+
+
+def test_an_input_too_far_from_kx_voids_the_certificate() -> None:
+    record = run_with((2.005, {"trigger.beta": 1e-6}))
+    after = [one for one in RunClaims(record).judge() if one.from_s > 0]
+    void = [one for one in after if one.source == "certificate"]
+    assert {one.verdict for one in void} == {ClaimVerdict.VOID}
+    assert all("from Kx" in one.why for one in void)
+
+
+def test_the_error_of_the_input_at_the_start_is_that_of_the_steps() -> None:
+    record = run_with()
+    loop, steps = record.loop, record[PLANT_STEP]
+    u, x = steps["u"][:20], steps["x"][:21]
+    worst = max(
+        float(np.linalg.norm(u[i] - loop.K @ x[j]) * np.exp(0.2 * 0.01 * (i + 1)))
+        for i in range(20) for j in (i, i + 1)
+    )  # fmt: skip
+    found = _start_error(record, 0.2)
+    assert worst <= found <= 1.01 * worst
+
+
+def test_the_guard_says_no_more_of_what_comes_after() -> None:
+    record = run_with(network=CONTENT["network"] | {"enforce_mansd": False, "mansd": 0})
+    free, ended = Guard(record.scenario), Guard(record.scenario)
+    ended.end_at(0.0)
+    for table in record.tables:
+        free.take(table, record[table])
+        ended.take(table, record[table])
+    assert free.end()
+    assert ended.end() == []

@@ -1,0 +1,110 @@
+"""Theorem 1's Δ from a recorded run: against its parts, one by one, and the error it bounds."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosim.analysis.claims.theorem_one import _longest, theorem_one
+from cosim.record.align import Joined, join_all
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from tests.cosim.analysis.claims.conftest import MS, Make, network_of, of_scenario
+
+
+def delta_of(record: RunRecord) -> float | None:
+    return theorem_one(record, join_all(record))
+
+
+def by_hand(record: RunRecord, joined: Joined, horizon: int = 10**9) -> float:
+    """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the events that are missing after each event.
+
+    Here from real intervals, which the theorem's δ̄_j bound from above.
+    """
+    from scipy.linalg import expm
+
+    rows, alpha = record[SENSOR_MEASUREMENT], record.scenario.trigger.alpha_per_s
+    at = np.flatnonzero(rows["event"] != NO_SEQUENCE)
+    ends_s = [*(rows["t_ns"][at[1:]] * 1e-9), rows["t_ns"][-1] * 1e-9]
+    largest = 1.0
+    for k, start in enumerate(at):
+        missing = [i for i in at[: k + 1] if rows["event"][i] > joined.received[start]]
+        delta = 1.0
+        for i in missing[-horizon:]:
+            reach_s = ends_s[k] - rows["t_ns"][i] * 1e-9
+            grown = expm(record.loop.H * np.linspace(0, reach_s, 200)[:, None, None])
+            delta += math.exp(alpha * reach_s) * np.linalg.norm(grown, 2, (1, 2)).max()
+        largest = max(largest, delta)
+    return largest
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+@pytest.mark.parametrize("sync", ["first_packet", "known_state"])
+def test_it_bounds_the_error_and_what_the_real_intervals_give(
+    mode: str, sync: str, make: Make
+) -> None:
+    fast = make(
+        mode=mode, network={"initial_sync": sync, "loss": {"model": "worst_case"}},
+        plant={"rate_hz": 1000.0}, controller={"rate_hz": 1000.0}, horizon_s=3.0,
+    )  # fmt: skip
+    record = simulate(fast)
+    joined = join_all(record)
+    delta = theorem_one(record, joined)
+    assert delta is not None
+    assert delta >= by_hand(record, joined) * (1 - 1e-6)
+    trigger = record.scenario.trigger
+    level = trigger.beta * np.exp(-trigger.alpha_per_s * joined.t_ns * 1e-9)
+    known = joined.received >= 0
+    # The theorem's trigger watches always; this one is tested once a millisecond.
+    overshoot = float((joined.e_s_norm / joined.threshold).max())
+    assert overshoot < 1.2
+    assert (joined.e_c_norm[known] <= overshoot * delta * level[known]).all()
+
+
+def test_a_late_update_is_missing_until_it_comes_and_no_longer(make: Make) -> None:
+    """Every update is 15 ms late: never two are missing, however long the run."""
+    record = simulate(make(), network_of(lambda n: 15))
+    joined = join_all(record)
+    starts = np.flatnonzero(record[SENSOR_MEASUREMENT]["event"] != NO_SEQUENCE)
+    assert (joined.received[starts[1:]] == np.arange(len(starts) - 1)).all()
+    delta, alone = theorem_one(record, joined), by_hand(record, joined)
+    assert delta is not None
+    # Each stretch is one event long; δ̄_j is some times the real interval.
+    assert alone < 4
+    assert delta < 20
+
+
+def test_without_losses_nothing_is_missing(make: Make) -> None:
+    assert delta_of(simulate(make(), network_of(lambda n: 0))) == 1.0
+
+
+def test_there_is_none_without_events_or_with_a_weight(make: Make) -> None:
+    quiet = make(trigger={"beta": 100.0}, network={"initial_sync": "known_state"})
+    assert delta_of(simulate(quiet)) is None
+    record = simulate(make())
+    weighted = make(trigger={"weight": [[2.0, 0.0], [0.0, 1.0]]})
+    assert delta_of(of_scenario(record, weighted)) is None
+    assert delta_of(record) is not None
+    assert record[SENSOR_MEASUREMENT]["t_ns"][1] == 10 * MS
+
+
+@given(st.lists(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=4), min_size=1, max_size=40))
+def test_the_stretches_that_are_left_out_are_exceeded_by_one_that_is_not(
+    stretches: list[list[float]],
+) -> None:
+    def reaches(stretch: Sequence[float]) -> list[float]:
+        sums = list(itertools.accumulate(reversed(stretch)))[::-1]
+        return sums + [0.0] * (4 - len(sums))
+
+    kept = _longest(stretches)
+    for stretch in stretches:
+        assert any(
+            all(a >= b - 1e-9 for a, b in zip(reaches(one), reaches(stretch), strict=True))
+            for one in kept
+        )
+    assert len(kept) <= len(stretches)

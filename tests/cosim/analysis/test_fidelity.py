@@ -1,0 +1,320 @@
+"""Fidelity: explained where the record is the scenario's, and not where it is not."""
+
+import itertools
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner, Result
+
+import cosim.analysis.fidelity
+from cosim.analysis.fidelity import Fidelity, fidelity_for_summary, fidelity_of
+from cosim.analysis.step_schedule import IncomparableError, live_run
+from cosim.cli import app
+from cosim.output.fidelity_table import summary_rows
+from cosim.record.run_record import Rows, RunRecord
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.virtual_time import Network, simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+
+LANE = Path(__file__).parents[3] / "scenarios" / "lane_following.toml"
+
+
+def lane(network: Network | None = None, *settings: str) -> RunRecord:
+    scenario = load(LANE, ["horizon_s=4", "plant.rate_hz=100", "controller.rate_hz=100", *settings])
+    return simulate(resolve(scenario), network)
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return lane()
+
+
+@pytest.fixture(scope="module")
+def fidelity(record: RunRecord) -> Fidelity:
+    return fidelity_of(record)
+
+
+def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
+    rows = {table: changed.get(table, record[table]) for table in record.tables}
+    return RunRecord(record.scenario, rows, record.notices, record.reports)
+
+
+def test_all_is_explained(fidelity: Fidelity) -> None:
+    # What remains is rounding, some 1e-15 of x, over a difference of some per cent of x.
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.explained
+    assert 1e-4 < fidelity.total.rms / fidelity.rms_live < 0.5
+    assert sum(stage.share for stage in fidelity.stages) == pytest.approx(1.0, rel=1e-9)
+    assert fidelity.stages[2].events == fidelity.stages[3].events == fidelity.events_live
+    assert fidelity.stages[3].max_event_difference_s == pytest.approx(0.0, abs=1e-9)
+    assert fidelity.stages[3].parted_event is None
+
+
+def test_the_figures_fit_together(fidelity: Fidelity) -> None:
+    for difference in (fidelity.total, *(stage.difference for stage in fidelity.stages)):
+        assert math.hypot(*difference.rms_by_state) == pytest.approx(difference.rms)
+        assert max(difference.max_by_state) <= difference.max * (1 + 1e-12)
+        assert difference.rms <= difference.max
+    assert fidelity.samples == 401
+    assert fidelity.compared_s == 4.0
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+@pytest.mark.parametrize("start", ["first_packet", "known_state"])
+def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) -> None:
+    settings = (f'mode="{mode}"', f'network.initial_sync="{start}"', "plant.measure_every=2",
+                "trigger.beta=0.02")  # fmt: skip
+    asked: list[int] = []
+
+    def network(data: bytes, now_ns: int) -> int | None:
+        asked.append(now_ns)
+        return None if len(asked) % 3 == 2 else 7_000_000 * (len(asked) % 5)
+
+    fidelity = fidelity_of(lane(network, *settings))
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.events_live > 3
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        '{ policy = "relative", sigma = 0.2 }',
+        '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }',
+        '{ policy = "deadline", interval_s = 0.3, rule = { policy = "absolute", delta = 0.2 } }',
+    ],
+)
+def test_any_policy_is_explained(policy: str) -> None:
+    fidelity = fidelity_of(lane(None, f"trigger={policy}", 'mode="zoh"'))
+    assert fidelity.explained_relative < 1e-9
+    assert fidelity.events_live > 3
+
+
+def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
+    record = lane(lambda data, now_ns: None, 'trigger={ policy = "lyapunov", rate_per_s = 0.1 }')
+    summary = fidelity_for_summary(record)
+    assert "accumulate" in summary["reason"]
+    ((_, told),) = summary_rows(summary)
+    assert told == f"not compared: {summary['reason']}"
+
+
+def test_a_share_that_counts_against_the_others_is_called_so() -> None:
+    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "unexplained": 0.0}
+    numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
+    told = dict(summary_rows(numbers | {"reason": None}))
+    assert told["  share of sampling"] == "142.0 %"
+    assert told["  share of delay"] == "-42.0 % (partly cancels the other effects)"
+    assert told["  share of held actuation"] == "0.0 %"
+
+
+def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> None:
+    """This rule does not stand the losses; a deviation grows freely between the same events."""
+    policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
+    record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
+    with pytest.raises(IncomparableError, match="turns rounding into another run"):
+        fidelity_of(record)
+
+
+def test_delay_shows_as_delay() -> None:
+    prompt, late = (fidelity_of(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
+    sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
+    assert delay > 2 * prompt.stages[1].difference.rms
+    assert sampling == pytest.approx(prompt.stages[0].difference.rms)  # the same fates, no delay
+
+
+def test_a_start_without_actuation_shows_as_held_actuation() -> None:
+    """Known x(0), no event at all: the plant still waits for the first tick, 8 ms late."""
+    settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
+    fidelity = fidelity_of(lane(None, *settings))
+    sampling, delay, held, _ = fidelity.stages
+    assert fidelity.events_live == 0
+    assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
+    assert delay.difference.max == 0.0
+    assert held.share == pytest.approx(1.0)
+    assert held.max_event_difference_s is None
+
+
+def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
+    plant = record.scenario.plant
+    assert plant.A is not None
+    A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
+    other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
+    rows = {table: record[table] for table in record.tables}
+    fidelity = fidelity_of(RunRecord(other, rows, record.notices, record.reports))
+    assert fidelity.explained_relative > 0.1
+    assert not fidelity.explained
+    assert "too much" in fidelity.verdict
+
+
+def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
+    steps = record[PLANT_STEP].copy()
+    steps["x"][200:] += 0.1
+    assert not fidelity_of(with_rows(record, plant_step=steps)).explained
+
+
+def test_at_rest_there_is_nothing_to_explain() -> None:
+    fidelity = fidelity_of(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    assert fidelity.explained
+    assert fidelity.explained_relative == 0.0
+    assert "rounding" in fidelity.verdict
+
+
+def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_delays() -> None:
+    waits_ns = itertools.cycle([10_000_000, 10_000_000, 30_000_000])
+    late = lane(lambda data, now_ns: next(waits_ns), "trigger.beta=0.02")
+    schedule = live_run(late).schedule
+    events = int(late[SENSOR_MEASUREMENT]["event"].max()) + 1
+    assert events > 6
+    fates = network_fates(late.scenario)
+    beyond = range(events, events + 50)
+    assert [schedule.delivered(i) for i in beyond] == [fates(i) for i in beyond]
+    assert {schedule.delivered(i) for i in beyond} == {True, False}
+    # 10 ms under way, then 5 to the tick that uses it, or the next step.
+    assert {schedule.delay_ns(i) for i in beyond} == {15_000_000}
+    assert {schedule.delay_steps(i) for i in beyond} == {2}
+
+
+def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
+    """A sampled sensor that looks four times a second has fewer events than the paper's."""
+    fidelity = fidelity_of(lane(None, "plant.measure_every=25", 'mode="zoh"'))
+    assert fidelity.events_ideal > fidelity.events_live
+    assert fidelity.parted_event is not None
+    assert fidelity.explained_relative < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("table", "rows", "why"),
+    [
+        (SENSOR_MEASUREMENT, slice(5), "5 measurements"),
+        (SENSOR_MEASUREMENT, [*range(50), *range(51, 401)], "sensor's record"),
+        (PLANT_STEP, [*range(50), *range(51, 401)], "steps of the plant"),
+        (PLANT_STEP, slice(300), "steps of the plant"),
+        (CONTROLLER_STEP, slice(300), "controller's record"),
+        (CONTROLLER_STEP, [*range(50), *range(51, 400)], "controller's record"),
+        (CONTROLLER_DELIVERY, slice(1, None), "controller's record"),
+    ],
+)
+def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, why: str) -> None:
+    broken = with_rows(record, **{table: record[table][rows]})
+    with pytest.raises(IncomparableError, match=why):
+        fidelity_of(broken)
+    summary = fidelity_for_summary(broken)
+    assert why in summary.pop("reason")
+    assert set(summary.values()) == {None}
+
+
+def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecord) -> None:
+    """The sensor was the first to end."""
+    short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
+    fidelity = fidelity_of(short)
+    assert fidelity.samples == 250
+    assert fidelity.explained_relative < 1e-9
+
+
+def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
+    steps = record[PLANT_STEP].copy()
+    steps["x"][300:] = math.nan
+    with pytest.raises(IncomparableError, match="diverged"):
+        fidelity_of(with_rows(record, plant_step=steps))
+
+
+def test_a_loop_whose_events_accumulate_says_so() -> None:
+    unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
+    with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
+        fidelity_of(unstable, max_events=200)
+
+
+def test_the_summary_has_the_same_keys_whatever_happens(
+    record: RunRecord, fidelity: Fidelity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = fidelity_for_summary(record)
+    assert good == fidelity.compact()
+    json.dumps(good, allow_nan=False)
+
+    def broken(*_: object) -> Fidelity:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(cosim.analysis.fidelity, "fidelity_of", broken)
+    bad = fidelity_for_summary(record)
+    assert bad.keys() == good.keys()
+    assert bad["reason"] == "RuntimeError('a bug')"
+    monkeypatch.setattr(cosim.analysis.fidelity, "_STEPS_AT_THE_END", 100)
+    assert "noack fidelity" in fidelity_for_summary(record)["reason"]
+
+
+def noack(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    shorter = ("--set", "horizon_s=2", "--set", "plant.rate_hz=100")
+    done = noack("simulate", LANE, "--runs", folder, *shorter)
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_the_last_run_is_compared(simulated: Path) -> None:
+    done = noack("fidelity", "--runs", simulated)
+    assert done.exit_code == 0, done.output
+    assert "held actuation" in done.stdout
+    assert done.stderr == ""
+    document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
+    assert document["explained"] is True
+    assert [stage["name"] for stage in document["stages"]] == [
+        "sampling", "delay", "held actuation", "unexplained"
+    ]  # fmt: skip
+
+
+def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(simulated / "latest", tmp_path / "run"))
+    path = run / "record" / "plant_step.parquet"
+    table = pq.read_table(path)
+    moved: Callable[[np.ndarray], np.ndarray] = lambda x: x + np.linspace(0, 1, len(x))  # noqa: E731
+    column = pa.array(moved(table["x_4"].to_numpy()))
+    pq.write_table(table.set_column(table.schema.get_field_index("x_4"), "x_4", column), path)
+    done = noack("fidelity", run)
+    assert done.exit_code == 1
+    assert "too much" in done.stdout
+    assert noack("fidelity", run, "--json").exit_code == 1
+
+
+def test_what_is_no_run_is_one_line(tmp_path: Path) -> None:
+    done = noack("fidelity", tmp_path)
+    assert done.exit_code == 2
+    assert "not a run directory" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        (SENSOR_MEASUREMENT, "t_ns", 2**62),
+        (SENSOR_MEASUREMENT, "t_ns", -(2**63)),
+        (CONTROLLER_STEP, "model_t_ns", 2**63 - 1),
+        (CONTROLLER_DELIVERY, "model_t_ns", -1),
+    ],
+)
+def test_a_record_with_times_that_no_run_has_is_not_compared(
+    table: str, column: str, value: int
+) -> None:
+    record = lane()
+    rows = {name: record[name].copy() for name in record.tables}
+    rows[table][column][len(rows[table]) // 2] = value
+    damaged = RunRecord(record.scenario, rows, [], record.reports)
+    with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
+        fidelity_of(damaged)

@@ -1,0 +1,146 @@
+"""A summary that passes for one that can be shown is shown; whatever else is written anew."""
+
+import copy
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+import noack
+from cosim.analysis.run_outcome import Outcome
+from cosim.analysis.run_summary import dumps, summarise
+from cosim.analysis.summary_check import can_be_shown
+from cosim.output.report.report_page import page
+from cosim.output.run_tables import print_outcome
+from cosim.record.environment import changed_since, kind_of
+from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.core.errors import ExitStatus
+
+HUGE = 10**400
+DELETED = object()
+RENAMED = object()
+VALUES = [None, True, HUGE, "[/b]", [], [[[[]]]], {}, {"a": [1]}, DELETED, RENAMED]
+QUANTILES = {"p50": 1.0, "p99": None, "p999": 1.0, "max": 2.0}
+DIFFERS = {
+    "bit_exact": False, "complete": False, "inputs": 4,
+    "first_difference": {
+        "table": "plant_step", "row": 1, "column": "x_1", "recorded": 1.0, "recorded_hex": "0x1",
+        "replayed": None, "replayed_hex": None, "what": "the row differs", "now_ns": 3,
+    },
+}  # fmt: skip
+FULL = {
+    "kind": "live",
+    "restarts": [{"process": "sensor", "last_s": 0.5, "first_s": 0.6, "what": ""}],
+    "changes": [{"t_s": 0.1, "what": "trigger.beta = 0.3"}],
+    "watchdog": {"policy": "hold", "trips": 2, "first_s": 0.1, "total_s": 0.5},
+    "estimation": {"observer": "kalman", "rms_second_half": 0.1, "expected_rms": 0.1, "max": 1.0,
+                   "sup_e_c_norm": 1.0},
+    "disturbances": [{"at": "input", "rms": 0.1, "max": 0.2}],
+    "assumption_violations": [{"t_s": 0.1, "process": "netem", "what": "MANSD violated"}],
+    "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_run": 1},
+    "lateness_us": {"plant": QUANTILES | {"steps": 3, "late_steps": 3}},
+    "latency_us": QUANTILES | {"updates": 3},
+    "realtime": {"plant": {"sched_fifo": "granted"}},
+    "linearisation": {"A": [[1.0]], "eigenvalues": [[1.0, 0.0]], "off_A": [[1.0]],
+                      "off_B": [[1.0]], "in_box": True},
+    "replay": DIFFERS,
+    "fidelity": {
+        "reason": None, "explained": True, "explained_relative": 0.1, "rms_x": 0.1, "max_x": 0.2,
+        "rms_x_live": 1.0, "shares": {"sampling": 0.5, "delay": -0.5}, "events_ideal": 1,
+        "events_live": 2, "max_event_difference_s": 0.1, "parted_event": None,
+    },
+    "claims": [{"what": "state", "source": "S", "bound": "B", "ratio": 0.5, "verdict": "void",
+                "since_s": 0.1, "why": "late", "from_s": 0.1, "until_s": None}],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def record() -> RunRecord:
+    return simulate(resolve(noack.load("double_integrator", {"horizon_s": 0.2})))
+
+
+@pytest.fixture(scope="module")
+def summary(record: RunRecord) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(dumps(summarise(record, 0, "horizon") | FULL))
+    return found
+
+
+def test_full_summary_can_be_shown(record: RunRecord, summary: dict[str, Any]) -> None:
+    assert can_be_shown(summary)
+    for replayed in ({"bit_exact": True, "inputs": 4}, {"bit_exact": None, "error": "empty"}, None):
+        assert can_be_shown(summary | {"replay": replayed})
+        show(record, summary | {"replay": replayed})
+
+
+def test_damaged_summary_is_shown_or_told_from_a_whole_one(
+    record: RunRecord, summary: dict[str, Any]
+) -> None:
+    shown = 0
+    for place in places(summary):
+        for value in VALUES if place[0] != "exit" else ():  # which is read first (test_conclude)
+            damaged = changed(summary, place, value)
+            if can_be_shown(damaged):
+                show(record, damaged)
+                shown += 1
+    assert shown > 100  # numbers that may be missing, keys that nothing shows
+
+
+def test_damaged_summary_is_written_anew(tmp_path: Path) -> None:
+    source = noack.load("double_integrator", {"horizon_s": 0.2})
+    run = noack.simulate(source, runs=tmp_path)
+    path = run.directory / SUMMARY_FILE
+    path.write_text(json.dumps(run.summary | {"restarts": 5, "kind": [[[[]]]]}))
+    assert repr(noack.open_run(run.directory)) == repr(run)
+    assert json.loads(path.read_text()).keys() == run.summary.keys()
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, "{" * 100_000, "7", '{"kind": []}'])
+def test_damaged_environment_says_nothing(content: str, tmp_path: Path) -> None:
+    (tmp_path / ENVIRONMENT_FILE).write_text(content)
+    assert kind_of(tmp_path) == "live"
+    assert any(line.startswith("python was None") for line in changed_since(tmp_path))
+
+
+def places(value: Any, at: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    if at:
+        yield at
+    inner: Any = ()
+    if isinstance(value, dict):
+        inner = value.items()
+    elif isinstance(value, list):
+        inner = enumerate(value[:1])
+    for key, one in inner:
+        yield from places(one, (*at, key))
+
+
+def changed(summary: dict[str, Any], place: tuple[Any, ...], value: Any) -> dict[str, Any]:
+    """The summary with another value in a place, or without it, or with another name for it."""
+    found = copy.deepcopy(summary)
+    table: Any = found
+    for key in place[:-1]:
+        table = table[key]
+    before = table.pop(place[-1])
+    if value is RENAMED and isinstance(table, dict):
+        table["[/b]"] = before
+    elif value is not DELETED and isinstance(table, dict):
+        table[place[-1]] = value
+    elif value is not DELETED:
+        table.insert(place[-1], value)
+    return found
+
+
+def show(record: RunRecord, summary: dict[str, Any]) -> None:
+    """Whatever reads a summary."""
+    outcome = Outcome(Path("run"), ExitStatus.OK, "horizon", summary)
+    print_outcome(Console(file=io.StringIO()), outcome)
+    page(record.scenario, summary, [], "", {})
+    run = noack.Run(outcome.run_dir, lambda: outcome)
+    assert repr(run)
+    assert run._repr_html_()

@@ -1,0 +1,143 @@
+"""That claims are void is said while the run goes on: by the recorder, and in the terminal."""
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from cosim.live.progress import progress_line
+from cosim.live.recorder import Recorder
+from cosim.record.run_directory import SCENARIO_FILE
+from cosim.record.run_record import RunRecord, load_record
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load
+from noack.core.errors import MachineError
+from noack.protocol.record_tables import OWNER
+from noack.runtime.control_messages import Progress, heard
+from tests.cosim.live.outage import SCENARIOS, with_outage
+from tests.fuzz.plane import FakePlane, Sample
+
+
+@pytest.fixture(scope="module")
+def run() -> RunRecord:
+    """The controller stands still from 0.5 s to 0.7 s."""
+    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", ["horizon_s=1"])), 0.5, 0.7)
+
+
+class Told(FakePlane):
+    """A plane that remembers the recorder's accounts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.accounts: list[dict[str, Any]] = []
+
+    def put(self, key: str, content: Any) -> None:
+        if isinstance(content, str):
+            self.accounts.append(heard(Progress, content))
+        super().put(key, content)
+
+
+def recorder_of(scenario: Scenario, run_dir: Path, plane: FakePlane) -> Recorder:
+    (run_dir / SCENARIO_FILE).write_text(dumps(scenario))
+    return Recorder(scenario, run_dir, plane, view=None)  # type: ignore[arg-type]
+
+
+def send(plane: FakePlane, record: RunRecord, until_ns: int, sent: dict[str, int]) -> None:
+    for table in record.tables:
+        first = sent.get(table, 0)
+        sent[table] = int(np.searchsorted(record[table]["now_ns"], until_ns))
+        rows = record[table][first : sent[table]]
+        if len(rows):
+            header = json.dumps({"first": first, "rows": len(rows)}).encode()
+            key = f"t/{OWNER[table]}/{table}"
+            plane.put("telemetry", Sample(key, rows.tobytes(), header))
+
+
+def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_path: Path) -> None:
+    plane, sent = Told(), {}  # type: ignore[var-annotated]
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    for until_ns in range(100_000_000, 1_200_000_000, 100_000_000):
+        send(plane, run, until_ns, sent)
+        recorder.poll()
+        recorder.show()
+    cause = "an input was 0.101 s old, 0.007 s allowed"
+    line = f"claims that this touches are void from 0.506 s on: {cause}"
+    void = [account["void"] for account in plane.accounts]
+    assert void == [[]] * 5 + [[line]] * 6
+    notices = recorder.finish().notices
+    assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
+    assert load_record(tmp_path).notices == notices
+
+
+def test_what_is_found_out_at_the_end_is_said_too(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    (notice,) = recorder.finish().notices
+    assert [account["void"] for account in plane.accounts] == [[notice["text"]]]
+
+
+def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
+    run: RunRecord, tmp_path: Path
+) -> None:
+    plane, sent = Told(), {}  # type: ignore[var-annotated]
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    send(plane, run, 300_000_000, sent)
+    sent["sensor_measurement"] += 10  # a batch that is lost, and sent again at the end
+    send(plane, run, 1_200_000_000, sent)
+    recorder.poll()
+    recorder.show()
+    recorder.show()
+    assert plane.accounts[-1]["void"] == [
+        "whether claims are void is told after the run only: "
+        "telemetry is missing, or came out of turn"
+    ]
+    assert recorder.finish().notices == []
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_the_terminal_says_each_cause_once(run: RunRecord, terminal: bool) -> None:
+    shown = io.StringIO()
+    account: dict[str, Any] = {
+        "t_s": 0.5, "events": 3, "deliveries": 2, "longest_drop_run": 1, "x_norm": 1.0,
+        "live": None,
+    }  # fmt: skip
+    console = Console(file=shown, force_terminal=terminal, width=200)
+    with progress_line(console, run.scenario) as watcher:
+        watcher.started(Path())
+        watcher.progress(account)
+        for void in ([], ["one [cause]"], ["one [cause]"], ["one [cause]", "another"]):
+            watcher.progress(account | {"void": void})
+    assert shown.getvalue().count("one [cause]") == 1
+    assert shown.getvalue().count("another") == 1
+
+
+def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    recorder.confirm()
+    (tmp_path / "spool" / "plant_step.recorder").unlink()
+    with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
+        recorder.confirm()
+    record = recorder.finish()  # what is left of it is kept
+    assert not len(record["plant_step"])
+    assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
+    assert "plant_step.recorder: was deleted or moved" in str(recorder.lost)
+
+
+def test_after_the_stop_nothing_more_is_said(run: RunRecord, tmp_path: Path) -> None:
+    plane = Told()
+    recorder = recorder_of(run.scenario, tmp_path, plane)
+    recorder.judge_no_more()
+    send(plane, run, 1_200_000_000, {})
+    recorder.poll()
+    recorder.show()
+    assert recorder.finish().notices == []

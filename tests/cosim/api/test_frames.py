@@ -1,0 +1,97 @@
+"""A run's tables against its record and its summary, and in data frames."""
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import noack
+from cosim.analysis.replay.replay_result import rows_differ
+from cosim.record.align import join_all
+from cosim.record.packet_outcomes import crossing
+from cosim.record.run_record import load_record
+
+
+def test_a_table_is_the_file_with_seconds_before_it(simulated: noack.Run) -> None:
+    assert "plant_step" in simulated.tables
+    for name in simulated.tables:
+        table = simulated.table(name)
+        file = pq.read_table(simulated.directory / "record" / f"{name}.parquet")
+        assert table.column_names == ["t_s", *file.column_names]
+        assert table.drop_columns(["t_s"]).equals(file)
+        np.testing.assert_allclose(table["t_s"].to_numpy(), file["t_ns"].to_numpy() * 1e-9)
+
+
+def test_samples_are_the_joined_record(simulated: noack.Run) -> None:
+    joined = join_all(load_record(simulated.directory))
+    samples = simulated.samples()
+    for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
+        for i in range(2):
+            np.testing.assert_array_equal(samples[f"{name}_{i + 1}"].to_numpy(), states[:, i])
+    e_c = np.hypot(*(samples[f"x_c_{i}"].to_numpy() - samples[f"x_{i}"].to_numpy() for i in (1, 2)))
+    np.testing.assert_allclose(e_c, samples["e_c_norm"].to_numpy())
+    assert (samples["event"].to_numpy() >= 0).sum() == simulated.summary["events"]
+
+
+def test_events_add_up_to_the_summary(simulated: noack.Run) -> None:
+    events, summary = simulated.events(), simulated.summary
+    assert events.num_rows == summary["events"]
+    assert sum(events["received"].to_pylist()) == summary["deliveries"]
+    fates = Counter(events["fate"].to_pylist())
+    assert fates["forced"] == summary["forced_deliveries"] > 0
+    assert fates["dropped"] > 0
+    assert {fate: n for fate, n in fates.items() if fate not in ("delivered", "forced")} == summary[
+        "drops_by_cause"
+    ]
+    intervals_s = events["interval_s"].to_numpy()
+    assert np.isnan(intervals_s[0])
+    assert intervals_s[1:].min() == pytest.approx(summary["inter_event_min_s"])
+
+
+def test_what_overtakes_and_what_is_under_way_is_said(scenario: noack.Scenario) -> None:
+    """Delays of up to half a second: some updates arrive out of order, some after the end."""
+    jitter = {"kind": "delay", "delay_s": 0.3, "jitter_s": 0.25}
+    run = noack.simulate(noack.with_settings(scenario, {"network.impairments": [jitter]}))
+    crossed = crossing(load_record(run.directory))
+    fates = Counter(run.events()["fate"].to_pylist())
+    assert fates["overtaken"] == run.summary["drops_by_cause"]["overtaken"] > 0
+    assert fates["under_way"] == crossed.under_way.sum()
+
+
+def test_a_damaged_table_is_one_line(tmp_path: Path, scenario: noack.Scenario) -> None:
+    run = noack.simulate(noack.with_settings(scenario, {"horizon_s": 0.1}), runs=tmp_path)
+    assert run.tables
+    (run.directory / "record/plant_step.parquet").write_bytes(b"PAR1")
+    with pytest.raises(noack.NoackError, match=r"plant_step\.parquet: cannot be read"):
+        run.table("plant_step")
+
+
+def test_pandas_takes_every_table(simulated: noack.Run) -> None:
+    pytest.importorskip("pandas", reason="pandas is not installed")
+    frame = simulated.samples().to_pandas()
+    assert list(frame.columns)[:3] == ["t_s", "t_ns", "x_1"]
+    assert frame["t_s"].is_monotonic_increasing
+    events = simulated.events().to_pandas()
+    assert events.loc[events.fate == "forced", "received"].all()
+
+
+def test_polars_takes_every_table(simulated: noack.Run) -> None:
+    polars = pytest.importorskip("polars", reason="polars is not installed")
+    frame = polars.from_arrow(simulated.table("plant_step"))
+    assert frame.columns[0] == "t_s"
+
+
+def test_states_have_one_name_everywhere(simulated: noack.Run) -> None:
+    """Figures, samples, columns of the record and what a replay says count from 1."""
+    names = ("x_1", "x_2")
+    assert simulated.scenario.model.state_names == names
+    assert [axes.get_ylabel().split("\n")[0] for axes in simulated.plot().axes[:2]] == [*names]
+    for columns in (simulated.samples(), simulated.table("plant_step")):
+        assert [name for name in columns.column_names if re.fullmatch("x_[0-9]+", name)] == [*names]
+    rows = simulated._record["plant_step"]
+    other = rows[3].copy()
+    other["x"][0] += 1
+    assert rows_differ("plant_step", 3, rows[3], other).column == "x_1"

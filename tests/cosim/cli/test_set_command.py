@@ -1,0 +1,95 @@
+"""`noack set`: its words, and how it finds a run."""
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import cosim.cli  # noqa: F401 - registers the commands
+from cosim.cli.command import app
+from cosim.cli.set_command import parsed
+from cosim.live.coordinator import Coordinator
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
+from noack.runtime import run_registry
+from noack.runtime.join_ticket import Ticket, new_ticket
+from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
+
+
+@pytest.fixture
+def ticket(content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ticket:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    endpoint = f"tcp/{LOOPBACK}:{free_tcp_port()}"
+    scenario = resolve(validate(content, "here"))
+    return new_ticket(scenario, endpoint, tmp_path / "run", launched=True)
+
+
+@pytest.fixture
+def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
+    found = Coordinator(ticket)
+    try:
+        yield found
+    finally:
+        found.close()
+
+
+def test_words_are_keys_and_values() -> None:
+    words = ["loss.p", "0.9", "mansd=2", "setpoint", "[1.0, 0.0]", "loss.model", "bernoulli"]
+    assert parsed(words) == {
+        "network.loss.probability": 0.9,
+        "network.mansd": 2,
+        "controller.setpoint": [1.0, 0.0],
+        "network.loss.model": "bernoulli",
+    }
+    assert parsed(["trigger.floor", "-0.5"]) == {"trigger.floor": -0.5}
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["loss.p"], "loss.p: needs a value, e.g."),
+        (["loss.p", "1", "network.loss.probability=2"], "is there twice"),
+        (["mansd", "9" * 5000], "mansd: not valid TOML"),
+    ],
+)
+def test_mistaken_words_are_told(words: list[str], why: str) -> None:
+    with pytest.raises(CallerError, match=why):
+        parsed(words)
+
+
+def test_without_a_run_that_is_said(ticket: Ticket) -> None:
+    done = CliRunner().invoke(app, ["set", "loss.p", "0.5"])
+    assert done.exit_code == 2
+    assert "no run goes on" in done.stderr
+
+
+def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ticket) -> None:
+    other = new_ticket(ticket.scenario, ticket.endpoint, Path("elsewhere"), launched=True)
+    with (
+        run_registry.published(other, "lab") as first,
+        run_registry.published(ticket, None) as path,
+    ):
+        os.utime(first, (0, 0))
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+        assert ticket.key.hex() not in path.read_text()
+        assert run_registry.find().run_dir == ticket.run_dir
+        assert run_registry.find(session="lab").run_dir == "elsewhere"
+        assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
+        with pytest.raises(CallerError, match="no run goes on in session 'none'; there is "):
+            run_registry.find(session="none")
+    assert list(path.parent.iterdir()) == []
+
+
+def test_only_what_runs_can_be_changed(ticket: Ticket, coordinator: Coordinator) -> None:
+    asked = {"settings": {"network.mansd": 1}}
+    with pytest.raises(CallerError, match="the run has not begun"):
+        coordinator._answer_to(asked)
+    knobs = coordinator._answer_to({})["knobs"]
+    assert knobs["network.mansd"] == 2
+    assert knobs["controller.setpoint"] == [0.0, 0.0]

@@ -1,0 +1,75 @@
+"""What is no message of the run ends nobody: it is refused or ignored, and the rest goes on."""
+
+import json
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from cosim.live import coordinator
+from cosim.live.recorder import Recorder
+from cosim.record.run_directory import SCENARIO_FILE
+from noack.config.resolution import resolve
+from noack.config.scenario_file import dumps, validate
+from noack.protocol.record_tables import PLANT_STEP
+from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.join_ticket import new_ticket
+from tests.fuzz.plane import FakePlane, Query, Sample
+
+JUNK: list[bytes | None] = [
+    None, b"", b"{", b"\xff", b"[]", b"{}", b"null", b'{"rows": 1}', b"[" * 100_000,
+    b'{"pid": 1, "address": ["127.0.0.1", 0]}', b'{"pid": 1, "address": null}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("junk", JUNK)
+def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
+    content: dict[str, Any], junk: bytes | None, tmp_path: Path
+) -> None:
+    plane = FakePlane()
+    ticket = new_ticket(resolve(validate(content, "")), "tcp/127.0.0.1:1", tmp_path, launched=True)
+    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+        barrier = coordinator.Coordinator(ticket)
+    plane.put("progress", Sample("progress", junk))
+    assert barrier.progress() is None
+    for question in ("admit", "join"):
+        bad = Query(f"noack/0/{question}/plant", junk)
+        plane.put(question, bad)
+        barrier.poll()
+        assert bad.error is not None
+        assert bad.error.startswith("cannot join: ")
+    for number, role in enumerate((*LOOP_ROLES, RECORDER)):
+        address = None if role == RECORDER else ["127.0.0.1", 1 + number]
+        hello = json.dumps({"pid": 1, "instance": role, "address": address}).encode()
+        for question in ("admit", "join"):
+            plane.put(question, Query(f"noack/0/{question}/{role}", hello))
+            barrier.poll()
+    assert barrier.epoch_ns is not None
+    assert plane.answers[-1]["addresses"].keys() == set(LOOP_ROLES)
+
+
+@pytest.mark.parametrize("junk", JUNK)
+def test_the_recorder_keeps_what_is_good(
+    content: dict[str, Any],
+    junk: bytes | None,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scenario, plane = resolve(validate(content, "")), FakePlane()
+    (tmp_path / SCENARIO_FILE).write_text(dumps(scenario))
+    recorder = Recorder(scenario, tmp_path, plane, view=None)  # type: ignore[arg-type]
+    row = np.zeros(1, recorder._types[PLANT_STEP]).tobytes()
+    header = b'{"first": 0, "rows": 1}'
+    plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
+    plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
+    plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
+    plane.put("telemetry", Sample("t/plant/notices", junk, header))
+    plane.put("telemetry", Sample("t/plant/plant_step", row, header))
+    bad = Query("goodbye/plant", junk)
+    plane.put("goodbye", bad)
+    recorder.poll()
+    assert bad.error is not None
+    assert len(recorder.finish()[PLANT_STEP]) == 1
+    assert capsys.readouterr().err.count("ignored what is no telemetry") == 1

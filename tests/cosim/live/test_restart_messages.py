@@ -1,0 +1,49 @@
+"""What the summary says of processes that took another's place."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.run_summary import summarise
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import INCARNATION, RESTART
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
+
+
+def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any]) -> None:
+    record = simulate(resolve(validate(content, "")))
+    rows = record[SENSOR_MEASUREMENT].copy()
+    rows["input"][50:] = 2 * INCARNATION + np.arange(len(rows) - 50)
+    said = [
+        {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
+        for k in (1, 2)
+    ]
+    tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
+    restarts = summarise(RunRecord(record.scenario, tables, said, {}), 0, "")["restarts"]
+    last_s = rows["now_ns"][49] * 1e-9
+    found = {one["incarnation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
+    assert found == {
+        1: (last_s, None, "after 1"),
+        2: (last_s, rows["now_ns"][50] * 1e-9, "after 2"),
+    }
+
+
+@pytest.mark.parametrize("newest", [1, 2])
+def test_rows_are_missing_of_one_whose_first_ones_are(content: dict[str, Any], newest: int) -> None:
+    """It died before a recorder was back to which it could have sent them again."""
+    record = simulate(resolve(validate(content, "")))
+    rows = record[SENSOR_MEASUREMENT].copy()
+    rows["input"][50:80] = INCARNATION + 7 + np.arange(30)
+    rows["input"][80:] = newest * INCARNATION + 37 + np.arange(len(rows) - 80)
+    if newest == 2:
+        rows["input"][80:] -= 37
+    said = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]
+    tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
+    summary = summarise(RunRecord(record.scenario, tables, said, {}), 0, "")
+    assert summary["missing_by_table"]["sensor"] == 7
+    if newest == 2:
+        assert [one["what"] for one in summary["restarts"]] == [None, "newest"]

@@ -1,0 +1,134 @@
+"""A recorder that takes another's place knows what that one knew."""
+
+import errno
+import json
+import os
+from collections.abc import Iterator, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.live import recorder
+from cosim.live.recorder import Recorder
+from cosim.output.viewer.recording import ViewError
+from cosim.record.run_directory import SCENARIO_FILE, SPOOL
+from noack.config.resolution import resolve
+from noack.config.scenario_file import dumps, validate
+from noack.protocol.machine_interface import BEGINNING, INCARNATION, Start
+from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.protocol.topology import LOOP_ROLES
+from noack.runtime.spool import read_chunks
+from noack.runtime.telemetry import NOTICES
+from tests.fuzz.plane import FakePlane, Query, Sample
+
+
+class Run:
+    """A run directory, and the recorders that follow each other in it."""
+
+    def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
+        self.scenario, self.run_dir = resolve(validate(content, "")), run_dir
+        (run_dir / SCENARIO_FILE).write_text(dumps(self.scenario))
+        self.begin(BEGINNING, "f")
+
+    def begin(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
+        self.plane = plane = FakePlane()
+        plane.instance = instance
+        self.recorder = Recorder(
+            self.scenario,
+            self.run_dir,
+            plane,
+            view=None,
+            start=start,  # type: ignore[arg-type]
+        )
+        for role in present:
+            plane.put("alive", Sample(f"noack/0/alive/{role}/{role}"))
+        self.recorder.poll()
+
+    def follow(self, start: Start, instance: str, present: Sequence[str] = LOOP_ROLES) -> None:
+        self.recorder.abandon()
+        self.begin(start, instance, present)
+
+    def say(self, table: str, first: int, payload: bytes, role: str, incarnation: int = 0) -> None:
+        header = json.dumps({"first": first, "incarnation": incarnation}).encode()
+        self.plane.put("telemetry", Sample(f"t/{role}/{table}", payload, header))
+        self.recorder.poll()
+
+    def rows(self, table: str, count: int, incarnation: int = 0) -> None:
+        rows = np.zeros(count, self.recorder._types[table])
+        rows["input"] = incarnation * INCARNATION + np.arange(count)
+        self.say(table, 0, rows.tobytes(), OWNER[table], incarnation)
+
+    def notice(self, role: str, incarnation: int = 0) -> None:
+        line = {"t_ns": 0, "level": "info", "text": role}
+        self.say(NOTICES, 0, json.dumps(line).encode(), role, incarnation)
+
+    def goodbye(self, role: str, incarnation: int = 0, **rows: int) -> Any:
+        tables = {table: 0 for table in OWNER if OWNER[table] == role}
+        report = {
+            "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
+            "incarnation": incarnation, "instance": role,
+        }  # fmt: skip
+        query = Query(f"goodbye/{role}", json.dumps(report).encode())
+        self.plane.put("goodbye", query)
+        self.recorder.poll()
+        return json.loads(query.replies[0])["rows"]
+
+
+@pytest.fixture
+def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
+    found = Run(content, tmp_path)
+    yield found
+    found.recorder.abandon()
+
+
+def test_it_asks_for_nothing_that_is_on_disk(run: Run) -> None:
+    run.rows(PLANT_STEP, 5)
+    run.notice("plant")
+    run.notice("sensor", 1)
+    run.follow(Start(1, 0), "a")
+    assert run.goodbye("plant", **{PLANT_STEP: 5, NOTICES: 1}) == {}
+    assert run.goodbye("sensor", 1, **{NOTICES: 1}) == {}
+    assert run.goodbye("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
+
+
+def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run) -> None:
+    run.rows(SENSOR_MEASUREMENT, 7)
+    run.follow(Start(1, 0), "b")
+    run.rows(SENSOR_MEASUREMENT, 3, incarnation=1)
+    run.follow(Start(2, 0), "a")
+    run.rows(PLANT_STEP, 2)
+    run.recorder.confirm()
+    assert run.plane.kept["sensor"] == {"incarnation": 1, "rows": {SENSOR_MEASUREMENT: [[0, 3]]}}
+    assert run.plane.kept["plant"] == {"incarnation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
+
+
+def test_it_does_not_wait_for_who_has_left(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    run.follow(Start(1, 0), "a")
+    assert not run.recorder.finished
+    for role in LOOP_ROLES:
+        assert run.goodbye(role) == {}
+    assert run.recorder.finished
+    run.follow(Start(2, 0), "b", present=["plant"])
+    assert not run.recorder.finished
+    monkeypatch.setattr(recorder, "_TOLD_S", -1.0)
+    assert not run.recorder.finished
+    assert run.goodbye("plant") == {}
+    assert run.recorder.finished
+
+
+def test_a_log_on_a_full_disk_costs_no_record(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What fails first then is the view; to say so must not fail, too."""
+
+    class Full(StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("sys.stderr", Full())
+        run.recorder._give_up_view(ViewError("no space left"))
+        run.say("junk", 0, b"", "plant")
+    run.rows(PLANT_STEP, 3)
+    assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1

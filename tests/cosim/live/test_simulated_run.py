@@ -1,0 +1,147 @@
+"""A simulated run leaves a run directory that everything which reads runs takes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.chunk
+from typer.testing import CliRunner, Result
+
+from cosim.cli import app
+from cosim.live.simulated_run import simulate_run
+from cosim.output.viewer import blueprint
+from cosim.output.viewer.opening_time import opening_time_ns
+from cosim.record.align import join_all
+from cosim.record.environment import write_environment
+from cosim.record.run_record import RunRecord, load_record
+from cosim.simulation.virtual_time import Progress, simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError, MachineError
+from noack.protocol.record_tables import tables
+
+ROOT = Path(__file__).parents[3]
+SHORT = ("horizon_s=2", "plant.rate_hz=100", "controller.rate_hz=100", "trigger.beta=0.05")
+PATH = ROOT / "scenarios" / "lane_following.toml"
+
+
+def noack(*arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    settings = [word for setting in SHORT for word in ("--set", setting)]
+    done = noack("simulate", str(PATH), "--runs", str(folder), "--json", *settings)
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == json.loads((folder / "latest/summary.json").read_text())
+    return folder
+
+
+def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
+    run_dir = runs / "latest"
+    assert {path.name for path in run_dir.iterdir()} == {
+        "scenario.toml", "environment.json", "record", "recording.rrd", "reports.json",
+        "summary.json", "report.html", "ending.json", "logs", ".lock",
+    }  # fmt: skip
+    assert json.loads((run_dir / "environment.json").read_text())["kind"] == "simulated"
+    assert {path.name for path in (run_dir / "record").iterdir()} == {
+        *(f"{table}.parquet" for table in tables(4, 2)),
+        "notices.jsonl",
+    }
+
+
+def test_who_wants_no_report_gets_none_and_may_have_it_later(tmp_path: Path) -> None:
+    settings = [word for setting in SHORT for word in ("--set", setting)]
+    done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
+    assert done.exit_code == 0, done.output
+    assert "report.html" not in done.stdout
+    report = (tmp_path / "latest").resolve() / "report.html"
+    assert not report.exists()
+    assert noack("report", "--runs", str(tmp_path)).exit_code == 0
+    assert report.exists()
+
+
+def test_the_record_on_disk_is_the_simulators(runs: Path) -> None:
+    again, loaded = simulate(resolve(load(PATH, SHORT))), load_record(runs / "latest")
+    assert all(again[table].tobytes() == loaded[table].tobytes() for table in again.tables)
+    assert loaded.scenario == again.scenario
+    assert loaded.kind == again.kind == "simulated"
+    assert loaded.reports == again.reports
+    assert loaded.notices == again.notices
+
+
+def test_the_summary_says_that_it_was_simulated(runs: Path) -> None:
+    summary = json.loads((runs / "latest" / "summary.json").read_text())
+    assert summary["kind"] == "simulated"
+    assert summary["exit"] == {"status": 0, "reason": "horizon"}
+    assert summary["replay"] is None
+    assert summary["reached_s"] == 2.0
+    shown = noack("summary", "--runs", str(runs))
+    assert shown.exit_code == 0
+    assert "simulated" in shown.stdout
+    assert "lateness" not in shown.stdout
+    assert "real-time" not in shown.stdout
+
+
+def test_a_lost_summary_is_made_anew_from_the_record(runs: Path, tmp_path: Path) -> None:
+    summary = runs / "latest" / "summary.json"
+    content = json.loads(summary.read_text())
+    summary.unlink()
+    anew = json.loads(noack("summary", "--runs", str(runs), "--json").stdout)
+    summary.write_text(json.dumps(content))
+    assert anew | {"exit": None} == content | {"exit": None}
+
+
+def test_the_recording_shows_the_run_without_lateness(runs: Path) -> None:
+    reader = rerun.chunk.RrdReader(runs / "latest" / "recording.rrd")
+    (store,) = reader.recordings()
+    paths = {chunk.entity_path.removeprefix("/") for chunk in reader.stream(store=store)}
+    assert blueprint.EVENT in paths
+    assert blueprint.INPUT in paths
+    assert not [path for path in paths if path.startswith("lateness")]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
+def test_what_is_broken_off_leaves_nothing_behind(tmp_path: Path, error: BaseException) -> None:
+    def broken(resolved: Scenario, *, progress: Progress | None) -> RunRecord:
+        raise error
+
+    expected = MachineError if isinstance(error, OSError) else type(error)
+    with pytest.raises(expected):
+        simulate_run(load(PATH, SHORT), tmp_path, broken)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_older_run_directory_is_a_live_runs(runs: Path, tmp_path: Path) -> None:
+    """Run directories that were made before simulation was do not say what they are."""
+    folder = tmp_path / "old"
+    folder.mkdir()
+    for path in (runs / "latest").iterdir():
+        (folder / path.name).symlink_to(path)
+    (folder / "environment.json").unlink()
+    assert load_record(folder).kind == "live"
+    write_environment(folder, "simulated")
+    assert load_record(folder).kind == "simulated"
+
+
+def test_the_view_opens_where_the_controller_errs_most(runs: Path) -> None:
+    run_dir = runs / "latest"
+    record = load_record(run_dir)
+    joined = join_all(record)
+    e_c = np.where(joined.since_delivery(record.scenario), joined.e_c_norm, -1.0)
+    summary = json.loads((run_dir / "summary.json").read_text())
+    assert summary["sup_e_c_norm"] == e_c.max()
+    assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]
+
+
+def test_recorded_scenario_may_be_larger_than_one_that_a_person_writes(tmp_path: Path) -> None:
+    (tmp_path / "long.txt").write_text("10" * 200_000)
+    trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
+    ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path, view=False)
+    assert load_record(ending.run_dir).scenario.network.loss.model == "scripted"
+    with pytest.raises(CallerError, match=r"scenario.toml: cannot be read: larger than 1 MiB$"):
+        load(ending.run_dir / "scenario.toml")

@@ -1,0 +1,61 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from cosim.output.report.decimate import decimate
+
+VALUES = arrays(
+    np.float64,
+    st.integers(0, 300),
+    elements=st.one_of(st.floats(-5, 5, width=16), st.just(np.nan)),
+)
+
+
+@given(VALUES, st.integers(1, 20), st.integers(0, 5))
+def test_each_column_keeps_its_extremes_and_its_ends(
+    y: np.ndarray, columns: int, step: int
+) -> None:
+    """Checked column by column, in the way that a person would draw it."""
+    t = np.cumsum(np.arange(len(y)) % (step + 1) + 0.5)
+    keep = decimate(t, y, columns)
+    assert np.array_equal(keep, np.unique(keep))
+    if len(y) <= 4 * columns:
+        assert len(keep) == len(y)
+        return
+    assert len(keep) <= 4 * columns
+    column = np.minimum((t - t[0]) / (t[-1] - t[0]) * columns, columns - 1).astype(int)
+    # An index that rounding puts into a neighbouring column is in neither comparison.
+    edge = np.abs((t - t[0]) / (t[-1] - t[0]) * columns - column) < 1e-9
+    for c in np.unique(column):
+        inside = (column == c) & ~edge
+        kept = np.isin(np.arange(len(y)), keep) & (column == c)
+        seen = y[inside & np.isfinite(y)]
+        if len(seen):
+            assert np.nanmin(y[kept]) <= seen.min()
+            assert np.nanmax(y[kept]) >= seen.max()
+    assert keep[0] == 0
+    assert keep[-1] == len(y) - 1
+
+
+def test_one_sample_in_a_million_is_not_lost() -> None:
+    t, y = np.linspace(0, 1, 1_000_000), np.zeros(1_000_000)
+    y[123_456], y[765_432] = 1.0, -2.0
+    keep = decimate(t, y, 600)
+    assert {123_456, 765_432} <= set(keep)
+    assert len(keep) <= 2400
+
+
+def test_a_gap_stays_a_gap() -> None:
+    t, y = np.linspace(0, 1, 10_000), np.ones(10_000)
+    y[4000:6000] = np.nan
+    keep = decimate(t, y, 100)
+    gap = np.isnan(y[keep])
+    assert gap.any()
+    assert t[keep][gap].min() < 0.41
+    assert t[keep][gap].max() > 0.59
+
+
+def test_samples_at_one_instant_are_all_one_column() -> None:
+    keep = decimate(np.zeros(100), np.arange(100.0), 5)
+    assert keep.tolist() == [0, 99]

@@ -1,0 +1,314 @@
+import io
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from cosim.output import palette
+from cosim.output.report import signal_figures
+from cosim.output.report.axes import Bound, BoundKind
+from cosim.output.report.figure_files import inline, save
+from cosim.output.report.figure_style import printed, settings
+from tests.cosim.output.report.conftest import HOSTILE
+
+SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
+UNITS = re.compile(r"\[(s|wall µs)\]$")
+UNITLESS = re.compile(r"x_\d|norm|input|count|share of steps at least as late")
+"""Pure numbers, and what is in the model's own units."""
+
+
+def values(case: str, k: int, columns: int | None = None) -> np.ndarray:
+    y = np.abs(np.sin(np.arange(k * (columns or 1)) * 0.05)) + 0.01
+    if case == "not finite":
+        y[::7], y[::11], y[::13], y[::17] = np.nan, np.inf, -np.inf, 1e300
+    return y if columns is None else y.reshape(k, columns)
+
+
+def drawn_for(case: str) -> dict[str, Figure]:
+    """Every figure, on data of the same kind."""
+    k = SIZES[case]
+    n = 10 if case == "ten" else 4
+    t_s = np.arange(k) * 0.002
+    e = k // 50
+    event_s, lost = np.arange(e) * 0.1, np.arange(e) % 3 > 0
+    bound = [Bound("certified", t_s, 5 * np.exp(-t_s))]
+    return {
+        "paper": signal_figures.paper_figure(
+            mode="zoh",
+            t_s=t_s,
+            x=values(case, k, n),
+            x_s=values(case, k, n),
+            x_c=values(case, k, n),
+            state_names=[f"x_{i}" for i in range(n)],
+            broadcast_s=event_s,
+            dropped=lost,
+            received_s=event_s[~lost],
+            forced=np.arange((~lost).sum()) % 2 > 0,
+            title="a run",
+        ),
+        "error": signal_figures.error_figure(
+            t_s, values(case, k), values(case, k), values(case, k), bound
+        ),
+        "norm": signal_figures.state_norm_figure(t_s, values(case, k), bound),
+        "input": signal_figures.input_figure(t_s, values(case, k, n), [f"u_{i}" for i in range(n)]),
+        "lateness": signal_figures.lateness_figure(
+            {"plant": values(case, k), "sensor": values(case, k) - 0.2}, 2000.0
+        ),
+        "latency": signal_figures.latency_figure(t_s, values(case, k), 1.0),
+        "inter": signal_figures.inter_event_figure(event_s, bound, 1.0),
+    }
+
+
+@pytest.fixture(scope="module", params=SIZES)
+def drawn(request: pytest.FixtureRequest) -> dict[str, Figure]:
+    return drawn_for(request.param)
+
+
+def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
+    for name, figure in drawn.items():
+        for axes in figure.axes:
+            beside = len(axes.figure.axes) == 2 and axes is axes.figure.axes[1] and name != "paper"
+            shared = axes.xaxis.get_tick_params().get("labelbottom") is False
+            for label, is_hidden in ((axes.get_ylabel(), beside), (axes.get_xlabel(), shared)):
+                has_unit = UNITS.search(label) or UNITLESS.fullmatch(label)
+                assert is_hidden or has_unit, (name, label)
+
+
+def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> None:
+    """Warnings are errors here: no log of zero, no limits that coincide, no layout that fails."""
+    for name, figure in drawn.items():
+        save(figure, tmp_path / f"{name}.png")
+        save(figure, tmp_path / f"{name}.svg")
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
+
+
+def test_nothing_is_cut_off_and_no_texts_meet(drawn: dict[str, Figure]) -> None:
+    for name, figure in drawn.items():
+        with settings():
+            figure.draw_without_rendering()
+            box, size_in = figure.get_tightbbox(), figure.get_size_inches()
+            assert box.x0 >= 0, name
+            assert box.y0 >= 0, name
+            assert box.x1 <= size_in[0], name
+            assert box.y1 <= size_in[1], name
+            for axes in figure.axes:
+                heads = [*axes.texts, axes.title, axes.yaxis.get_offset_text(), axes._left_title]
+                legend = axes.get_legend()
+                heads += legend.get_texts() if legend else []
+                boxes = [text.get_window_extent() for text in heads if text.get_text()]
+                for i, one in enumerate(boxes):
+                    assert not any(one.overlaps(other) for other in boxes[:i]), name
+
+
+def test_a_figure_without_data_says_so() -> None:
+    for name, figure in drawn_for("empty").items():
+        for axes in figure.axes:
+            assert "no data" in [text.get_text() for text in axes.texts], name
+
+
+def spike(k: int) -> np.ndarray:
+    y = np.zeros(k)
+    y[k // 3] = 7.0
+    return y
+
+
+def test_a_long_run_is_drawn_with_its_peaks_and_few_points() -> None:
+    k = 200_000
+    t_s = np.arange(k) * 0.002
+    x = np.column_stack([spike(k), -spike(k)])
+    none, no = np.zeros(0), np.zeros(0, bool)
+    figure = signal_figures.paper_figure(
+        mode="model", t_s=t_s, x=x, x_s=x, x_c=x, state_names=["a", "b"],
+        broadcast_s=none, dropped=no, received_s=none, forced=no,
+    )  # fmt: skip
+    for axes, extreme in zip(figure.axes, (7.0, -7.0), strict=False):
+        for line in axes.lines:
+            assert extreme in line.get_ydata()
+            assert len(line.get_ydata()) <= 2400
+
+
+def labels(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    return [] if legend is None else [text.get_text() for text in legend.get_texts()]
+
+
+def test_intervals_and_fates_are_drawn_where_they_belong() -> None:
+    broadcast_s = np.array([0.0, 1.0, 1.5, 3.0, 3.25])
+    dropped = np.array([False, True, False, True, False])
+    t_s, x = np.linspace(0, 4, 10), np.zeros((10, 1))
+    figure = signal_figures.paper_figure(
+        mode="model", t_s=t_s, x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=broadcast_s,
+        dropped=dropped, received_s=broadcast_s[~dropped], forced=np.array([True, False, True]),
+    )  # fmt: skip
+    _, above, below = figure.axes
+    assert labels(above) == ["sent", "sent, lost"]
+    assert labels(below) == ["received", "received, forced", "lost"]
+    found = {
+        line.get_marker(): dict(zip(line.get_xdata(), line.get_ydata(), strict=True))
+        for axes in (above, below)
+        for line in axes.lines
+        if line.get_marker() != "None"
+    }
+    assert found["D"] == {3.25: 1.75}  # the first, at 0, has no interval
+    assert found["o"] == {1.5: 1.5}  # the one received without force
+    sent, lost = above.lines[1], above.lines[2]
+    assert sent.get_xdata().tolist() == [1.5, 3.25]
+    assert lost.get_ydata().tolist() == [1.0, 1.5]
+
+
+@pytest.mark.parametrize(("mode", "head"), [("model", "MB-ET"), ("zoh", "ZOH-ET")])
+def test_the_papers_figure_is_named_as_in_the_paper(mode: Any, head: str) -> None:
+    x, none, no = np.zeros((3, 1)), np.zeros(0), np.zeros(0, bool)
+    figure = signal_figures.paper_figure(
+        mode=mode, t_s=np.arange(3.0), x=x, x_s=x, x_c=x, state_names=["x"], broadcast_s=none,
+        dropped=no, received_s=none, forced=no, title="one draw out of 1,000",
+    )  # fmt: skip
+    assert [text.get_text() for text in figure.texts] == [f"{head}: one draw out of 1,000"]
+
+
+def test_names_are_taken_literally() -> None:
+    """Neither as mathematics, nor hidden for a leading underscore."""
+    names = [HOSTILE, "_hidden", "a$b$c", "日本", ""]
+    figure = signal_figures.input_figure(np.arange(3.0), np.zeros((3, 5)), names)
+    assert len(labels(figure.axes[0])) == 5
+    text = inline(figure, "input", HOSTILE)
+    assert "<script" not in text
+
+
+def test_bounds_are_dashed_and_the_measured_is_not() -> None:
+    t_s = np.arange(1.0, 5.0)
+    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i) for i in range(5)]
+    (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+    assert [line.get_linestyle() for line in axes.lines] == ["-"] * 3 + ["--"] * 5
+    assert labels(axes)[3:] == [one.label for one in bound]
+    styles = {(line.get_color(), str(line._dash_pattern)) for line in axes.lines[3:7]}
+    assert len(styles) == 4
+
+
+def test_a_bound_has_the_colour_of_what_it_rests_on_in_every_figure() -> None:
+    t_s = np.arange(1.0, 5.0)
+    kinds: list[BoundKind] = ["identity", "certified", "printed", "certified"]
+    bound = [Bound(f"bound {i}", t_s, 3.0 + t_s + i, kind) for i, kind in enumerate(kinds)]
+    own = {
+        "identity": palette.IDENTITY, "certified": palette.CERTIFIED, "printed": palette.PRINTED,
+    }  # fmt: skip
+    for drawn, measured in (
+        (signal_figures.error_figure(t_s, t_s, t_s, t_s, bound), 3),
+        (signal_figures.state_norm_figure(t_s, t_s, bound), 1),
+    ):
+        lines = drawn.axes[0].lines[measured:]
+        assert [line.get_color() for line in lines] == [printed(own[kind]) for kind in kinds]
+        assert len({(line.get_color(), str(line._dash_pattern)) for line in lines}) == 4
+
+
+def test_a_legend_takes_as_few_rows_as_there_is_room_for() -> None:
+    t_s = np.arange(1.0, 5.0)
+    names = ("for the scenario's plant", "for every plant of the uncertainty box")
+    bound = [Bound(f"certified {name}", t_s, 3.0 + t_s) for name in names]
+    bound.append(Bound("bound from (I1)", t_s, 2.0 + t_s, "identity"))
+    (axes,) = signal_figures.error_figure(t_s, t_s, t_s, t_s, bound).axes
+    assert axes.get_legend()._ncols == 2
+
+
+def test_no_legend_covers_data() -> None:
+    for name, figure in drawn_for("ten").items():
+        figure.savefig(io.BytesIO())  # lays it out
+        for axes in figure.axes:
+            if axes.get_legend() is not None:
+                assert axes.get_legend().get_window_extent().y0 >= axes.bbox.y1 - 1, name
+
+
+def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
+    late_us = np.random.default_rng(1).lognormal(3, 1, 5000)
+    (axes,) = signal_figures.lateness_figure({"plant": late_us}).axes
+    (line,) = axes.lines
+    found_us, share = line.get_xdata(), line.get_ydata()
+    assert found_us[-1] == late_us.max()
+    assert share[-1] == 1 / 5000
+    assert found_us[0] == late_us.min()
+    assert share[0] == 1
+    assert np.array_equal(share, [(late_us >= value).mean() for value in found_us])
+    assert len(share) < 300
+
+
+def same(draw: Callable[[], Figure], tmp_path: Path, ending: str) -> set[bytes]:
+    found = set()
+    for _ in range(2):
+        save(draw(), tmp_path / f"figure.{ending}")
+        found.add((tmp_path / f"figure.{ending}").read_bytes())
+        with mpl.rc_context({"lines.linewidth": 9, "font.size": 20, "svg.hashsalt": "other"}):
+            save(draw(), tmp_path / f"figure.{ending}")
+            found.add((tmp_path / f"figure.{ending}").read_bytes())
+    return found
+
+
+@pytest.mark.parametrize("ending", ["svg", "png"])
+def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> None:
+    (content,) = same(lambda: drawn_for("normal")["error"], tmp_path, ending)
+    for trace in (b"http://purl", b"matplotlib.org", b"dc:date", b"Software"):
+        assert trace not in content
+
+
+def test_another_ending_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"\.svg or \.png, not as \.pdf"):
+        save(Figure(), tmp_path / "figure.pdf")
+
+
+def test_drawing_leaves_the_settings_alone() -> None:
+    before = dict(mpl.rcParams)
+    drawn_for("one")
+    assert dict(mpl.rcParams) == before
+
+
+def luminance(colour: Any) -> float:
+    """Relative luminance by WCAG 2.2."""
+    parts = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(colour)]
+    return float(np.dot(parts, [0.2126, 0.7152, 0.0722]))
+
+
+def contrast(one: Any, other: Any) -> float:
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
+def test_every_colour_stands_out_on_paper_and_on_a_dark_screen(paper: str) -> None:
+    """3 to 1, what WCAG asks of graphics."""
+    css = Path(signal_figures.__file__).with_name("report.css").read_text()
+    assert f"--paper: {paper}" in css
+    for colour in {*palette.SERIES, *palette.PROCESSES.values(), palette.THRESHOLD, palette.FORCED}:
+        assert contrast(printed(colour), paper) >= 3, colour
+
+
+@pytest.mark.parametrize("paper", ["#ffffff", "#14181d"])
+def test_text_stands_out(paper: str) -> None:
+    """4.5 to 1, what WCAG asks of text."""
+    css = Path(signal_figures.__file__).with_name("report.css").read_text()
+    (block,) = [block for block in css.split(":root") if f"--paper: {paper}" in block][:1]
+    shade = re.search(r"--shade: (#\w+)", block)
+    assert shade
+    for name, colour in re.findall(r"--(ink|quiet|good|bad|doubt): (#\w+)", block):
+        assert contrast(colour, paper) >= 4.5, name
+        assert contrast(colour, shade[1]) >= 4.5, name
+
+
+def test_nobody_imports_matplotlib_before_it_is_needed() -> None:
+    """Not the command line, and not a process of the loop."""
+    code = (
+        "import sys, cosim.cli, cosim.live.finalize, cosim.output.run_tables, cosim.live.recorder, "
+        "plant_server.__main__, sensor_node.__main__, controller_node.__main__, netem.__main__\n"
+        "assert not {'matplotlib', 'jinja2'} & sys.modules.keys()\n"
+        "import cosim.output.report.report_file\n"
+        "assert 'matplotlib.pyplot' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

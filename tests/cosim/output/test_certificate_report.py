@@ -1,0 +1,243 @@
+"""``noack certify``: what it says, to a person and to a program; what the documentation quotes."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.cli import app
+from cosim.output.certificate_report import IDEAL, SCHEDULE, Study, study, with_weight
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
+from noack.theory.assumptions import Verdict
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import certify_box, outside_box
+
+ROOT = Path(__file__).parents[3]
+
+
+def scenario(name: str, *settings: str) -> Scenario:
+    return resolve(load(ROOT / "scenarios" / f"{name}.toml", settings))
+
+
+def found(study: Study, under: str, scope: str) -> dict[str, float]:
+    (certificate,) = [
+        c for u, c in study.certificates if u == under and scope in (c.source, c.scope)
+    ]
+    assert certificate.constants is not None
+    return certificate.constants._asdict()
+
+
+@pytest.fixture(scope="module")
+def lane() -> Study:
+    return study(scenario("lane_following"), 2)
+
+
+@pytest.fixture(scope="module")
+def weighted() -> Study:
+    return study(scenario("lane_weighted"), 2)
+
+
+def test_the_lane_example_reaches_its_figures(lane: Study, weighted: Study) -> None:
+    """A hundred times the printed inter-event time; Δ = M = 5 in a chosen weight."""
+    assert lane.theorem_2 is not None
+    printed_s = lane.theorem_2.inter_event_s
+    assert found(lane, IDEAL, "certificate")["inter_event_s"] >= 100 * printed_s
+    assert found(weighted, IDEAL, "certificate")["inter_event_s"] >= 500 * printed_s
+    assert found(weighted, IDEAL, "certificate")["delta"] == pytest.approx(5.0, abs=1e-9)
+    assert found(weighted, IDEAL, "box certificate")["delta"] == pytest.approx(5.0, abs=1e-9)
+
+
+def test_the_documentation_quotes_what_is_computed(lane: Study, weighted: Study) -> None:
+    assert lane.theorem_2 is not None
+    text = (ROOT / "docs/theory.md").read_text().partition("## The adversary")[0]
+    rows = {
+        key: [cell.strip() for cell in cells.strip(" |").split("|")]
+        for key, cells in re.findall(r"^\| (Δ|X|δ) \|(.*)$", text, re.MULTILINE)
+    }
+    own, chosen = (found(s, IDEAL, "certificate") for s in (lane, weighted))
+    theorem = lane.theorem_2
+    assert rows["Δ"] == ["(same)", f"{own['delta']:.3g}", f"{chosen['delta']:.3g}"]
+    printed = theorem.state_start + theorem.state_forced
+    assert rows["X"] == [f"{printed:.3g}", f"{own['state']:.3g}", f"{chosen['state']:.3g}"]
+    assert rows["δ"] == [
+        f"{1e6 * theorem.inter_event_s:.3g} µs",
+        f"{1e3 * own['inter_event_s']:.3g} ms",
+        f"{1e3 * chosen['inter_event_s']:.3g} ms",
+    ]
+    live = found(lane, SCHEDULE, "certificate")
+    least_ms = 1e3 * live["inter_event_s"]
+    said = f"Δ = {live['delta']:.3g}, X = {live['state']:.3g} and δ = {least_ms:.0f} ms"
+    assert said in " ".join(text.split())
+    limits = weighted.limits["the scenario's plant"]
+    assert f"sampling periods up to {1e3 * limits.sampling_s:.0f} ms" in text
+
+
+def test_beyond_the_largest_certified_schedule_there_is_no_certificate(lane: Study) -> None:
+    """The limits are limits: a little less stands, a little more does not."""
+    from noack.theory.run_conditions import nominal_conditions
+    from noack.theory.scenario_certificates import own_plant
+
+    resolved = scenario("lane_following")
+    scheduled, scope = nominal_conditions(resolved, 2), own_plant(resolved)
+    limits = lane.limits["the scenario's plant"]
+    for share, stands in ((0.99, True), (1.01, False)):
+        for changed in (
+            scheduled._replace(
+                sampling_s=share * limits.sampling_s, spacing_s=share * limits.sampling_s
+            ),
+            scheduled._replace(hold_s=share * limits.hold_s),
+        ):
+            assert (scope.certificate(changed).constants is not None) == stands
+
+
+def test_a_weight_is_chosen_that_contracts_and_keeps_the_volume() -> None:
+    resolved = scenario(
+        "lane_following", 'model={name="double_integrator"}', "plant={initial_state=[1.0,0.0]}"
+    )
+    shares: list[float] = []
+    weighted, W = with_weight(resolved, "chosen", shares.append)
+    assert W is not None
+    assert abs(np.linalg.det(W)) == pytest.approx(1.0)
+    assert shares[-1] == 1.0
+    np.testing.assert_array_equal(np.array(weighted.trigger.weight), W)
+    loop = loop_of(weighted)
+    turned = W @ (loop.H + 0.25 * np.eye(2)) @ np.linalg.inv(W)
+    assert np.linalg.eigvalsh(turned + turned.T).max() <= 1e-9
+    better = found(study(weighted, 0, W), IDEAL, "certificate")
+    plain = found(study(resolved, 0), IDEAL, "certificate")
+    assert better["delta"] <= 5.0
+    assert better["inter_event_s"] >= plain["inter_event_s"]
+
+
+def test_no_weight_helps_a_hold() -> None:
+    with pytest.raises(CallerError, match=r"weight chosen: α = 0\.25 /s is not below"):
+        with_weight(scenario("lane_following", 'mode="zoh"'), "chosen")
+    with pytest.raises(CallerError, match='given, identity or chosen, not "best"'):
+        with_weight(scenario("lane_following"), "best")
+
+
+def test_identity_takes_the_weight_away() -> None:
+    plain, W = with_weight(scenario("lane_weighted"), "identity")
+    assert W is None
+    assert plain.trigger.weight is None
+
+
+def test_the_command_prints_one_document() -> None:
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--late", "1", "--json"])
+    assert result.exit_code == 0, result.output
+    document = json.loads(result.stdout)
+    assert [c["under"] for c in document["certificates"]] == [IDEAL, IDEAL, SCHEDULE, SCHEDULE]
+    first = document["certificates"][0]
+    assert first["constants"]["delta"] > 1
+    assert first["floor_from_s"] == pytest.approx(np.log(0.02 / 0.001) / 0.3)
+    assert first["floor_constants"]["rate_per_s"] == 0
+    assert {a["verdict"] for a in first["assumptions"]} <= {str(v) for v in Verdict}
+    assert document["limits"]["the scenario's plant"]["sampling_s"] > 0.002
+
+
+def test_nothing_certified_is_a_failure_that_says_why() -> None:
+    """The gain does not stabilise this plant at all."""
+    settings = ["--set", "model.gain=[[1.0, 1.0]]", "--set", "model.allow_unstable=true"]
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", *settings])
+    assert result.exit_code == 1
+    assert "void" in result.stdout
+    assert "grows at" in result.stdout
+
+
+def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum"])
+    said = " ".join(result.stdout.split())
+    sentences = said.split("In words: ")[1:]
+    assert [one.partition(",")[0] for one in sentences] == [
+        "of the scenario's plant", "of every plant of the box"
+    ]  # fmt: skip
+    document = json.loads(
+        CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json"]).stdout
+    )
+    scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
+    for sentence, one in zip(sentences, scheduled, strict=True):
+        assert "where what is presupposed above holds" in sentence
+        assert "at most 3 in a row" in sentence
+        assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
+        assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
+
+
+def test_a_gain_of_the_other_sign_is_recognised() -> None:
+    settings = ["--set", "model.gain=[[15.0, 5.0]]", "--set", "model.allow_unstable=true"]
+    arguments = ["certify", "unstable_pendulum", *settings]
+    said = " ".join(CliRunner().invoke(app, arguments).stdout.split())
+    assert "the loop's u is +Kx, and −K would stabilise it" in said
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        ["plant.uncertainty_A=[[0.0, 0.0], [1e3, 1e3]]"],
+        ["plant.uncertainty_A=[[0.0, 0.0], [1e300, 0.0]]", 'plant.draw="nominal"'],
+        ["plant.initial_state=[1e300, 1e300]"],
+        ["trigger.beta=1e308", "trigger.floor=0.0"],
+        ["model.gain=[[0.0, -1e7]]", "model.allow_unstable=true"],
+    ],
+)
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_numbers_beyond_floating_point_are_no_certificate(settings: list[str]) -> None:
+    """Neither a traceback nor a certificate with a constant that is no number."""
+    arguments = [part for setting in settings for part in ("--set", setting)]
+    result = CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json", *arguments])
+    assert result.exit_code in (0, 1), result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    for certificate in json.loads(result.stdout)["certificates"]:
+        if certificate["constants"] is None:
+            assert certificate["void"]
+        else:
+            assert all(v is not None for k, v in certificate["constants"].items()
+                       if k != "inter_event_s")  # fmt: skip
+
+
+BOXED = (
+    'model={name="double_integrator"}',
+    "plant={initial_state=[1.0,0.0],uncertainty_A=[[0.0,0.0],[0.3,0.1]]}",
+)
+
+
+def test_a_plant_outside_its_box_is_named() -> None:
+    inside = scenario("lane_following", *BOXED)
+    assert outside_box(inside) is None
+    assert outside_box(scenario("lane_following")) is None
+    outside = scenario(
+        "lane_following", *BOXED, 'plant.draw="given"', "plant.A=[[0.0,1.0],[2.0,0.0]]",
+        "plant.B=[[0.0],[1.0]]",
+    )  # fmt: skip
+    said = outside_box(outside)
+    assert said == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
+    claims = [c for c in Claims(simulate(outside)).judge() if c.source == "box certificate"]
+    assert claims
+    assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
+
+
+def test_a_box_too_large_for_alpha_is_certified_at_a_slower_rate() -> None:
+    """Bounds that fall like e^(−rate·t), and no inter-event time; a larger box has none at all."""
+    certified = {}
+    for wide in (0.2, 0.5, 5.0):
+        settings = [
+            *BOXED[:1],
+            f"plant={{initial_state=[1.0,0.0],uncertainty_A=[[0,0],[{wide},0]]}}",
+        ]
+        resolved = scenario("lane_following", *settings, "trigger.alpha_per_s=0.6")
+        found = certify_box(resolved, ideal_conditions(resolved))
+        assert found is not None
+        certified[wide] = found
+    assert certified[0.2].constants is not None
+    assert certified[5.0].constants is None
+    slower = certified[0.5].constants
+    assert slower is not None
+    assert 0 < slower.rate_per_s < 0.6
+    assert slower.inter_event_s is None

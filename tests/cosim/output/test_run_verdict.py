@@ -1,0 +1,153 @@
+"""The end of a run: three lines, one table that fits, and nothing alarming without a cause."""
+
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+import noack
+from cosim.analysis.run_outcome import Outcome
+from cosim.live.finalize import reopen
+from cosim.output.remarks import remarks
+from cosim.output.run_tables import short_numbers
+from cosim.output.run_verdict import print_outcome, verdict
+
+RED = "\x1b[1;31m"
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """Of the paper's example, which goes well."""
+    run = noack.simulate("lane_following", runs=tmp_path_factory.mktemp("runs"))
+    return reopen(run.directory)
+
+
+def printed(outcome: Outcome, *, verbose: bool = False, **changed: Any) -> str:
+    """What a terminal of 80 columns gets, colours included."""
+    file = io.StringIO()
+    console = Console(file=file, width=80, force_terminal=True, color_system="standard")
+    print_outcome(console, replace(outcome, summary=outcome.summary | changed), verbose=verbose)
+    return file.getvalue()
+
+
+def claim(verdict: str, why: str = "") -> dict[str, Any]:
+    return {"what": "a", "source": "b", "bound": "c", "ratio": 1.0, "since_s": 1.0, "why": why,
+            "verdict": verdict}  # fmt: skip
+
+
+def test_a_run_that_went_well_is_a_verdict_a_table_and_a_way_to_the_rest(outcome: Outcome) -> None:
+    summary = outcome.summary
+    lines = [line.text for line in verdict(summary)]
+    claims = len(summary["claims"])
+    assert lines == [
+        "completed 20 s",
+        f"{summary['events']} transmissions (ideal loop: {summary['fidelity']['events_ideal']}), "
+        f"{summary['deliveries']} delivered",
+        f"claims: {claims} of {claims} held",
+    ]
+    text = printed(outcome)
+    assert RED not in text
+    assert "violated" not in text
+    assert len(text.splitlines()) <= 25
+    *_, last = text.splitlines()
+    assert "--verbose" in last
+    assert str(outcome.run_dir) in last
+    assert list(remarks(summary)) == []
+
+
+def test_all_tables_are_there_on_request_and_do_not_alarm(outcome: Outcome) -> None:
+    text = printed(outcome, verbose=True)
+    for what in ("numerical check of x_c − x_s (I1)", "the paper's assumptions", "idealised",
+                 "claims checked against this run", "certificate"):  # fmt: skip
+        assert what in text
+    assert RED not in text
+    assert "violated" not in text
+
+
+@pytest.mark.parametrize(
+    ("status", "reason", "said"),
+    [
+        (0, "horizon", "completed 20 s"),
+        (1, "sensor died", "not completed: sensor died (20 s of 20 s)"),
+        (130, "stopped by SIGINT", "not completed: stopped by SIGINT (20 s of 20 s)"),
+        (0, "horizon; rows are missing", "completed 20 s: horizon; rows are missing"),
+    ],
+)  # fmt: skip
+def test_the_first_line_says_how_a_run_ended(
+    outcome: Outcome, status: int, reason: str, said: str
+) -> None:
+    first, *_ = verdict(outcome.summary | {"exit": {"status": status, "reason": reason}})
+    assert first.text == said
+    assert (first.style == "bold red") == (status == 1)
+
+
+def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) -> None:
+    claims = [claim("held"), claim("void", "late"), claim("not applicable", "ideal")]
+    line = verdict(outcome.summary | {"claims": claims})[2]
+    assert line.text == "claims: 1 of 3 held, 1 void (late), 1 not applicable (assumption not met)"
+    worse = verdict(outcome.summary | {"claims": [*claims, claim("violated")]})[2]
+    assert worse.text.startswith("claims: 1 of 4 held, 1 violated, 1 void")
+    assert worse.style == "bold red"
+    assert verdict(outcome.summary | {"claims": []})[2].text == "claims: none"
+
+
+def test_what_breaks_the_guarantee_is_unmistakable(outcome: Outcome) -> None:
+    broken = {"t_s": 2.5, "process": "controller", "what": "MANSD violated: 6 lost"}
+    text = printed(outcome, assumption_violations=[broken] * 7)
+    assert text.count("assumption violated at t = 2.500 s, seen by controller: MANSD") == 5
+    assert "and 2 more such violations" in text
+    assert RED in text
+
+
+def test_an_assumption_that_a_scenario_breaks_is_a_warning(tmp_path: Path) -> None:
+    trigger = {"policy": "absolute", "delta": 0.02}
+    run = noack.simulate(noack.load("double_integrator", {"trigger": trigger}), runs=tmp_path)
+    assert "warning:" in (text := printed(reopen(run.directory)))
+    assert "assumption violated: the trigger is" in text
+
+
+@pytest.mark.parametrize("scenario", ["four_tank", "pendulum_observed", "lane_acknowledged"])
+def test_the_table_fits_eighty_columns(scenario: str, tmp_path: Path) -> None:
+    run = noack.simulate(noack.load(scenario, {"horizon_s": 1.0}), runs=tmp_path)
+    rows = short_numbers(run.summary)
+    assert max(len(name) for name, _ in rows) + max(len(value) for _, value in rows) <= 73
+    assert "ideal loop" not in verdict(run.summary)[1].text  # there is none to compare with
+
+
+def test_summary_prints_the_same_short_form_and_all_of_it_on_request(outcome: Outcome) -> None:
+    def noack_summary(*more: str) -> str:
+        command = [sys.executable, "-m", "cosim.cli", "summary", str(outcome.run_dir), *more]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    short, long = noack_summary(), noack_summary("--verbose")
+    assert short.splitlines()[:3] == [line.text for line in verdict(outcome.summary)]
+    assert len(short.splitlines()) <= 25 < len(long.splitlines())
+    assert long.splitlines()[:3] == short.splitlines()[:3]
+    assert json.loads(noack_summary("--json")) == outcome.summary
+
+
+def test_the_live_rows_are_there_where_a_run_was_live(outcome: Outcome) -> None:
+    late = {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0, "steps": 100, "late_steps": 0}
+    lateness = {"plant": late, "sensor": late | {"late_steps": 7}}
+    latency = {"p50": 600.4, "p99": 900.0, "p999": 1.0, "max": 1.0, "updates": 3}
+    rows = dict(short_numbers(outcome.summary | {"lateness_us": lateness, "latency_us": latency}))
+    assert rows["most deadlines missed"] == "sensor, 7 of 100"
+    assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"
+
+
+def test_a_run_that_is_not_of_the_present_version_is_printed_all_the_same(
+    outcome: Outcome, capsys: pytest.CaptureFixture[str]
+) -> None:
+    earlier = {key: value for key, value in outcome.summary.items()
+               if key not in ("claims", "fidelity", "replay", "kind")}  # fmt: skip
+    show: Callable[..., None] = print_outcome
+    for verbose in (False, True):
+        show(Console(), replace(outcome, summary=earlier), verbose=verbose)
+    assert "claims: none" in capsys.readouterr().out

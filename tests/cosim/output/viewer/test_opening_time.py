@@ -1,0 +1,112 @@
+"""A finished run's view opens where ‖e_c‖ is largest; where no summary says so, as rerun does."""
+
+import json
+import re
+import subprocess
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rerun.experimental
+
+from cosim.output.viewer.opening_time import move_window_to, opening_time_ns, script_to_open_at
+from cosim.output.viewer.viewer_server import RecordingServer
+
+T_NS = 4_244_000_000
+
+
+def decoded(message: bytes) -> list[tuple[int, int | bytes]]:
+    """Numbers and values of a protobuf message's fields."""
+    at = 0
+
+    def varint() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            byte = message[at]
+            at, value, shift = at + 1, value | (byte & 0x7F) << shift, shift + 7
+            if byte < 0x80:
+                return value
+
+    found: list[tuple[int, int | bytes]] = []
+    while at < len(message):
+        field, kind = divmod(varint(), 8)
+        value = varint()
+        if kind == 2:
+            at += value
+        found.append((field, message[at - value : at] if kind == 2 else value))
+    return found
+
+
+def test_the_page_asks_the_viewer_for_this_time_and_to_pause() -> None:
+    found = re.search(rb"Uint8Array\((\[[^]]*\])\)", script_to_open_at(T_NS))
+    assert found is not None
+    ((set_time_cursor, content),) = decoded(bytes(json.loads(found[1])))
+    assert set_time_cursor == 6
+    assert isinstance(content, bytes)
+    (two, timeline), (three, time), paused = decoded(content)
+    assert (two, three, paused) == (2, 3, (5, 1))
+    assert isinstance(timeline, bytes)
+    assert isinstance(time, bytes)
+    assert decoded(timeline) == [(1, b"t")]
+    assert decoded(time) == [(1, T_NS)]
+
+
+@pytest.mark.parametrize(
+    ("summary", "expected"),
+    [
+        ('{"sup_e_c_at_s": 4.244}', T_NS), ('{"sup_e_c_at_s": null}', None), ("{}", None),
+        ("[]", None), ("{", None), (None, None),
+    ],
+)  # fmt: skip
+def test_the_time_is_the_summarys(
+    tmp_path: Path, summary: str | None, expected: int | None
+) -> None:
+    if summary is not None:
+        (tmp_path / "summary.json").write_text(summary)
+    assert opening_time_ns(tmp_path / "recording.rrd") == expected
+
+
+def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"RRF2")
+    with RecordingServer(path, follow=False) as server:
+        page, script = server.start_page(), server.origin + "/re_viewer.js"
+        assert b"openAt" not in read(page)
+        (tmp_path / "summary.json").write_text('{"sup_e_c_at_s": 4.244}')
+        assert read(page).endswith(script_to_open_at(T_NS))
+        assert b"openAt" not in read(script)
+
+
+def read(url: str) -> bytes:
+    with urllib.request.urlopen(url, timeout=30) as answer:
+        content: bytes = answer.read()
+        return content
+
+
+def test_a_window_is_asked_until_it_has_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, Any]] = []
+
+    class Client:
+        @classmethod
+        def connect(cls, url: str) -> "Client":
+            asked.append(("connect", url))
+            if len(asked) == 1:
+                raise ConnectionError("transport error")
+            return cls()
+
+        def set_time(self, timeline: str, **more: Any) -> None:
+            asked.append((timeline, more))
+            if len(asked) == 3:
+                raise ConnectionError("no active recording to set the time for")
+
+    monkeypatch.setattr(rerun.experimental, "ViewerClient", Client)
+    with subprocess.Popen(["sleep", "600"]) as window:
+        move_window_to(T_NS, window, 1234)
+        window.kill()
+    wanted = ("t", {"duration": 4.244, "play_state": "paused"})
+    connected = ("connect", "rerun+http://127.0.0.1:1234/proxy")
+    assert asked == [connected, connected, wanted, connected, wanted]
+    move_window_to(T_NS, window, 1234)  # closed: nothing to ask
+    assert len(asked) == 5

@@ -1,0 +1,249 @@
+"""The pictures of plants and of the network, as the recording gets them."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cosim.output.viewer.pictures.lane_picture import Lane, Place
+from cosim.output.viewer.pictures.network_picture import LEG_S, Diagram
+from cosim.output.viewer.pictures.pendulum_picture import Pendulum
+from cosim.output.viewer.pictures.phase_picture import Phase
+from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel
+from cosim.output.viewer.pictures.picture_choice import picture_of, reach_of
+from cosim.output.viewer.pictures.quadrotor_picture import Quadrotor
+from cosim.output.viewer.pictures.tanks_picture import Tanks
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario_file import load
+from noack.core.linear_systems import Propagator
+from noack.protocol.record_tables import Fate
+
+ROOT = Path(__file__).parents[4]
+S = 1_000_000_000
+PICTURES: dict[str, tuple[Picture, int, int]] = {
+    "lane": (Lane(3, 2, forward_mps=-12.0), 4, 0),
+    "vehicle": (Lane(3, 2, forward_mps=-15.0, place=Place(0, 1, 2, 4)), 4, 7),
+    "cart and pole": (Pendulum(0, 2, reach_m=1.0, pole_m=0.6), 4, 0),
+    "pendulum": (Pendulum(None, 0), 2, 0),
+    "cart": (Pendulum(0, None, reach_m=30.0), 2, 0),
+    "quadrotor": (Quadrotor(range(6), 1.0), 12, 12),
+    "tanks": (Tanks(range(4), range(4)), 4, 4),
+    "phase": (Phase(["a", "b", "c"], np.ones(3)), 3, 0),
+    "one state": (Phase(["a"], np.ones(1)), 1, 0),
+}
+
+
+def frames_of(n: int, internal: int, k: int = 7, seed: int = 0) -> Frames:
+    rng = np.random.default_rng(seed)
+    x, x_s, x_c = rng.normal(size=(3, k, n))
+    z = rng.normal(size=(k, internal)) if internal else None
+    return Frames(np.arange(k) / 60, x, x_s, x_c, z)
+
+
+def arrays(columns: Columns) -> dict[str, list[Any]]:
+    """Columns by the last part of their names, as lists with one entry a row."""
+    return {
+        str(column.component_descriptor()).rpartition(":")[2]: column.as_arrow_array().to_pylist()
+        for column in columns
+    }
+
+
+def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (k, 2) with up for +y, and the angles (k,) by which a shape is turned to the left."""
+    found = arrays(columns)
+    place = np.array(found["translation"], dtype=float)[:, 0, :2] * (1, -1)
+    quaternion = np.array(found.get("quaternion", [[(0, 0, 0, 1)]] * len(place)))[:, 0, :]
+    return place, -2 * np.arctan2(quaternion[:, 2], quaternion[:, 3])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "kind", "title"),
+    [
+        ("lane_following", Lane, "lane"),
+        ("lane_weighted", Lane, "lane"),
+        ("lane_acknowledged", Lane, "lane"),
+        ("unstable_pendulum", Pendulum, "pendulum"),
+        ("cart_pole", Pendulum, "cart and its pole"),
+        ("tabuada_dynamic", Phase, "phase plot"),
+    ],
+)
+def test_a_plant_has_the_picture_of_its_kind(scenario: str, kind: type, title: str) -> None:
+    picture = picture_of(resolve(load(ROOT / "scenarios" / f"{scenario}.toml")))
+    assert type(picture) is kind
+    assert title in picture.title
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_all_that_moves_is_to_be_seen_and_has_a_place_in_every_frame(name: str) -> None:
+    picture, n, internal = PICTURES[name]
+    shapes = picture.scenery()
+    panel(picture)
+    frames = frames_of(n, internal)
+    frames.x_c[3:] = np.nan  # no controller
+    frames.x[5] = 1e300  # a run may diverge
+    moved = picture.frames(frames)
+    assert moved.keys() >= {entity for entity in shapes if entity in WHO}
+    for entity, columns in moved.items():
+        assert any(shape == entity or shape.startswith(f"{entity}/") for shape in shapes), entity
+        for values in arrays(columns).values():
+            assert len(values) == len(frames.t_s)
+            assert np.isfinite(np.array(values, dtype=float)).all()
+    # All three of plant and models move, in themselves or by what they are made of.
+    for who in WHO:
+        assert any(who in entity.split("/") for entity in moved), who
+    assert picture.rate_hz <= 60
+
+
+def test_the_car_is_drawn_the_way_it_goes() -> None:
+    """Without sideslip, the nose points along the path over the ground that the picture shows."""
+    scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
+    loop, picture = loop_of(scenario), picture_of(scenario)
+    t_s = np.arange(600) / 60
+    advance = Propagator(loop.A_model + loop.B_model @ loop.K).transition(round(S / 60))
+    x = [loop.x0]
+    while len(x) < len(t_s):
+        x.append(advance @ x[-1])
+    states = np.array(x)
+    moved = picture.frames(Frames(t_s, states, states, states))
+    place, angle = pose(moved["plant"])
+    # The markings stay where they are on the ground, up to whole periods of theirs.
+    passed = -np.unwrap(pose(moved["road/passing"])[0][:, 0], period=18.0)
+    speed = 12.0
+    np.testing.assert_allclose(np.diff(passed) * 60, speed, rtol=1e-3)
+    slope = np.gradient(place[:, 1], passed)
+    sideslip = states[:, 0] / speed
+    np.testing.assert_allclose(slope[1:-1], (angle + sideslip)[1:-1], atol=2e-3)
+
+
+def test_a_vehicles_own_place_says_where_it_is() -> None:
+    """In its own coordinates y and yaw are such that it goes forward along x; Y_g is −y."""
+    picture, n, internal = PICTURES["vehicle"]
+    frames = frames_of(n, internal)
+    assert frames.z is not None
+    place, angle = pose(picture.frames(frames)["plant"])
+    np.testing.assert_allclose(place[:, 1], -frames.z[:, 1], atol=1e-6)
+    np.testing.assert_allclose(angle, -frames.z[:, 4], atol=1e-6)
+    _, steered = pose(picture.frames(frames)["plant/steered/left"])
+    np.testing.assert_allclose(steered, -frames.z[:, 2], atol=1e-6)
+    place, angle = pose(picture.frames(frames)["sensor"])
+    np.testing.assert_allclose(place[:, 1], frames.x_s[:, 3], atol=1e-6)
+
+
+def test_a_pole_falls_to_the_side_of_its_angle() -> None:
+    picture = Pendulum(0, 2)
+    x = np.array([[0.5, 0.0, 0.1, 0.0]])
+    moved = picture.frames(Frames(np.zeros(1), x, x, x))
+    assert pose(moved["plant"])[0].tolist() == [[0.5, 0.0]]
+    (angle,) = pose(moved["plant/pole"])[1]
+    assert -math.sin(angle) == pytest.approx(math.sin(0.1))  # where the tip of (0, 1) goes
+
+
+def test_levels_are_as_high_as_they_are() -> None:
+    frames = frames_of(4, 4)
+    z = np.full((7, 4), 10.0)
+    moved = Tanks(range(4), range(4)).frames(frames._replace(z=z))
+    drawn = np.array(arrays(moved["sensor/1"])["strips"], dtype=float)[:, 0, 0, 1]
+    (low,) = {0.0}
+    expected = low + (10.0 + frames.x_s[:, 0] - frames.x[:, 0]) / 20.0 * 1.6
+    np.testing.assert_allclose(-drawn, expected, rtol=1e-6)
+
+
+def test_a_trail_goes_on_from_batch_to_batch() -> None:
+    frames = frames_of(2, 0, k=12)
+    whole = Phase(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
+    picture = Phase(["a", "b"], np.ones(2))
+    pieces = [
+        row
+        for i in range(0, 12, 4)
+        for row in arrays(
+            picture.frames(frames.at(np.isin(np.arange(12), range(i, i + 4))))["plant/trail"]
+        )["strips"]
+    ]
+    assert pieces == arrays(whole)["strips"]
+
+
+def test_what_a_picture_has_room_for_is_what_the_models_loop_goes_through() -> None:
+    scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
+    reach = reach_of(loop_of(scenario), scenario.horizon_ns)
+    assert (reach >= np.abs(loop_of(scenario).x0)).all()
+    assert reach[3] < 10.0
+
+
+def rows_of(diagram: Diagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
+    """What each entity shows at which time."""
+    found: dict[str, dict[int, list[Any]]] = {}
+    for until_ns in ends_ns:
+        for entity, moving in diagram.advance(until_ns).items():
+            ((values),) = arrays(moving.columns).values()
+            assert (moving.t_ns <= until_ns).all()
+            rows = found.setdefault(entity, {})
+            assert not rows.keys() & set(moving.t_ns.tolist())
+            rows |= dict(zip(moving.t_ns.tolist(), values, strict=True))
+    return found
+
+
+def sent(diagram: Diagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0) -> Diagram:
+    t_ns = np.array([round(t_s * S) for t_s, _ in packets], np.int64)
+    fate = np.array([fate for _, fate in packets], np.int64)
+    diagram.add(t_ns, t_ns + round(delay_s * S), fate)
+    return diagram
+
+
+PACKETS = [
+    (0.5, Fate.DELIVERED), (0.6, Fate.DROPPED), (0.7, Fate.FORCED), (1.5, Fate.CORRUPTED),
+    (1.9, Fate.DELIVERED),
+]  # fmt: skip
+
+
+def test_each_packet_is_seen_to_become_what_it_became() -> None:
+    seen = rows_of(sent(Diagram(), PACKETS), [3 * S])
+    assert seen.keys() == {"broadcast", "delivered", "forced", "lost"}
+    for entity, count in (("delivered", 2), ("forced", 1), ("lost", 2)):
+        shown = [bool(shapes) for _, shapes in sorted(seen[entity].items())]
+        assert shown.count(False) == count, entity  # each is seen to end
+    lost_ns = [t_ns for t_ns, shapes in seen["lost"].items() if shapes]
+    assert min(lost_ns) >= (0.6 + LEG_S) * S
+    # The network is at 8.8, between sensor and controller at 4.4 and 13.2.
+    assert max(x for shapes in seen["delivered"].values() for x, _ in shapes) > 11
+    assert max(x for shapes in seen["lost"].values() for line in shapes for x, _ in line) < 9.3
+
+
+def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
+    seen = rows_of(sent(Diagram(), PACKETS[:1], delay_s=0.8), [3 * S])
+    inside = [float(np.float32(8.8)), 0.0]
+    waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if inside in shapes]
+    assert min(waiting) == pytest.approx((0.5 + LEG_S) * S, abs=S / 50)
+    assert max(waiting) == pytest.approx(1.3 * S, abs=S / 50)
+
+
+def test_batches_leave_no_trace_in_the_diagram() -> None:
+    whole = rows_of(sent(Diagram(), PACKETS), [3 * S])
+    steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
+    assert rows_of(sent(Diagram(), PACKETS), [*steps, 3 * S]) == whole
+
+
+def test_a_flood_of_packets_is_thinned_and_a_quiet_network_costs_nothing() -> None:
+    diagram = sent(Diagram(), [(i / 1000, Fate.DELIVERED) for i in range(2000)])
+    seen = rows_of(diagram, [2 * S])
+    assert max(len(shapes) for shapes in seen["broadcast"].values()) <= LEG_S / 0.025 + 1
+    rows_of(diagram, [3 * S])
+    assert diagram.advance(100 * S) == {}
+
+
+def test_acknowledgements_go_back() -> None:
+    diagram = Diagram(acknowledged=True)
+    diagram.add(
+        np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),
+        back=True,
+    )  # fmt: skip
+    seen = rows_of(diagram, [4 * S])
+    assert seen.keys() == {"acknowledgement", "lost"}
+    (first, *_, last) = [
+        shapes[0][0] for t_ns, shapes in sorted(seen["acknowledgement"].items())
+        if shapes and t_ns < 1.5 * S
+    ]  # fmt: skip
+    assert first > 10.5
+    assert last < 6.5

@@ -1,0 +1,786 @@
+import contextlib
+import http.client
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urljoin, urlsplit
+
+import numpy as np
+import psutil
+import pytest
+import rerun.chunk
+from numpy.typing import NDArray
+from rerun.error_utils import RerunWarning
+
+from cosim.output.viewer.live_viewer import LiveView, has_display, view_recording
+from cosim.output.viewer.pictures.lane_picture import Lane
+from cosim.output.viewer.pictures.network_picture import Diagram
+from cosim.output.viewer.pictures.picture import TIMELINE, Frames, Picture
+from cosim.output.viewer.recording import APPLICATION_ID, RunView, ViewError
+from cosim.output.viewer.viewer_server import RECORDING, RecordingServer
+from noack.core.errors import CallerError, ExitStatus
+from noack.protocol.record_tables import Fate
+from tests.integration.conftest import wait_for
+
+ROOT = Path(__file__).parents[4]
+Floats = NDArray[np.float64]
+
+STATES, INPUTS = ["V", "r", "psi", "Y_g"], ["u_1", "u_2"]
+PROCESSES = ["plant", "sensor", "netem", "controller"]
+STEP_NS = 2_000_000
+S = 1_000_000_000
+K = 100
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "killpg"), reason="tells by process groups what is left behind"
+)
+
+
+def new_view(
+    path: Path,
+    states: list[str] | None = None,
+    live: LiveView | None = None,
+    *,
+    indexed: bool = True,
+    picture: Picture | None = None,
+    diagram: Diagram | None = None,
+) -> RunView:
+    return RunView(
+        path,
+        run_id="run-1",
+        title="a run",
+        about="# About\nα = 0.25",
+        state_names=states or STATES,
+        input_names=INPUTS,
+        processes=PROCESSES,
+        horizon_s=20.0,
+        picture=picture,
+        diagram=diagram,
+        live=live,
+        indexed=indexed,
+    )
+
+
+def times(first: int, k: int = K) -> NDArray[np.int64]:
+    return (first + np.arange(k)) * STEP_NS
+
+
+def add_samples(view: RunView, batches: int, n: int = 4, first: int = 0) -> None:
+    """Samples whose every value says which series, coordinate and step it belongs to."""
+    for batch in range(first, first + batches):
+        t_ns = times(batch * K)
+        norm = t_ns.astype(np.float64) * 1e-9
+        x: Floats = norm[:, None] + np.arange(n)
+        bounds = np.stack([norm + 3, norm + 4], axis=1)
+        view.samples(t_ns, x, x + 100, x + 200, norm, norm + 1, norm + 2, bounds, norm + 5)
+
+
+def read(path: Path, kind: str = "recording") -> dict[str, list[Any]]:
+    """Chunks of the file by entity."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RerunWarning)  # a file without footer is read in full
+        reader = rerun.chunk.RrdReader(path)
+    (store,) = reader.recordings() if kind == "recording" else reader.blueprints()
+    chunks: dict[str, list[Any]] = {}
+    for chunk in reader.stream(store=store):
+        chunks.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk)
+    return chunks
+
+
+def column(chunks: list[Any], name: str) -> list[Any]:
+    return [value for c in chunks for value in c.to_record_batch().column(name).to_pylist()]
+
+
+def static(chunks: dict[str, list[Any]], entity: str, name: str) -> list[Any]:
+    ((value,),) = [
+        c.to_record_batch().column(name).to_pylist()
+        for c in chunks[entity]
+        if c.is_static and name in c.to_record_batch().schema.names
+    ]
+    return list(value)
+
+
+def series(
+    chunks: dict[str, list[Any]], entity: str
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Times in ns (k,) and scalars (k, series) of one entity, in the order of the file."""
+    moving = [c for c in chunks[entity] if not c.is_static]
+    assert all(c.timeline_names == [TIMELINE] for c in moving)
+    batches = [c.to_record_batch() for c in moving]
+    t_ns = np.concatenate([b.column("t").to_numpy(zero_copy_only=False) for b in batches])
+    return t_ns.astype(np.int64), np.array(column(moving, "Scalars:scalars"), dtype=np.float64)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    """Wait; the test's own time limit ends a wait in vain."""
+    while not condition():
+        time.sleep(0.02)
+
+
+def is_left(group: int) -> bool:
+    """Whether a process of the group is alive; one that only awaits its parent's notice is not."""
+    stats = list(Path("/proc").glob("[0-9]*/stat"))
+    for stat in stats:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            state, _, of_group = stat.read_text().rpartition(")")[2].split()[:3]
+            if int(of_group) == group and state != "Z":
+                return True
+    if stats:
+        return False
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def another_process(code: str, path: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run code with this module as ``t`` and a path as ``path``, and kill it at the end."""
+    head = (
+        "import importlib.util, pathlib, sys;"
+        f"spec = importlib.util.spec_from_file_location('t', {__file__!r});"
+        "t = importlib.util.module_from_spec(spec); spec.loader.exec_module(t);"
+        "path = pathlib.Path(sys.argv[1]);"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", head + code, str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={name: value for name, value in os.environ.items() if "DISPLAY" not in name},
+        text=True,
+        start_new_session=True,
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def get(url: str, host: str | None = None) -> tuple[int, bytes]:
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port)
+    with contextlib.closing(connection):
+        target = f"{parts.path}?{parts.query}" if parts.query else parts.path
+        connection.request("GET", target, headers={"Host": host or parts.netloc})
+        answer = connection.getresponse()
+        if (there := answer.getheader("Location")) is not None:
+            return get(urljoin(url, there))
+        return answer.status, answer.read()
+
+
+def recording_url(page: str) -> str:
+    return page + RECORDING
+
+
+@pytest.fixture
+def live() -> Iterator[LiveView]:
+    view = LiveView(native=False)
+    yield view
+    view.close()
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path, indexed=indexed) as view:
+        add_samples(view, 5)
+        view.inputs(times(0), np.stack((np.arange(K), -np.arange(K)), axis=1))
+    chunks = read(path)
+    for i, name in enumerate(STATES):
+        t_ns, values = series(chunks, f"state/{name}")
+        np.testing.assert_array_equal(t_ns, times(0, 5 * K))
+        x = t_ns * 1e-9 + i
+        np.testing.assert_array_equal(values, np.stack((x, x + 100, x + 200), axis=1))
+    t_ns, values = series(chunks, "error/norm")
+    np.testing.assert_array_equal(values, (t_ns * 1e-9)[:, None] + [3, 0, 1, 2])
+    t_ns, values = series(chunks, "error/log10")
+    certified = 10 ** values[:, 4]
+    np.testing.assert_allclose(certified, t_ns * 1e-9 + 4, rtol=1e-12)
+    t_ns, values = series(chunks, "size/log10")
+    np.testing.assert_allclose(10 ** values[:, 1], t_ns * 1e-9 + 5, rtol=1e-12)
+    t_ns, values = series(chunks, "input")
+    np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
+
+
+def test_what_was_flushed_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path, indexed=False) as view:
+        add_samples(view, 2)
+        view.flush()
+        t_ns, _ = series(read(path), "state/V")
+        np.testing.assert_array_equal(t_ns, times(0, 2 * K))
+
+
+def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    chunks = read(path)
+    names = static(chunks, "state/V", "SeriesLines:names")
+    colours = static(chunks, "state/V", "SeriesLines:colors")
+    assert [name.split()[0] for name in names] == ["x", "x_s", "x_c"]
+    assert len(set(colours)) == 3
+    for name in STATES[1:]:
+        assert static(chunks, f"state/{name}", "SeriesLines:colors") == colours
+    errors = static(chunks, "error/log10", "SeriesLines:colors")
+    identity, sensor, threshold, controller, certified = errors
+    assert len(set(errors)) == 5
+    assert static(chunks, "error/norm", "SeriesLines:colors") == errors[:4]
+    assert static(chunks, "event/certified", "SeriesLines:colors") == [certified]
+    assert static(chunks, "key/1/1/sample", "LineStrips2D:colors") == [identity]
+    assert (sensor, controller) == (colours[1], colours[2])
+    assert threshold not in colours
+    assert static(chunks, "event/interval", "SeriesPoints:colors") == [sensor]
+    assert static(chunks, "reception/interval", "SeriesPoints:colors") == [controller]
+    assert static(chunks, "input", "SeriesLines:names") == INPUTS
+    for process in PROCESSES:
+        assert static(chunks, f"lateness/{process}", "SeriesLines:names") == [process]
+
+
+def test_the_file_carries_its_identity_about_text_and_layout(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    reader = rerun.chunk.RrdReader(path)
+    (recording,), (layout_store,) = reader.recordings(), reader.blueprints()
+    assert (recording.application_id, recording.recording_id) == (APPLICATION_ID, "run-1")
+    assert layout_store.application_id == APPLICATION_ID
+    assert static(read(path), "about", "TextDocument:text") == ["# About\nα = 0.25"]
+    layout = read(path, "blueprint")
+    views = [c for entity in layout for c in layout[entity] if entity.count("/") == 1]
+    titles = {
+        name
+        for c in views
+        if "ViewBlueprint:display_name" in c.to_record_batch().schema.names
+        for (name,) in column([c], "ViewBlueprint:display_name")
+    }
+    assert {f"State {name}" for name in STATES} <= titles
+    assert {"Broadcasting intervals [s]", "Receiving intervals [s]", "About this run"} <= titles
+
+
+def test_no_legend_covers_a_plot_and_a_key_beside_them_names_the_colours(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    layout = read(path, "blueprint")
+    legends = [
+        visible
+        for entity, chunks in layout.items() if entity.endswith("/PlotLegend")
+        for visible in column(chunks, "PlotLegend:visible")
+    ]  # fmt: skip
+    plots = sum(
+        kind == ["TimeSeries"]
+        for entity, chunks in layout.items() if entity.count("/") == 1
+        for c in chunks if "ViewBlueprint:class_identifier" in c.to_record_batch().schema.names
+        for kind in column([c], "ViewBlueprint:class_identifier")
+    )  # fmt: skip
+    # All but the one, never seen, that holds what the plots share.
+    assert legends == [[False]] * (plots - 1)
+    chunks = read(path)
+    named = {
+        static(chunks, entity, "Points2D:labels")[0]
+        for entity in chunks if entity.startswith("key/") and entity.endswith("/name")
+    }  # fmt: skip
+    assert {"threshold", "bound from (I1)", "certified bound", "lost", *INPUTS} <= named
+
+
+def test_the_plots_show_the_whole_run_and_room_for_marks_and_tick_labels(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    layout = read(path, "blueprint")
+    shared = layout["view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis"]
+    ((whole,),) = column(shared, "TimeAxis:view_range")
+    assert -0.05 * 20 * S < whole["start"] < 0
+    assert 1.05 * 20 * S < whole["end"] < 1.1 * 20 * S
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 16, 17, 64])
+def test_every_coordinate_has_a_panel(tmp_path: Path, n: int) -> None:
+    path = tmp_path / "recording.rrd"
+    states = [f"x{i}" for i in range(n)]
+    with new_view(path, states) as view:
+        add_samples(view, 1, n)
+    layout = read(path, "blueprint")
+    origins = [
+        origin
+        for entity, chunks in layout.items()
+        if entity.startswith("view/")
+        for c in chunks
+        if "ViewBlueprint:space_origin" in c.to_record_batch().schema.names
+        for (origin,) in column([c], "ViewBlueprint:space_origin")
+    ]
+    assert {f"state/{name}" for name in states} <= {o.removeprefix("/") for o in origins}
+    assert all(len(series(read(path), f"state/{name}")[0]) == K for name in states)
+
+
+def test_names_with_signs_of_their_own_keep_their_entities_apart(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path, ["a/b", "a b", "ψ"]) as view:
+        add_samples(view, 1, 3)
+    assert sum(entity.startswith("state/") for entity in read(path)) == 3
+
+
+def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path) as view:
+        x = np.zeros((3, 4))
+        error, threshold = np.array([0.1, 0.0, np.nan]), np.array([0.1, 0.1, 0.1])
+        none = np.full(3, np.nan)
+        view.samples(
+            times(0, 3), x, x, x, error, threshold, error, np.stack([none, none], axis=1), none
+        )
+    _, values = series(read(path), "error/log10")
+    np.testing.assert_allclose(values[:, 1], [-1.0, -4.0, np.nan], rtol=1e-12)
+    np.testing.assert_allclose(values[:, 2], -1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("threshold", [0.0, np.inf, np.nan])
+def test_a_rule_without_a_threshold_still_gives_a_plot(tmp_path: Path, threshold: float) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path) as view:
+        x, e = np.zeros((2, 4)), np.array([1e-3, 0.0])
+        none = np.full((2, 2), np.nan)
+        view.samples(times(0, 2), x, x, x, e, np.full(2, threshold), e, none, none[:, 0])
+    for entity in ("error/norm", "error/log10"):
+        assert not np.isinf(series(read(path), entity)[1]).any()
+    assert series(read(path), "error/log10")[1][0, 1] == pytest.approx(-3.0)
+
+
+def test_every_event_is_a_mark_on_a_stem_and_the_first_stands_on_the_axis(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    t_ns = np.array([0, 300, 700], dtype=np.int64)
+    with new_view(path) as view:
+        view.broadcasts(t_ns[:1], np.array([np.nan]))
+        view.broadcasts(t_ns[1:], np.array([0.3, 0.4]))
+    at, values = series(read(path), "event/interval")
+    np.testing.assert_array_equal(at, t_ns)
+    np.testing.assert_array_equal(values[:, 0], [0.0, 0.3, 0.4])
+    at, values = series(read(path), "event/stem")
+    np.testing.assert_array_equal(at, np.repeat(t_ns, 3))
+    np.testing.assert_array_equal(values.reshape(3, 3), [[0, h, np.nan] for h in (0.0, 0.3, 0.4)])
+
+
+def test_forced_deliveries_and_drops_have_marks_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    t_ns = np.array([0, 300, 700], dtype=np.int64)
+    with new_view(path) as view:
+        view.receptions(t_ns, np.array([np.nan, 0.3, 0.4]), np.array([False, True, False]))
+        view.drops(np.array([100, 200], dtype=np.int64))
+        view.drops(np.array([], dtype=np.int64))
+    chunks = read(path)
+    assert series(chunks, "reception/interval")[0].tolist() == [0, 700]
+    at, values = series(chunks, "reception/forced")
+    assert (at.tolist(), values.tolist()) == ([300], [[0.3]])
+    assert series(chunks, "reception/stem")[0].tolist() == np.repeat(t_ns, 3).tolist()
+    assert series(chunks, "drop")[0].tolist() == [100, 200]
+
+
+def test_lateness_and_log_are_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    with new_view(path) as view:
+        view.lateness("sensor", times(0, 3), np.array([1.0, 2.5, 900.0]))
+        view.log(1_500_000_000, "WARN", "three measurements late")
+    chunks = read(path)
+    assert series(chunks, "lateness/sensor")[1].ravel().tolist() == [1.0, 2.5, 900.0]
+    assert column(chunks["log"], "TextLog:level") == [["WARN"]]
+    ((line,),) = column(chunks["log"], "TextLog:text")
+    assert line.split(maxsplit=2) == ["1.500", "s", "three measurements late"]
+
+
+def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
+    with new_view(tmp_path / "recording.rrd") as view:
+        x, e = np.zeros((2, 4)), np.zeros(2)
+        with pytest.raises(ValueError, match=r"x_s: expected shape \(2, 4\), found \(2, 3\)"):
+            view.samples(times(0, 2), x, x[:, :3], x, e, e, e, np.ones((2, 2)), e)
+        with pytest.raises(ValueError, match=r"u: expected shape \(2, 2\), found \(2, 4\)"):
+            view.inputs(times(0, 2), x)
+
+
+def test_closing_twice_is_closing_once(tmp_path: Path) -> None:
+    view = new_view(tmp_path / "recording.rrd")
+    view.close()
+    view.close()
+
+
+def test_a_recording_can_be_written_anew(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    for batches in (3, 2):
+        with new_view(path) as view:
+            add_samples(view, batches)
+    assert rows_of(path) == 2 * K
+
+
+def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ViewError, match=r"nowhere/recording.rrd: cannot create"):
+        new_view(tmp_path / "nowhere" / "recording.rrd")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_full_disk_is_told() -> None:
+    with pytest.raises(ViewError, match=r"/dev/full: .*No space left"):
+        new_view(Path("/dev/full"))
+
+
+def test_a_disk_that_fills_during_the_run_is_told_at_the_latest_on_closing(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    code = (
+        "import resource; view = t.new_view(path);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000));"
+        "t.add_samples(view, 50); view.close()"
+    )
+    with another_process(code, path) as child:
+        _, told = child.communicate()
+        assert child.returncode == 1
+    last = told.splitlines()[-1]
+    assert "ViewError" in last
+    assert str(path) in last
+    assert "the recording is incomplete" in last
+
+
+def test_a_file_whose_writer_was_killed_holds_all_it_was_given(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    code = (
+        "import time; view = t.new_view(path); t.add_samples(view, 5);"
+        "print('written', flush=True); time.sleep(1000)"
+    )
+    with another_process(code, path) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "written\n"
+        until(lambda: holds(path, 5 * K))
+    assert rows_of(path) == 5 * K
+
+
+def holds(path: Path, rows: int) -> bool:
+    """Whether a file that may be in the middle of a write holds these rows."""
+    with contextlib.suppress(RuntimeError, ValueError):
+        return rows_of(path) == rows
+    return False
+
+
+def rows_of(path: Path) -> int:
+    chunks = read(path).get("error/log10", [])
+    return sum(c.num_rows for c in chunks if not c.is_static)
+
+
+def test_a_live_viewer_gets_the_file_as_it_grows_and_to_its_end(
+    tmp_path: Path, live: LiveView
+) -> None:
+    path = tmp_path / "recording.rrd"
+    view = new_view(path, live=live)
+    assert live.url is not None
+    assert live.url in live.status
+    status, page = get(live.url)
+    assert status == 200
+    assert b"Rerun" in page
+    parts = urlsplit(recording_url(live.url))
+    connection = http.client.HTTPConnection(str(parts.hostname), parts.port)
+    with contextlib.closing(connection):
+        connection.request("GET", parts.path)
+        answer = connection.getresponse()
+        received = answer.read(4)
+        assert received == b"RRF2"
+        size = path.stat().st_size
+        add_samples(view, 5)
+        while len(received) <= size:  # what was written after the download began
+            received += answer.read(1)
+        view.close()
+        received += answer.read()
+    assert received == path.read_bytes()
+
+
+def test_a_stalled_viewer_holds_up_nothing(tmp_path: Path, live: LiveView) -> None:
+    path = tmp_path / "recording.rrd"
+    view = new_view(path, live=live)
+    assert live.url is not None
+    parts = urlsplit(recording_url(live.url))
+    with socket.create_connection((str(parts.hostname), parts.port)) as viewer:
+        viewer.sendall(f"GET {parts.path} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode())
+        assert viewer.recv(12) == b"HTTP/1.0 200"
+        add_samples(view, 500)
+        view.close()
+        group = live.pid
+        live.close()
+        assert group is not None
+        assert not is_left(group)
+        received = 0
+        with contextlib.suppress(ConnectionResetError):
+            while block := viewer.recv(1 << 16):
+                received += len(block)
+    # The file is larger than all buffers in between, so the viewer did stall its download.
+    assert received < path.stat().st_size
+    assert rows_of(path) == 500 * K
+
+
+def test_a_viewer_that_died_holds_up_nothing(tmp_path: Path, live: LiveView) -> None:
+    path = tmp_path / "recording.rrd"
+    view = new_view(path, live=live)
+    assert live.pid is not None
+    os.killpg(live.pid, signal.SIGKILL)
+    add_samples(view, 5)
+    view.close()
+    live.close()
+    assert rows_of(path) == 5 * K
+
+
+def test_a_viewer_that_does_not_start_is_told_and_the_run_is_recorded(
+    tmp_path: Path, live: LiveView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RERUN_CLI_PATH", shutil.which("false") or "false")
+    path = tmp_path / "recording.rrd"
+    with new_view(path, live=live) as view:
+        add_samples(view, 1)
+    assert live.url is None
+    assert live.status == "no live view: rerun's web viewer did not start"
+    assert rows_of(path) == K
+
+
+def test_closing_a_live_view_leaves_no_process(tmp_path: Path, live: LiveView) -> None:
+    new_view(tmp_path / "recording.rrd", live=live).close()
+    group = live.pid
+    assert group is not None
+    assert is_left(group)
+    live.close()
+    assert not is_left(group)
+
+
+def test_a_kept_live_view_serves_until_it_is_ended(tmp_path: Path, live: LiveView) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path, live=live).close()
+    live.close(keep=True)
+    assert live.url is not None
+    assert live.pid is not None
+    assert get(recording_url(live.url)) == (200, path.read_bytes())
+    os.kill(live.pid, signal.SIGTERM)
+    group = live.pid
+    live.close()
+    assert not is_left(group)
+
+
+def test_a_live_view_ends_with_a_killed_recorder(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"RRF2")
+    code = (
+        "import time; live = t.LiveView(native=False); live.show(path);"
+        "print(live.pid, flush=True); time.sleep(1000)"
+    )
+    with another_process(code, path) as child:
+        assert child.stdout is not None
+        group = int(child.stdout.readline())
+        assert is_left(group)
+    until(lambda: not is_left(group))
+
+
+WINDOW = """#!{python}
+import os, sys, time, urllib.request
+if "--serve-web" in sys.argv:
+    os.execv({viewer!r}, [{viewer!r}, *sys.argv[1:]])
+if {opens}:
+    with urllib.request.urlopen(sys.argv[-1]) as answer, open({seen!r}, "wb") as seen:
+        seen.write(answer.read())
+sys.exit({status})
+"""
+
+
+def pretend_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, opens: bool) -> Path:
+    """Put a program in the place of rerun's that opens no window; its browser part is rerun's."""
+    folder = Path(str(__import__("rerun_cli").__file__)).parent
+    program, seen = tmp_path / "viewer", tmp_path / "seen.rrd"
+    program.write_text(
+        WINDOW.format(
+            python=sys.executable,
+            viewer=str(folder / "rerun"),
+            opens=opens,
+            seen=str(seen),
+            status=0 if opens else 1,
+        )
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(program))
+    return seen
+
+
+def test_a_window_is_shown_the_whole_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = pretend_window(tmp_path, monkeypatch, opens=True)
+    path = tmp_path / "recording.rrd"
+    live = LiveView(native=True)
+    with new_view(path, live=live) as view:
+        add_samples(view, 5)
+        assert live.url is None
+        assert live.status == "live view: in a window"
+    live.close()
+    until(lambda: seen.exists() and seen.read_bytes() == path.read_bytes())
+
+
+def test_where_no_window_opens_a_browser_is_served(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend_window(tmp_path, monkeypatch, opens=False)
+    path = tmp_path / "recording.rrd"
+    live = LiveView(native=True)
+    new_view(path, live=live).close()
+    assert live.url is not None
+    assert get(live.url)[0] == 200
+    live.close()
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="there is always a display")
+@pytest.mark.parametrize("variable", ["DISPLAY", "WAYLAND_DISPLAY", None])
+def test_a_display_is_told_by_the_environment(
+    monkeypatch: pytest.MonkeyPatch, variable: str | None
+) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if variable is not None:
+        monkeypatch.setenv(variable, ":0")
+    assert has_display() is (variable is not None)
+
+
+def test_other_hosts_names_and_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(b"RRF2 and more")
+    with RecordingServer(path, follow=False) as server:
+        assert server.origin.startswith("http://127.0.0.1:")
+        recording = server.address + RECORDING
+        assert get(recording) == (200, b"RRF2 and more")
+        assert get(recording, host="localhost:1")[0] == 200
+        assert get(recording, host="rebound.example:1")[0] == 403
+        assert get(server.address + "../recording.rrd")[0] == 404
+
+
+@pytest.mark.parametrize("asked", [b"/\xe9", b"/\xff\x80", b"/a\x01b"])
+def test_path_that_is_not_ascii_is_not_found(
+    asked: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with RecordingServer(tmp_path / "recording.rrd", follow=False) as server:
+        port = int(server.origin.rpartition(":")[2])
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
+            client.sendall(b"GET " + asked + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            assert b" 404 " in client.recv(1000)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"run/recording\.rrd: no such recording"):
+        view_recording(tmp_path / "run" / "recording.rrd")
+
+
+@pytest.mark.parametrize("content", [b"", b"<html>"])
+def test_what_is_no_recording_is_not_served(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    path.write_bytes(content)
+    with pytest.raises(CallerError, match=r"recording\.rrd: is no rerun recording"):
+        view_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        (signal.SIGINT, 0),
+        (signal.SIGTERM, ExitStatus.TERMINATED),
+        (signal.SIGHUP, ExitStatus.TERMINATED),
+        pytest.param(
+            signal.SIGKILL, -signal.SIGKILL,
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="tells no child elsewhere"),
+        ),
+    ],
+)  # fmt: skip
+def test_viewing_without_a_display_serves_a_page_until_it_is_ended(
+    tmp_path: Path, sent: int, status: int
+) -> None:
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    with another_process("t.view_recording(path)", path) as child:
+        assert child.stdout is not None
+        page = next(word for word in child.stdout.readline().split() if word.startswith("http"))
+        assert get(page)[0] == 200
+        assert get(recording_url(page)) == (200, path.read_bytes())
+        child.send_signal(sent)
+        assert child.wait() == status
+        wait_for(lambda: not is_left(child.pid))
+
+
+def test_a_browser_is_served_where_there_is_a_display_but_no_window_is_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On loopback and nowhere else."""
+    pretend_window(tmp_path, monkeypatch, opens=True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    path = tmp_path / "recording.rrd"
+    new_view(path).close()
+    with subprocess.Popen(
+        [sys.executable, "-m", "cosim.cli", "view", str(path), "--web"],
+        stdout=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+    ) as child:  # fmt: skip
+        try:
+            assert child.stdout is not None
+            page = next(word for word in child.stdout.readline().split() if "http" in word)
+            assert get(recording_url(page)) == (200, path.read_bytes())
+            processes = [psutil.Process(child.pid), *psutil.Process(child.pid).children()]
+            listening = [
+                address.laddr.ip
+                for process in processes
+                for address in process.net_connections("inet")
+                if address.status == psutil.CONN_LISTEN
+            ]
+            assert len(listening) == 2  # the page with the recording, and rerun's own files
+            assert set(listening) == {"127.0.0.1"}
+        finally:
+            child.send_signal(signal.SIGINT)
+            assert child.wait() == 0
+
+
+def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_path: Path) -> None:
+    path = tmp_path / "recording.rrd"
+    picture = Lane(3, 2, forward_mps=-12.0)
+    with new_view(path, picture=picture, diagram=Diagram()) as view:
+        for first in range(0, 1000, 37):
+            t_ns = times(first, min(37, 1000 - first))
+            x = np.tile(t_ns[:, None] * 1e-9, (1, 4))
+            view.move(t_ns, Frames(t_ns * 1e-9, x, x, x))
+        view.packets(np.array([S]), np.array([S]), np.array([Fate.FORCED]))
+        view.travel(2 * S)
+    chunks = read(path)
+    moving = [c for c in chunks["picture/plant"] if not c.is_static]
+    places = np.array(column(moving, "Transform3D:translation"))[:, 0, :]
+    assert len(places) == 2 * 60  # of 2 s, out of 1000 samples
+    assert (np.diff(places[:, 1]) < 0).all()  # the lateral offset grows; down is +y in the viewer
+    assert static(chunks, "picture/plant/body", "LineStrips2D:colors")
+    shapes = column([c for c in chunks["network/forced"] if not c.is_static], "LineStrips2D:strips")
+    assert [len(strips) for strips in (shapes[0], shapes[-1])] == [1, 0]
+    origins = {
+        origin
+        for entity, found in read(path, "blueprint").items()
+        if entity.startswith("view/")
+        for c in found
+        if "ViewBlueprint:space_origin" in c.to_record_batch().schema.names
+        for (origin,) in column([c], "ViewBlueprint:space_origin")
+    }
+    assert {"picture", "network", "log", "about"} <= {o.removeprefix("/") for o in origins}
+
+
+@pytest.mark.parametrize("wanted", ["missing recording", "missing browser"])
+def test_the_picture_tool_says_in_one_line_what_is_missing(tmp_path: Path, wanted: str) -> None:
+    path = tmp_path / "recording.rrd"
+    if wanted == "missing browser":
+        path.write_bytes(b"RRF2")
+    tool = ROOT / "tools" / "screenshot_recording.py"
+    answer = subprocess.run(
+        [sys.executable, str(tool), str(path), str(tmp_path / "picture.png")],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 1
+    (line,) = answer.stderr.splitlines()
+    assert ("no such recording" if wanted == "missing recording" else "no browser") in line

@@ -1,0 +1,94 @@
+"""A damaged run directory: what is readable is read, what is not is said in a line."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from cosim.analysis.run_summary import dumps, summarise
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SPOOL
+from cosim.record.run_record import finish_record, load_record
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import PLANT_STEP
+from noack.runtime.spool import SpoolWriter
+from noack.runtime.telemetry import notices_of
+from tests.fuzz.parsers.record import NOTICE, files
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path) -> Path:
+    for name, data in files(acknowledged=False, live=True).items():
+        if not name.startswith(SPOOL):
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_bytes(data)
+    return tmp_path
+
+
+def change(run_dir: Path, do: Callable[[pa.Table], pa.Table]) -> None:
+    path = run_dir / RECORD / f"{PLANT_STEP}.parquet"
+    pq.write_table(do(pq.read_table(path)), path)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (lambda n: pa.array(["0"] * n), "column t_ns is not one of int64"),
+        (lambda n: pa.array([0.5] * n), "column t_ns is not one of int64"),
+        (lambda n: pa.array([None] + [0] * (n - 1), pa.int64()), "column t_ns has holes"),
+    ],
+)
+def test_a_column_is_of_its_type_and_whole(
+    run_dir: Path, values: Callable[[int], Any], expected: str
+) -> None:
+    change(
+        run_dir,
+        lambda table: table.set_column(
+            table.column_names.index("t_ns"), "t_ns", values(len(table))
+        ),
+    )
+    with pytest.raises(CallerError, match=expected):
+        load_record(run_dir)
+
+
+def test_a_column_is_there_once(run_dir: Path) -> None:
+    change(run_dir, lambda table: table.append_column("t_ns", table["t_ns"]))
+    with pytest.raises(CallerError, match=r"plant_step\.parquet: .*t_ns"):
+        load_record(run_dir)
+
+
+@pytest.mark.parametrize(
+    "report",
+    [
+        None, [], {}, {"rows": {}}, {"ended": "horizon", "channel": {}, "rows": {"plant_step": 1}},
+        {"ended": "horizon", "channel": {}, "rows": {"plant_step": "1", "plant_actuation": 1}},
+    ],
+)  # fmt: skip
+def test_what_is_no_report_counts_as_none(run_dir: Path, report: object) -> None:
+    path = run_dir / REPORTS_FILE
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"plant": report}))
+    record = load_record(run_dir)
+    assert record.reports.keys() == {"sensor", "netem", "controller"}
+    assert json.loads(dumps(summarise(record, 0, "")))["missing_samples"] == 0
+
+
+def test_of_a_damaged_spool_the_rest_is_kept(run_dir: Path) -> None:
+    record = load_record(run_dir)
+    rows, steps = record[PLANT_STEP], len(record[PLANT_STEP])
+    (run_dir / RECORD / f"{PLANT_STEP}.parquet").unlink()
+    writer = SpoolWriter(run_dir / SPOOL, "recorder")
+    writer.append(PLANT_STEP, 0, rows[:2].tobytes())
+    writer.append(PLANT_STEP, 2, rows[2:4].tobytes()[:-1])
+    writer.append(PLANT_STEP, 4, rows[4:].tobytes())
+    for number, said in enumerate(["[]", "{", json.dumps(NOTICE | {"text": "last"})]):
+        writer.append(notices_of("netem"), number, said.encode())
+    writer.close()
+    finished = finish_record(run_dir)
+    kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
+    assert finished[PLANT_STEP]["input"].tolist() == kept
+    assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
+    assert summarise(finished, 0, "")["missing_by_table"] == {PLANT_STEP: 2}
+    assert steps == len(finished[PLANT_STEP]) + 2

@@ -1,0 +1,108 @@
+"""A run that diverges is told from one that is disturbed, saturated, short or in a limit cycle."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.run_summary import summarise
+from cosim.record.divergence import GROWTH, divergence
+from cosim.simulation.continuous.continuous_report import run_continuous, summary
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.core.linear_systems import Matrix, Vector
+
+T_S = np.linspace(0.0, 10.0, 1001)
+
+
+def scenario(content: dict[str, Any], **plant: Any) -> Scenario:
+    content["plant"] |= plant
+    return resolve(validate(content, "test"))
+
+
+def at_0_unless(condition: Any) -> Matrix:
+    return np.stack([np.where(condition, 1.0, 0.0), np.zeros_like(T_S)], axis=1)
+
+
+def exponential(rate_per_s: float) -> Matrix:
+    return np.exp(rate_per_s * T_S)[:, None] * [1.0, 0.5]
+
+
+@pytest.mark.parametrize("rate_per_s", [1.0, 4.64, 30.0])
+def test_an_unstable_loop_has_diverged(content: dict[str, Any], rate_per_s: float) -> None:
+    found = divergence(T_S, exponential(rate_per_s), [scenario(content)])
+    assert found is not None
+    assert 0 < found.at_s < 10
+    assert "still growing at the end" in found.text
+    assert "\n" not in found.text
+
+
+def test_a_state_that_is_not_finite_has_diverged(content: dict[str, Any]) -> None:
+    x = exponential(-1.0)
+    x[300:, 1] = np.inf
+    found = divergence(T_S, x, [scenario(content)])
+    assert found is not None
+    assert found.at_s == T_S[300]
+    assert found.text == f"diverged: x is not finite at {T_S[300]:g} s"
+
+
+def shapes() -> dict[str, Matrix]:
+    rng = np.random.default_rng(0)
+    one, wave = np.ones_like(T_S), np.sin(3 * T_S)
+    rows: dict[str, Vector] = {
+        "stable": np.exp(-T_S),
+        "slowly unstable, so that the run is short": np.exp(0.6 * T_S),
+        "an overshoot": 1e-3 + 1e6 * T_S * np.exp(-3 * T_S),
+        "a limit cycle from next to nothing": 1e-9 + np.minimum(np.exp(6 * T_S - 30), 1) * wave,
+        "saturated far away": 1e-6 + 1e5 * np.minimum(T_S / 5, 1),
+        "noise": rng.normal(size=len(T_S)),
+        "at rest": 0 * one,
+    }
+    return {name: values[:, None] * [1.0, 0.1] for name, values in rows.items()}
+
+
+@pytest.mark.parametrize("name", shapes())
+def test_what_does_not_diverge_is_not_accused(content: dict[str, Any], name: str) -> None:
+    assert divergence(T_S, shapes()[name], [scenario(content)]) is None
+
+
+def test_a_late_disturbance_or_set_point_gives_the_run_its_scale(content: dict[str, Any]) -> None:
+    content["trigger"]["beta"] = 1e-9
+    late = at_0_unless(T_S >= 9.5) + 1e-12
+    plain = scenario(content)
+    assert divergence(T_S, late, [plain]) is not None  # nothing in it explains such a state
+    step = {"kind": "step", "amplitude": [1.0], "from_s": 0.0}
+    assert divergence(T_S, late, [scenario(content, disturbances=[step])]) is None
+    moved = plain.controller.model_copy(update={"setpoint": (1.0, 0.0)})
+    assert divergence(T_S, late, [plain, plain.model_copy(update={"controller": moved})]) is None
+
+
+def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:
+    """The sign convention of Matlab, wanted: A + BK has an eigenvalue 4.64."""
+    content["model"] = {
+        "A": [[0.0, 1.0], [3.0, -0.5]], "B": [[0.0], [1.0]], "gain": [[6.16, 3.17]],
+        "allow_unstable": True,
+    }  # fmt: skip
+    return scenario(content | {"horizon_s": horizon_s}, draw="nominal", initial_state=[0.1, 0.0])
+
+
+def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
+    resolved = unstable(content, 8.0)
+    sampled = summarise(simulate(resolved), 0, "horizon")
+    continuous = summary(run_continuous(resolved), resolved)
+    for found in (sampled, continuous):
+        assert found["exit"]["status"] == 1
+        assert found["exit"]["reason"].startswith("diverged: ‖x‖ passed ")
+        assert 1e6 < found["final_state_norm"] < np.inf
+    assert sampled["diverged_at_s"] == pytest.approx(continuous["diverged_at_s"], abs=0.1)
+    stopped = summarise(simulate(resolved), 130, "stopped by the user (SIGINT)")
+    assert stopped["exit"] == {"status": 130, "reason": "stopped by the user (SIGINT)"}
+    assert stopped["diverged_at_s"] == sampled["diverged_at_s"]
+
+
+def test_a_run_too_short_to_tell_does_not_fail(content: dict[str, Any]) -> None:
+    found = summarise(simulate(unstable(content, 0.5)), 0, "horizon")
+    assert found["final_state_norm"] < GROWTH * found["initial_state_norm"]
+    assert (found["exit"]["status"], found["diverged_at_s"]) == (0, None)

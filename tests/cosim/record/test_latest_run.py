@@ -1,0 +1,84 @@
+"""``latest`` is followed if link and run are the user's own, and said to be another's if not."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cosim.api.runs import open_run
+from cosim.record.run_directory import (
+    LATEST,
+    SCENARIO_FILE,
+    chosen_run,
+    latest_run,
+    point_to_latest,
+)
+from noack.core.errors import CallerError
+
+ANOTHER_UID = 65_534
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """A folder in which everybody may write, and remove what is their own, as in /tmp."""
+    folder = tmp_path / "runs"
+    for name in ("first", "second"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / SCENARIO_FILE).write_text("")
+    folder.chmod(0o1777)
+    return folder
+
+
+def require_root() -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root may give a file to another user")
+
+
+def test_the_newest_is_where_the_link_leads(runs: Path) -> None:
+    with pytest.raises(CallerError, match="no run yet"):
+        latest_run(runs)
+    for name in ("first", "second"):
+        point_to_latest(runs / name)
+        assert latest_run(runs) == chosen_run(runs / LATEST, runs) == (runs / name).resolve()
+    assert chosen_run(runs / "first", runs) == runs / "first"
+
+
+@pytest.mark.parametrize("whose", ["link", "run"])
+def test_what_is_another_user_s_is_not_opened(runs: Path, whose: str) -> None:
+    require_root()
+    point_to_latest(runs / "first")
+    os.chown(
+        runs / (LATEST if whose == "link" else "first"), ANOTHER_UID, -1, follow_symlinks=False
+    )
+    for opened in (
+        lambda: latest_run(runs),
+        lambda: chosen_run(runs / LATEST, Path("elsewhere")),
+        lambda: open_run(runs / LATEST),
+    ):
+        with pytest.raises(CallerError, match=rf"^{runs / LATEST}: .* is another user's; name the"):
+            opened()
+    assert chosen_run(runs / "first", runs) == runs / "first"  # whose name says which it is
+
+
+def test_a_link_that_cannot_be_replaced_is_said(runs: Path) -> None:
+    require_root()
+    point_to_latest(runs / "first")
+    # Relative: another user need not be let into the folders above.
+    script = (
+        "import os, pathlib, sys, cosim.record.run_directory;"
+        "os.chdir(sys.argv[1]); os.setuid(int(sys.argv[2]));"
+        "cosim.record.run_directory.point_to_latest(pathlib.Path('second'))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(runs), str(ANOTHER_UID)],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stderr == (
+        "noack: warning: latest cannot be replaced: Operation not permitted; "
+        "this run is in second\n"
+    )
+    assert (runs / LATEST).readlink() == Path("first")
+    assert sorted(path.name for path in runs.iterdir()) == ["first", "latest", "second"]

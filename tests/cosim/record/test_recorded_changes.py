@@ -1,0 +1,259 @@
+"""Runs whose settings change: replay, the identity (I1), and the cap, whatever changes when."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from controller_node.controller import controller_of
+from cosim.analysis.claims.claim_evaluation import ClaimVerdict
+from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.record.align import identity_residual, join_all
+from cosim.record.recorded_changes import changes_of
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import Shuttle, _Gathered, _report, simulate
+from netem.duplex_link import network_of
+from netem.link_machine import Datagram, update_link_of
+from noack.config.parameter_changes import Change
+from noack.config.resolution import loop_of, resolve, tables_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load, validate
+from noack.core.errors import CallerError
+from noack.protocol.machine_interface import Notice, Record, Start
+from noack.protocol.record_tables import (
+    CONTROLLER_SETTING,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    NETEM_SETTING,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    SENSOR_SETTING,
+    Fate,
+)
+from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.wire_format import Flow, Message
+from plant_server.plant import plant_of
+from sensor_node.sensor import sensor_of
+
+MS = 1_000_000
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+CONTENT: dict[str, Any] = {
+    "name": "changing",
+    "horizon_s": 3.0,
+    "model": {"name": "double_integrator"},
+    "plant": {
+        "initial_state": [1.0, 0.0],
+        "rate_hz": 100.0,
+        "draw": "uniform",
+        "uncertainty_A": [[0.0, 0.0], [0.0, 0.5]],
+    },
+    "controller": {"rate_hz": 100.0},
+    "trigger": {"beta": 0.02, "alpha_per_s": 0.25},
+    "network": {"mansd": 3, "loss": {"model": "bernoulli", "probability": 0.8}},
+}
+
+one_change = st.one_of(
+    st.builds(lambda p: {"network.loss": {"model": "bernoulli", "probability": p}},
+              st.sampled_from([0.0, 0.5, 1.0])),
+    st.just({"network.loss": {"model": "worst_case"}}),
+    st.builds(lambda m: {"network.mansd": m}, st.integers(0, 5)),
+    st.builds(lambda b: {"trigger.beta": b}, st.sampled_from([0.005, 0.02, 0.1])),
+    st.builds(lambda a: {"trigger.alpha_per_s": a}, st.sampled_from([0.1, 1.0])),
+    st.builds(lambda y: {"controller.setpoint": [y, 0.0]}, st.sampled_from([-1.0, 0.0, 2.0])),
+)  # fmt: skip
+sequences = st.lists(
+    st.tuples(st.integers(0, 2_999_999_999), one_change), min_size=1, max_size=6
+).map(lambda found: [(t_ns, change) for t_ns, change in sorted(found, key=lambda one: one[0])])
+
+
+def run_with(changes: list[tuple[int, dict[str, Any]]], **more: Any) -> RunRecord:
+    listed = [{"at_s": t_ns / 1e9, "set": settings} for t_ns, settings in changes]
+    return simulate(resolve(validate(CONTENT | {"changes": listed} | more, "here")))
+
+
+@settings(max_examples=15)
+@given(sequences)
+def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
+    changes: list[tuple[int, dict[str, Any]]],
+) -> None:
+    record = run_with(changes)
+    assert len(changes_of(record)) == len(changes)
+    found = replay(record)
+    assert found.bit_exact
+    assert found.gaps == []
+    joined = join_all(record)
+    residual = identity_residual(record, joined)
+    scale = float(np.abs(joined.x_s).max())
+    assert np.nanmax(residual) <= 1e-12 * max(scale, 1.0)
+    # A run of losses is no longer than the larger of the caps that were in force during it.
+    caps = [(-1, 3), *((one.change.t_ns, one.scenario.network.mansd) for one in changes_of(record))]
+    began_ns = 0
+    for row in record[NETEM_PACKET]:
+        if row["fate"] in (Fate.DELIVERED, Fate.FORCED):
+            continue
+        if row["drop_run"] == 1:
+            began_ns = row["now_ns"]
+        ends_ns = [t_ns for t_ns, _ in caps[1:]] + [2**63 - 1]
+        allowed = [
+            cap
+            for (since_ns, cap), end_ns in zip(caps, ends_ns, strict=True)
+            if since_ns <= row["now_ns"] and end_ns > began_ns
+        ]
+        assert row["drop_run"] <= max(allowed)
+    assert summarise(record, 0, "horizon")["assumption_violations"] == []
+
+
+def test_each_machine_applies_a_change_at_its_own_first_time_not_before_it() -> None:
+    at_ns = 1_003 * MS
+    record = run_with([(at_ns, {"trigger.beta": 0.5, "network.loss.probability": 0.0})])
+    assert [len(record[table]) for table in (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)]
+    (row,) = record[SENSOR_SETTING]
+    assert (row["t_ns"], row["since_ns"], row["now_ns"]) == (at_ns, at_ns, 0)
+    rows = record[SENSOR_MEASUREMENT]
+    before = rows["t_ns"] < at_ns
+    expected = np.where(before, 0.02, 0.5) * np.exp(-0.25 * rows["t_ns"] * 1e-9)
+    assert rows["threshold"] == pytest.approx(expected)
+    packets = record[NETEM_PACKET]
+    assert (packets["fate"][packets["now_ns"] < at_ns] == Fate.DROPPED).any()
+    assert (packets["fate"][packets["now_ns"] >= at_ns] == Fate.DELIVERED).all()
+
+
+def test_the_plant_goes_to_the_set_point_and_both_models_know_it() -> None:
+    record = run_with(
+        [(1_003 * MS, {"controller.setpoint": [2.0, 0.0]})], horizon_s=12.0, plant={
+            "initial_state": [1.0, 0.0], "rate_hz": 100.0,
+        },
+    )  # fmt: skip
+    assert record[PLANT_STEP]["x"][-1] == pytest.approx([2.0, 0.0], abs=1e-2)
+    steps, loop = record[CONTROLLER_STEP], record.loop
+    x_r = np.where((steps["t_ns"] < 1_003 * MS)[:, None], 0.0, [2.0, 0.0])
+    assert steps["u"] == pytest.approx((steps["x_c"] - x_r) @ loop.K.T)
+
+
+def test_a_cap_that_shrinks_in_the_middle_of_a_burst_lets_the_next_datagram_pass() -> None:
+    content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "worst_case"}}}
+    link = update_link_of(resolve(validate(content, "here")))
+    runs = []
+    for number in range(12):
+        if number == 5:  # one passed, and four have been lost
+            link.announce(Change(0, 50 * MS, {"network.mansd": 2}), 45 * MS)
+        (row,) = [one.row for one in link.handle(Datagram(0, b"x"), number * 10 * MS)
+                  if isinstance(one, Record)]  # fmt: skip
+        runs.append((int(row[5]), int(row[6])))
+    lost = [run for fate, run in runs if fate == Fate.DROPPED]
+    assert [run for _, run in runs] == [0, 1, 2, 3, 4, 0, 1, 2, 0, 1, 2, 0]
+    assert max(lost) == 4
+
+
+def test_dropouts_are_held_against_the_caps_of_their_time() -> None:
+    content = CONTENT | {"network": {"mansd": 5, "loss": {"model": "lossless"}}}
+    controller = controller_of(resolve(validate(content, "here")))
+
+    def delivered(sequence: int, t_ns: int) -> list[str]:
+        message = Message(Flow.UPDATE, sequence, t_ns, np.zeros(2))
+        return [one.text for one in controller.handle(message, t_ns) if isinstance(one, Notice)]
+
+    assert delivered(0, 0) == []
+    controller.announce(Change(0, 50 * MS, {"network.mansd": 1}), 0)
+    assert delivered(5, 60 * MS) == []  # four were lost while five might be
+    (text,) = delivered(8, 90 * MS)
+    assert "2 successive dropouts" in text
+    assert "at most 1 assumed" in text
+
+
+def test_who_is_started_anew_is_told_and_applies_what_is_in_force() -> None:
+    resolved = resolve(validate(CONTENT, "here"))
+    change = Change(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
+    sensor = sensor_of(resolved, Start(1, 2_000 * MS))
+    (said,) = sensor.announce(change, 2_000 * MS)
+    assert isinstance(said, Record)
+    assert said.row[4] == change.t_ns  # not late: it had no time of its own yet
+    x = np.array([1.0, 0.0])
+    sensor.handle(Message(Flow.MEASUREMENT, 0, 2_000 * MS, x), 2_000 * MS)
+    outputs = sensor.handle(Message(Flow.MEASUREMENT, 1, 2_010 * MS, x), 2_010 * MS)
+    (row,) = [one.row for one in outputs if isinstance(one, Record)]
+    loop, x_r = loop_of(resolved), np.array([2.0, 0.0])
+    assert row[8] == pytest.approx(0.5 * np.exp(-0.25 * 2.01))
+    rate = (row[5] - x) / 0.01
+    assert rate == pytest.approx(loop.H @ (x - x_r), rel=0.02, abs=0.02)
+
+
+def test_processes_that_were_told_otherwise_are_found() -> None:
+    record = run_with([(1_003 * MS, {"trigger.beta": 0.5})])
+    rows = {table: record[table].copy() for table in record.tables}
+    rows[NETEM_SETTING]["t_ns"] += 1
+    rows[NETEM_SETTING]["since_ns"] += 1
+    other = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
+    found = replay(other).first_difference
+    assert found is not None
+    assert found.what == "another process was told otherwise"
+
+
+def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> None:
+    """The controller is told at 1 s of what was to be so from 0.9 s on."""
+    resolved = resolve(validate(CONTENT, "here"))
+    change = Change(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
+    told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
+    gathered = _Gathered(tables_of(resolved))
+    machines: dict[str, Any] = {
+        "plant": plant_of(resolved), "sensor": sensor_of(resolved),
+        "netem": network_of(resolved), "controller": controller_of(resolved),
+    }  # fmt: skip
+    shuttle = Shuttle(machines, resolved.entries, gathered.take)
+    for now_ns in shuttle.run():
+        for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
+            shuttle._emit(role, machines[role].announce(change, now_ns))
+            del told_ns[role]
+    rows = gathered.rows()
+    reports = {role: _report(role, rows, None) for role in LOOP_ROLES}
+    record = RunRecord(resolved, rows, gathered.notices, reports, "simulated")
+    assert replay(record).bit_exact
+    (made,) = changes_of(record)
+    assert list(made.late) == ["controller"]
+    assert made.everywhere_ns == made.late["controller"] > 990 * MS
+    (violation,) = summarise(record, 0, "horizon")["assumption_violations"]
+    assert "heard of a change too late" in violation["what"]
+    assert violation["process"] == "controller"
+    claims = [one for one in RunClaims(record).judge() if one.source == "(I1)"]
+    assert [one.verdict for one in claims] == [ClaimVerdict.HELD] * 4
+    assert claims[0].until_s == 0.9
+    assert claims[-1].from_s > made.everywhere_ns * 1e-9
+    # In between the models were apart by what they did not both know.
+    joined = join_all(record)
+    between = (joined.t_ns > 910 * MS) & (joined.t_ns < claims[-1].from_s * 1e9)
+    assert np.nanmax(identity_residual(record, joined)[between]) > 1e-3
+
+
+def test_a_sensor_with_an_observer_is_told_too() -> None:
+    changes = [
+        {"at_s": 1.0, "set": {"trigger.beta": 0.01, "network.mansd": 0}},
+        {"at_s": 2.0, "set": {"controller.setpoint": [0.0, 0.0]}},
+    ]
+    scenario = load(SCENARIOS / "pendulum_observed.toml", ["horizon_s=3"])
+    content = scenario.model_dump(mode="json", exclude_none=True) | {"changes": changes}
+    record = simulate(resolve(validate(content, "here")))
+    assert len(record[SENSOR_SETTING]) == 2
+    assert replay(record).bit_exact
+    residual = identity_residual(record, join_all(record))
+    assert np.nanmax(residual) < 1e-12
+
+
+@pytest.mark.parametrize("machine_of", [sensor_of, network_of, controller_of])
+def test_the_machines_of_the_baseline_refuse(machine_of: Callable[[Scenario], Any]) -> None:
+    content = CONTENT | {"network": CONTENT["network"] | {"protocol": "ack"}}
+    machine = machine_of(resolve(validate(content, "here")))
+    with pytest.raises(CallerError, match="changed"):
+        machine.announce(Change(0, MS, {"network.mansd": 1}), 0)
+
+
+def test_who_decides_every_fate_cannot_have_changes() -> None:
+    listed = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
+    resolved = resolve(validate(CONTENT | {"changes": listed}, "here"))
+    with pytest.raises(CallerError, match="settings stay as they are"):
+        simulate(resolved, lambda data, now_ns: 0)

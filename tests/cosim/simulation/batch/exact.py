@@ -1,0 +1,146 @@
+"""Random batches, and the exact simulator's word on their runs."""
+
+import math
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from cosim.simulation.batch.batch_interface import Population, Setting
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from netem.link_machine import UPDATE_LINK, Link
+from noack.config.impairments import (
+    Bernoulli,
+    Corrupt,
+    FourState,
+    GilbertElliott,
+    LinkSettings,
+    Lossless,
+    LossOf,
+    Periodic,
+    Scripted,
+    WorstCase,
+)
+from noack.config.resolution import Loop
+from noack.core.linear_systems import Vector
+from noack.protocol.record_tables import Fate
+from noack.trigger.decaying import DecayingTrigger
+
+LOSSES = (
+    Lossless(),
+    Bernoulli(probability=0.7),
+    Bernoulli(probability=0.5, correlation=0.8),
+    GilbertElliott(good_to_bad=0.4, bad_to_good=0.3, loss_in_good=0.1, loss_in_bad=0.9),
+    FourState(p13=0.4, p31=0.3, p32=0.4, p23=0.5, p14=0.1),
+    Periodic(period=5, burst=3, first=1),
+    Scripted(lost=(1, 2, 5, 6, 7), repeat_every=9),
+    WorstCase(),
+)
+SIZES = ((2, 1), (4, 2))
+
+
+def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
+    """Any mode, weight, floor, cap, loss and start; cost weights half of the time."""
+    known, held, floor = rng.random(3) < 0.5
+    impairments: list[Any] = [LossOf(loss=LOSSES[rng.integers(len(LOSSES))])]
+    if rng.random() < 0.3:
+        impairments.append(Corrupt(probability=0.3))
+    if rng.random() < 0.2:
+        impairments.append(LossOf(loss=Bernoulli(probability=0.2)))
+    weight = np.eye(n) + 0.5 * rng.uniform(-1, 1, (n, n)) if rng.random() < 0.5 else None
+    Q, R = (part @ part.T for part in (rng.uniform(-1, 1, (n, n)), rng.uniform(-1, 1, (m, m))))
+    weighs = rng.random() < 0.5
+    return Setting(
+        H=np.zeros((n, n)) if held else rng.uniform(-1, 1, (n, n)) * 2 / math.sqrt(n) - np.eye(n),
+        K=rng.uniform(-1, 1, (m, n)) * 2 / math.sqrt(n),
+        trigger=DecayingTrigger(0.3, rng.choice([0.1, 1.0]), 0.1 if floor else 0.0, weight),
+        link=LinkSettings(
+            impairments=tuple(impairments),
+            mansd=int(rng.integers(0, 5)) if rng.random() < 0.9 else None,
+            first_delivered=bool(not known and rng.random() < 0.8),
+        ),
+        horizon_s=3.0,
+        known_start=bool(known),
+        Q=Q if weighs else None,
+        R=R if weighs else None,
+        settle=0.3,
+        most_events=2000,
+    )
+
+
+def random_population(rng: np.random.Generator, setting: Setting, k: int) -> Population:
+    """Plants whose closed loop is anything from the model's own to another one altogether."""
+    n, m = len(setting.H), len(setting.K)
+    B = rng.uniform(-1, 1, (k, n, m)) * 2 / math.sqrt(n)
+    apart = rng.choice([0.0, 1e-6, 0.3, 1.0], (k, 1, 1)) * rng.uniform(-1, 1, (k, n, n))
+    A = setting.H - B @ setting.K + apart
+    seeds = rng.integers(0, 2**64, k, dtype=np.uint64)
+    return Population(A, B, rng.uniform(-1, 1, (k, n)), seeds)
+
+
+def one(population: Population, i: int) -> Population:
+    return Population(*(part[i : i + 1] for part in population))
+
+
+def reference(setting: Setting, draw: Population, most_events: int = 2000) -> ContinuousRun:
+    """The exact simulator's run of a population of one."""
+    (A,), (B,), (x0,), (seed,) = draw
+    n, m = B.shape
+    names = tuple(f"x_{i}" for i in range(n))
+    loop = Loop(
+        A, B, setting.K, setting.H, A, B, x0, setting.trigger.weight, names, names[:m] or names
+    )
+    link, known = Link(setting.link, int(seed), UPDATE_LINK), []
+
+    def delivered(event: int) -> bool:
+        assert event == len(known)
+        known.append(Fate(link.decide(0, 1, 0).fate).effective)
+        return known[-1]
+
+    return simulate_continuous(
+        loop,
+        setting.trigger,
+        horizon_s=setting.horizon_s,
+        delivered=delivered,
+        known_start=setting.known_start,
+        max_events=most_events,
+    )
+
+
+def pieces(run: ContinuousRun) -> list[tuple[Any, float, float]]:
+    """State after the last event, from when, and until when."""
+    spans_s = pairwise([0.0, *run.event_s, run.reached_s])
+    found = zip((run.start, *run.after), spans_s, strict=True)
+    return [(state, begin_s, end_s) for state, (begin_s, end_s) in found if end_s > begin_s]
+
+
+def cost_of(run: ContinuousRun, setting: Setting) -> float:
+    """By Gauss's rule with 24 nodes on parts of 0.1 s at most."""
+    n, m = len(setting.H), len(setting.K)
+    Q = np.eye(n) if setting.Q is None else setting.Q
+    R = np.eye(m) if setting.R is None else setting.R
+    nodes, weights = np.polynomial.legendre.leggauss(24)
+    total = 0.0
+    for state, begin_s, end_s in pieces(run):
+        edges_s = np.linspace(begin_s, end_s, math.ceil((end_s - begin_s) / 0.1) + 1)
+        for low_s, high_s in pairwise(edges_s):
+            t_s = low_s + (high_s - low_s) * (nodes + 1) / 2
+            samples = run.system.sample(state, t_s)
+            u = samples.x_c @ setting.K.T
+            integrand = ((samples.x @ Q) * samples.x).sum(1) + ((u @ R) * u).sum(1)
+            total += (high_s - low_s) / 2 * float(weights @ integrand)
+    return total
+
+
+def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]:
+    """Times, ‖x‖ and ‖W e_c‖ e^{αt} from just after an event to just before the next."""
+    guards = setting.trigger.guards(len(setting.H))
+    alpha = 0.0 if guards.from_event else guards.rate_per_s
+    times_s, norms, errors = [], [], []
+    for state, begin_s, end_s in pieces(run):
+        t_s = np.linspace(begin_s, end_s, 400)
+        samples = run.system.sample(state, t_s)
+        times_s.append(t_s)
+        norms.append(np.linalg.norm(samples.x, axis=1))
+        errors.append(run.e_c_norm(samples) * np.exp(alpha * t_s))
+    return np.concatenate(times_s), np.concatenate(norms), np.concatenate(errors)

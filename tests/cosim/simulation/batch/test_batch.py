@@ -1,0 +1,211 @@
+"""Batches against the exact simulator, whose method is another one, on the same draws."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch.batch_interface import (
+    Population,
+    Setting,
+    run_batch,
+    run_events,
+    setting_of,
+)
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from noack.config.impairments import Delay, LinkSettings
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.core.errors import CallerError
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.quadratic import QuadraticTrigger
+from tests.cosim.simulation.batch.exact import (
+    SIZES,
+    cost_of,
+    dense,
+    one,
+    random_population,
+    random_setting,
+    reference,
+)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_events_fates_and_measures_are_those_of_the_exact_simulator(size: tuple[int, int]) -> None:
+    rng = np.random.default_rng(size[0])
+    events = lost = settled = 0
+    for _ in range(15):
+        setting = random_setting(rng, *size)
+        population = random_population(rng, setting, 4)
+        rows = run_batch(setting, population)
+        for i, row in enumerate(rows):
+            run = reference(setting, one(population, i))
+            found = run_events(setting, one(population, i))
+            assert row["status"] == OK
+            assert found.delivered.tolist() == run.delivered.tolist()
+            np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+            assert row["transmissions"] == len(run.event_s)
+            assert row["deliveries"] == run.delivered.sum()
+            gaps_s = np.diff(run.event_s)
+            if len(gaps_s):
+                assert row["inter_event_min_s"] == pytest.approx(gaps_s.min(), abs=2e-9)
+                assert row["inter_event_mean_s"] == pytest.approx(gaps_s.mean(), abs=2e-9)
+            else:
+                assert math.isnan(row["inter_event_min_s"])
+                assert math.isnan(row["inter_event_mean_s"])
+            assert row["cost"] == pytest.approx(cost_of(run, setting), rel=1e-9, abs=1e-15)
+            t_s, norms, errors = dense(run, setting)
+            assert row["final_norm"] == pytest.approx(norms[-1], rel=1e-9)
+            assert errors.max() <= row["sup_e_c_scaled"] * (1 + 1e-9) + 1e-15
+            assert row["sup_e_c_scaled"] <= errors.max() * (1 + 1e-3) + 1e-15
+            above = np.flatnonzero(norms > setting.settle * norms[0])
+            if above[-1] == len(norms) - 1:
+                assert math.isnan(row["settling_s"])
+            else:
+                settled += 1
+                low_s, high_s = t_s[above[-1]], t_s[above[-1] + 1]
+                assert low_s - 1e-12 <= row["settling_s"] <= high_s + 1e-12
+            assert math.isnan(row["diverged_at_s"])
+            events += len(run.event_s)
+            lost += int((~run.delivered).sum())
+    assert events > 300
+    assert lost > 50
+    assert settled > 3
+
+
+def scenario(content: dict[str, Any], **changes: Any) -> Scenario:
+    return resolve(Scenario.model_validate_json(json.dumps(content | changes)))
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_a_setting_of_a_scenario_runs_as_the_scenario(content: dict[str, Any], mode: str) -> None:
+    content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.1}]
+    resolved = scenario(content, mode=mode, horizon_s=8.0, seeds={"loss": 2**40 + 3})
+    loop = loop_of(resolved)
+    draw = Population(loop.A[None], loop.B[None], loop.x0[None], np.array([2**40 + 3], np.uint64))
+    found = run_events(setting_of(resolved), draw)
+    run = simulate_continuous(
+        continuous_loop_of(resolved), horizon_s=8.0, delivered=network_fates(resolved),
+        known_start=False,
+    )  # fmt: skip
+    assert len(run.event_s) >= (1 if mode == "model" else 5)
+    np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+    assert found.delivered.tolist() == run.delivered.tolist()
+
+
+def test_a_row_depends_on_its_own_draw_only() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        setting = random_setting(rng, 3, 2)
+        population = random_population(rng, setting, 40)
+        rows = run_batch(setting, population)
+        order = rng.permutation(40)
+        mixed = run_batch(setting, Population(*(part[order] for part in population)))
+        assert mixed.tobytes() == rows[order].tobytes()
+        alone = np.concatenate([run_batch(setting, one(population, i)) for i in range(40)])
+        assert alone.tobytes() == rows.tobytes()
+
+
+def turning(depth: float, omega: float, floored: bool) -> tuple[Setting, Population, float]:
+    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it pokes through around t = π/ω."""
+    alpha = 0.0 if floored else 0.8
+    turn = np.array([[0.0, omega], [-omega, 0.0]])
+    level = 2.0 * math.hypot(0.3, 0.4) * (1 - depth)
+    trigger = DecayingTrigger(level * 1e-3, 0.8, level) if floored else DecayingTrigger(level, 0.8)
+    setting = Setting(
+        H=-alpha * np.eye(2), K=np.zeros((1, 2)), trigger=trigger, link=LinkSettings(),
+        horizon_s=1.5 * math.pi / omega, known_start=True,
+    )  # fmt: skip
+    draw = Population(
+        (turn - alpha * np.eye(2))[None], np.ones((1, 2, 1)), np.array([[0.3, 0.4]]),
+        np.zeros(1, np.uint64),
+    )  # fmt: skip
+    return setting, draw, 2 / omega * math.asin(min(1 - depth, 1.0))
+
+
+@pytest.mark.parametrize("floored", [False, True])
+@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
+def test_a_crossing_however_short_is_found(depth: float, omega: float, floored: bool) -> None:
+    setting, draw, first_s = turning(depth, omega, floored)
+    found = run_events(setting, draw)
+    tolerance_s = 2e-14 / math.sqrt(depth) / omega + 1e-12 * first_s
+    assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
+    assert run_events(*turning(-depth, omega, floored)[:2]).event_s.size == 0
+
+
+def test_the_supremum_between_events_is_certified() -> None:
+    """e_c = e_s turns with x, and nothing is sent: sup ‖e_c‖ e^{αt} is 2‖x(0)‖, at π/ω."""
+    for omega in (0.3, 7.0, 200.0):
+        setting, draw, _ = turning(-1e-3, omega, False)
+        (row,) = run_batch(setting, draw)
+        assert row["transmissions"] == 0
+        assert 1 - 1e-10 <= row["sup_e_c_scaled"] / 1.0 <= 1 + 1e-12
+
+
+def test_a_loop_that_diverges_says_so() -> None:
+    fast = 100 * np.eye(2)
+    setting = Setting(
+        H=fast, K=np.zeros((1, 2)), trigger=DecayingTrigger(0.5, 0.25), link=LinkSettings(),
+        horizon_s=50.0, known_start=True,
+    )  # fmt: skip
+    start = np.array([[0.6, 0.8]])
+    draw = Population(fast[None], np.ones((1, 2, 1)), start, np.zeros(1, np.uint64))
+    (row,) = run_batch(setting, draw)
+    assert row["status"] == DIVERGED
+    assert row["transmissions"] == 0
+    # e^{100t} = 1e100 · 0.5 e^{−0.25t}; ‖(x, e_s, e_c)‖ = |x|.
+    expected_s = math.log(0.5e100) / 100.25
+    assert row["diverged_at_s"] == pytest.approx(expected_s, rel=1e-12)
+    for name in ("cost", "settling_s", "final_norm", "sup_e_c_scaled"):
+        assert math.isnan(row[name])
+
+
+def test_events_of_unstable_loops_are_those_of_the_exact_simulator_while_they_can_be_told() -> None:
+    """x grows and the threshold falls: after a while there are too many events."""
+    rng = np.random.default_rng(3)
+    compared = 0
+    for _ in range(10):
+        setting = random_setting(rng, 2, 1)
+        population = random_population(rng, setting, 1)
+        wild = population._replace(A=population.A + 2 * np.eye(2))
+        short = Setting(**{**vars(setting), "horizon_s": 1.5, "most_events": 5000})
+        found, run = run_events(short, wild), reference(short, wild, 5000)
+        assert len(found.event_s) == len(run.event_s)
+        np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+        compared += len(found.event_s)
+        few = Setting(**{**vars(setting), "horizon_s": 50.0, "most_events": 60})
+        (row,) = run_batch(few, wild)
+        assert row["status"] in (OK, TOO_MANY_EVENTS)
+        if row["status"] == TOO_MANY_EVENTS:
+            assert row["transmissions"] == 60
+            assert math.isnan(row["cost"])
+    assert compared > 100
+
+
+def test_mistakes_are_told() -> None:
+    rng = np.random.default_rng(1)
+    setting = random_setting(rng, 2, 1)
+    population = random_population(rng, setting, 3)
+    with pytest.raises(ValueError, match="x0: expected the shape"):
+        run_batch(setting, population._replace(x0=population.x0[:, :1]))
+    with pytest.raises(ValueError, match="loss_seeds: expected uint64"):
+        run_batch(setting, population._replace(loss_seeds=np.zeros(3, np.int64)))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="one run"):
+        run_events(setting, population)
+    late = setting.link.model_copy(update={"impairments": (Delay(delay_s=1.0),)})
+    with pytest.raises(CallerError, match="losses and corruption only"):
+        run_batch(Setting(**{**vars(setting), "link": late}), population)
+    with pytest.raises(CallerError, match=r"trigger\.floor"):
+        run_batch(
+            Setting(**{**vars(setting), "trigger": DecayingTrigger(1.0, 1.0), "horizon_s": 1e3}),
+            population,
+        )
+    wide = QuadraticTrigger(np.eye(6), 10**6)
+    with pytest.raises(ValueError, match="trigger: expected 4 columns, found 6"):
+        run_batch(Setting(**{**vars(setting), "trigger": wide}), population)

@@ -1,0 +1,266 @@
+"""Batches under every policy against the exact simulator, on the same draws."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch.batch_interface import Population, Setting, run_batch, run_events
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.simulation.continuous.continuous_run import TooManyEventsError
+from noack.config.impairments import LinkSettings, LossOf, WorstCase
+from noack.core.linear_systems import Matrix
+from noack.trigger.absolute import AbsoluteTrigger
+from noack.trigger.deadline import DeadlineTrigger
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.dwell import DwellTrigger
+from noack.trigger.dynamic import DynamicTrigger
+from noack.trigger.lyapunov import LyapunovTrigger
+from noack.trigger.mixed import MixedTrigger
+from noack.trigger.periodic import PeriodicTrigger
+from noack.trigger.quadratic import QuadraticTrigger
+from noack.trigger.relative import relative_trigger
+from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.trigger_policy import Policy
+from tests.cosim.simulation.batch.exact import (
+    cost_of,
+    dense,
+    one,
+    random_population,
+    random_setting,
+    reference,
+)
+
+Make = Callable[[np.random.Generator, int, Matrix | None], Policy]
+MS = 10**6
+
+
+def mixed(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    return MixedTrigger(0.05, rng.uniform(0.003, 0.05), W)
+
+
+def decaying(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    return DecayingTrigger(0.2, 0.5, rng.choice([0.0, 0.1, 1.0]), W)
+
+
+def lyapunov(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    return LyapunovTrigger(np.eye(n) + 0.1 * rng.uniform(-1, 1, (n, n)), 1.2, W)
+
+
+def dynamic(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    L = np.eye(n) + 0.3 * rng.uniform(-1, 1, (n, n))
+    theta_s, decay_per_s = rng.choice([0.01, 0.5]), rng.choice([0.0, 1.0, 30.0])
+    BK = 3 * rng.uniform(-1, 1, (n, n))
+    return DynamicTrigger(
+        0.1, theta_s, decay_per_s, L.T @ L, np.eye(n), BK, rng.choice([0.0, 0.05]), W
+    )
+
+
+def quadratic(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    apart = 0.05 * rng.uniform(-1, 1, (2 * n, 2 * n))
+    Q = np.diag([-0.02] * n + [1.0] * n) + apart + apart.T
+    period_ns, heartbeat = int(rng.choice([100 * MS, 7 * MS, 1])), int(rng.choice([0, 6]))
+    if period_ns == 1:
+        period_ns, heartbeat = 33 * MS, 0
+    return QuadraticTrigger(Q, period_ns, rng.choice([0.0, 0.01]), heartbeat, W)
+
+
+def self_triggered(rng: np.random.Generator, n: int, W: Matrix | None) -> Policy:
+    growth_per_s = rng.choice([0.0, 2.0])
+    return SelfTrigger(0.3, 0.5, 0.01, growth_per_s, 1.0, 0.1, 10 * MS, 1000 * MS, W)
+
+
+POLICIES: dict[str, Make] = {
+    "absolute": lambda rng, n, W: AbsoluteTrigger(0.01, W),
+    "relative": lambda rng, n, W: relative_trigger(rng.uniform(0.01, 0.05), W),
+    "mixed": mixed,
+    "lyapunov": lyapunov,
+    "dynamic": dynamic,
+    "quadratic": quadratic,
+    "periodic": lambda rng, n, W: PeriodicTrigger(100 * MS, W),
+    "self_triggered": self_triggered,
+    "deadline of decaying": lambda *given: DeadlineTrigger(decaying(*given), 300 * MS),
+    "deadline of mixed": lambda *given: DeadlineTrigger(mixed(*given), 300 * MS),
+    "dwell of decaying": lambda *given: DwellTrigger(decaying(*given), 100 * MS),
+    "dwell of lyapunov": lambda *given: DwellTrigger(lyapunov(*given), 100 * MS),
+    "dwell of dynamic": lambda *given: DwellTrigger(dynamic(*given), 100 * MS),
+    "dwell of quadratic": lambda *given: DwellTrigger(quadratic(*given), 15 * MS + 3),
+    "dwell of deadline of self_triggered": lambda *given: DwellTrigger(
+        DeadlineTrigger(self_triggered(*given), 200 * MS), 50 * MS
+    ),
+    "deadline within a dwell": lambda *given: DeadlineTrigger(
+        DwellTrigger(dynamic(*given), 300 * MS), 100 * MS
+    ),
+}
+NORM_OR_TIME = (
+    "absolute", "periodic", "self_triggered", "deadline of decaying", "dwell of decaying",
+    "dwell of deadline of self_triggered",
+)  # fmt: skip
+"""They run in the code that the paper's policy has."""
+SIZES = {True: (2, 1), False: (3, 2)}
+"""Of those, and of the others. Each is compiled, which takes seconds."""
+MOST_EVENTS = 500
+
+
+def settings(name: str, seeds: range) -> list[tuple[Setting, Population]]:
+    """Random settings under a policy, with two draws each."""
+    made = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, *name.encode()])
+        n, m = SIZES[name in NORM_OR_TIME]
+        setting = random_setting(rng, n, m)
+        policy = POLICIES[name](rng, n, setting.trigger.weight)
+        if name == "lyapunov":  # Where an update is lost, the next event is at once.
+            setting = replace(setting, link=LinkSettings(), H=0.3 * setting.H - 0.7 * np.eye(n))
+        population = random_population(rng, setting, 2)
+        made.append((replace(setting, trigger=policy, most_events=MOST_EVENTS), population))
+    return made
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_events_fates_and_measures_are_those_of_the_exact_simulator(name: str) -> None:
+    events = finished = 0
+    for setting, population in settings(name, range(6)):
+        for i, row in enumerate(run_batch(setting, population)):
+            draw = one(population, i)
+            found = run_events(setting, draw)
+            try:
+                run = reference(setting, draw, MOST_EVENTS)
+            except TooManyEventsError:
+                assert row["status"] == TOO_MANY_EVENTS
+                continue
+            assert row["status"] == OK
+            assert found.delivered.tolist() == run.delivered.tolist()
+            np.testing.assert_allclose(found.event_s, run.event_s, rtol=0, atol=1e-9)
+            assert row["transmissions"] == len(run.event_s)
+            assert row["deliveries"] == run.delivered.sum()
+            gaps_s = np.diff(run.event_s)
+            if len(gaps_s):
+                assert row["inter_event_min_s"] == pytest.approx(gaps_s.min(), abs=2e-9)
+                assert row["inter_event_mean_s"] == pytest.approx(gaps_s.mean(), abs=2e-9)
+            assert row["cost"] == pytest.approx(cost_of(run, setting), rel=1e-9, abs=1e-15)
+            t_s, norms, errors = dense(run, setting)
+            assert row["final_norm"] == pytest.approx(norms[-1], rel=1e-9)
+            assert errors.max() <= row["sup_e_c_scaled"] * (1 + 1e-9) + 1e-15
+            assert row["sup_e_c_scaled"] <= errors.max() * (1 + 1e-3) + 1e-15
+            above = np.flatnonzero(norms > setting.settle * norms[0])
+            if above[-1] == len(norms) - 1:
+                assert math.isnan(row["settling_s"])
+            else:
+                low_s, high_s = t_s[above[-1]], t_s[above[-1] + 1]
+                assert low_s - 1e-12 <= row["settling_s"] <= high_s + 1e-12
+            events += len(run.event_s)
+            finished += 1
+    assert events > (3 if name == "lyapunov" else 30)
+    assert finished == 12 or (name == "lyapunov" and finished >= 3)
+
+
+@pytest.mark.parametrize("name", ["mixed", "dynamic", "quadratic", "dwell of lyapunov"])
+def test_a_row_depends_on_its_own_draw_only(name: str) -> None:
+    rng = np.random.default_rng(5)
+    for setting, _ in settings(name, range(2)):
+        population = random_population(rng, setting, 30)
+        rows = run_batch(setting, population)
+        order = rng.permutation(30)
+        permuted = run_batch(setting, Population(*(part[order] for part in population)))
+        assert permuted.tobytes() == rows[order].tobytes()
+        alone = np.concatenate([run_batch(setting, one(population, i)) for i in range(30)])
+        assert alone.tobytes() == rows.tobytes()
+
+
+def turning(sigma: float, omega: float, alpha: float) -> tuple[Setting, Population]:
+    """‖x‖ = e^{−αt}, ‖e_s‖ = 2 e^{−αt} sin(ωt/2): the relative rule meets sin(ωt/2) > σ/2."""
+    turn = omega * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    setting = Setting(
+        H=-alpha * np.eye(3), K=np.zeros((2, 3)), trigger=relative_trigger(sigma),
+        link=LinkSettings(), horizon_s=1.5 * math.pi / omega, known_start=True,
+    )  # fmt: skip
+    draw = Population(
+        (turn - alpha * np.eye(3))[None], np.ones((1, 3, 2)), np.array([[0.6, 0.8, 0.0]]),
+        np.zeros(1, np.uint64),
+    )  # fmt: skip
+    return setting, draw
+
+
+@pytest.mark.parametrize("alpha_omega", [0.1, 7.0, 70.0])
+@pytest.mark.parametrize("omega", [0.3, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-8, 1e-11])
+def test_a_crossing_however_short_is_found(depth: float, omega: float, alpha_omega: float) -> None:
+    """Also where the state has decayed to e^{−70π}, 1e-95.
+
+    On the way there a hundred polynomials lose some 1e-14 each of its relative accuracy.
+    """
+    found = run_events(*turning(2 * (1 - depth), omega, alpha_omega * omega))
+    first_s = 2 / omega * math.asin(1 - depth)
+    tolerance_s = 5e-13 / math.sqrt(depth) / omega + 1e-12 * first_s
+    assert found.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
+    beyond = turning(2 * (1 + depth), omega, alpha_omega * omega)
+    assert run_events(*beyond).event_s.size == 0
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["relative", "periodic", "dwell of decaying", "dynamic", "quadratic", "dwell of quadratic"],
+)
+def test_runs_that_diverge_do_so_at_the_time_of_the_exact_simulator(name: str) -> None:
+    quiet = name in ("relative", "dynamic", "quadratic")
+    for setting, population in settings(name, range(6)):
+        wild = population._replace(A=population.A + 20 * np.eye(len(setting.H)))
+        forever = replace(setting, horizon_s=60.0, most_events=100_000)
+        if quiet:  # The model knows the plant, and there is nothing to send.
+            forever = replace(forever, H=wild.A[0] + wild.B[0] @ setting.K, known_start=True)
+        draw = one(wild, 0)
+        (row,) = run_batch(forever, draw)
+        run = reference(forever, draw, 100_000)
+        assert row["status"] == DIVERGED
+        assert row["diverged_at_s"] == pytest.approx(run.diverged_at_s, rel=1e-9)
+        assert row["transmissions"] == len(run.event_s)
+
+
+def test_an_oscillation_is_no_hard_case() -> None:
+    """x turns and nothing arrives: ‖e_c‖ is 1 for ever, all but the level 1 + 1e-10."""
+    turn = np.array([[0.0, 100.0], [-100.0, 0.0]])
+    lost = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=None)
+    setting = Setting(
+        H=np.zeros((2, 2)), K=np.zeros((1, 2)), trigger=PeriodicTrigger(1000 * MS), link=lost,
+        horizon_s=20.0, known_start=False,
+    )  # fmt: skip
+    draw = Population(
+        turn[None], np.ones((1, 2, 1)), np.array([[0.6, 0.8]]), np.zeros(1, np.uint64)
+    )
+    (row,) = run_batch(setting, draw)
+    assert row["status"] == OK
+    assert row["sup_e_c_scaled"] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_level_that_is_all_but_met_all_the_time_is_undecided() -> None:
+    """‖x‖ is 1 for ever, as x turns; whether it passes 1 + 1e-13 is looked at a million times."""
+    turn = np.array([[0.0, 3.0], [-3.0, 0.0]])
+    setting = Setting(
+        H=turn, K=np.zeros((1, 2)), trigger=AbsoluteTrigger(1.0), link=LinkSettings(),
+        horizon_s=4.0, known_start=True, settle=1 + 1e-13,
+    )  # fmt: skip
+    draw = Population(
+        turn[None], np.ones((1, 2, 1)), np.array([[0.6, 0.8]]), np.zeros(1, np.uint64)
+    )
+    (row,) = run_batch(setting, draw)
+    assert row["status"] == UNDECIDED
+    assert math.isnan(row["cost"])
+    (row,) = run_batch(replace(setting, settle=1 + 1e-6), draw)
+    assert row["status"] == OK
+    assert row["settling_s"] == 0.0
+
+
+@pytest.mark.parametrize("rate_per_s", [1e11, 1e17])
+def test_a_plant_too_fast_for_the_clock_is_undecided(rate_per_s: float) -> None:
+    """Polynomials of 1e-10 s do not come to an end, and those of 1e-16 s do not exist."""
+    fast = -rate_per_s * np.eye(2)
+    setting = Setting(
+        H=fast, K=np.zeros((1, 2)), trigger=PeriodicTrigger(1000 * MS), link=LinkSettings(),
+        horizon_s=4.0, known_start=True,
+    )  # fmt: skip
+    draw = Population(fast[None], np.ones((1, 2, 1)), np.ones((1, 2)), np.zeros(1, np.uint64))
+    (row,) = run_batch(setting, draw)
+    assert row["status"] == UNDECIDED

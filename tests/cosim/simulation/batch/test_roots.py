@@ -1,0 +1,72 @@
+"""First roots of polynomials, interpreted: the functions that the batch engine compiles."""
+
+import math
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch import level_crossing, norm_crossing
+from cosim.simulation.batch.level_crossing import estimate, first_root
+from cosim.simulation.batch.norm_crossing import NONE, UNRESOLVED
+from noack.core.linear_systems import Vector
+
+
+def coefficients(zeros: Vector, leading: float) -> Vector:
+    """Of ``leading`` Π (s − zero), from the lowest."""
+    return np.asarray(leading * np.poly(zeros)[::-1].real)
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_the_first_of_known_roots_is_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    inside = rng.uniform(0.05, 1, rng.integers(0, 4))
+    outside = np.concatenate([rng.uniform(1.1, 3, 2), -rng.uniform(0.1, 3, 2)])
+    pair = rng.uniform(0.1, 0.9) + 1j * 10.0 ** rng.uniform(-5, 0)
+    g = coefficients(np.concatenate([inside, outside, [pair, pair.conjugate()]]), 1.0)
+    g = -g * np.sign(g[0])
+    found = first_root(g, len(g) - 1, 0.0, 0.0, 1e-15 * abs(g[0]), 1.0)
+    if len(inside):
+        assert found == pytest.approx(inside.min(), rel=1e-8)
+    else:
+        assert found == NONE
+
+
+def test_a_level_that_decays_is_met() -> None:
+    """s² = e^{−2s} at the root of s = e^{−s}, the omega constant."""
+    g = np.array([0.0, 0.0, 1.0])
+    assert first_root(g, 2, 1.0, 2.0, 0.0, 1.0) == pytest.approx(0.5671432904097838, rel=1e-15)
+    assert first_root(g, 2, 1.0, 2.0, 0.0, 0.567) == NONE
+
+
+def test_a_start_on_the_level_is_an_event_only_if_it_goes_up() -> None:
+    assert first_root(np.array([1.0, 1e-3, 0.0]), 2, 1.0, 0.0, 0.0, 1.0) == 0.0
+    assert first_root(np.array([1.0, -1.0, 2.0]), 2, 1.0, 0.0, 0.0, 1.0) == pytest.approx(0.5)
+    assert first_root(np.array([1.0, -1.0, 0.5]), 2, 1.0, 0.0, 0.0, 1.0) == NONE
+    assert first_root(np.array([1.0 + 1e-9, -1.0, 0.0]), 2, 1.0, 0.0, 1e-15, 1.0) == 0.0
+    assert first_root(np.zeros(3), 2, 0.0, 0.0, 0.0, 1.0) == NONE
+    assert first_root(np.array([-1.0, 1.0, 0.0]), 2, 0.0, 0.0, 0.0, 0.0) == NONE
+
+
+def test_too_many_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(s − ½)² s² all but touches 0 from below."""
+    g = -coefficients(np.array([0.5, 0.5, -1.0, -1.0]), 1.0)
+    g[0] -= 1e-12
+    assert first_root(g, 4, 0.0, 0.0, 0.0, 1.0) == NONE
+    monkeypatch.setattr(level_crossing, "MOST_STEPS", 5)
+    assert first_root(g, 4, 0.0, 0.0, 0.0, 1.0) == UNRESOLVED
+
+
+def test_newton_gives_way_to_halving(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(level_crossing, "NEWTON_STEPS", 0)
+    monkeypatch.setattr(norm_crossing, "NEWTON_STEPS", 0)
+    g = np.array([-0.1, 0.0, 0.0, 1.0])
+    found = first_root(g, 3, 0.0, 0.0, 0.0, 1.0)
+    assert found == pytest.approx(0.1 ** (1 / 3), rel=1e-15)
+
+
+def test_an_estimate_is_the_root_of_a_parabola() -> None:
+    assert estimate(np.array([-1.0, 0.0, 4.0]), 0.0, 0.0) == 0.5
+    assert estimate(np.array([0.0, -1.0, 4.0]), 0.0, 0.0) == 0.25
+    assert estimate(np.array([-3.0, 4.0, -1.0]), 0.0, 0.0) == 1.0
+    assert estimate(np.array([-1.0, 0.0, -1.0]), 0.0, 0.0) == math.inf
+    assert estimate(np.array([-1.0, 1.0, -1.0]), 0.0, 0.0) == math.inf

@@ -1,0 +1,405 @@
+"""Exact event times against an integrator, closed forms, and curves made to be missed."""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.linalg import block_diag, expm
+from scipy.optimize import brentq
+
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, LoopState, reset
+from cosim.simulation.continuous.continuous_run import (
+    ContinuousRun,
+    TooManyEventsError,
+    simulate_continuous,
+)
+from noack.config.resolution import Loop
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.trigger.decaying import DecayingTrigger
+
+
+def loop_with(
+    A: Matrix, B: Matrix, K: Matrix, H: Matrix, x0: Vector, weight: Matrix | None = None
+) -> Loop:
+    """A loop of given matrices; what H was made of does not matter to it."""
+    names = tuple(f"x_{i}" for i in range(len(A)))
+    return Loop(A, B, K, H, A, B, x0, weight, names, names[: B.shape[1]])
+
+
+class Case(NamedTuple):
+    loop: Loop
+    trigger: DecayingTrigger
+    lost: list[bool]
+    known: bool
+    horizon_s: float
+
+    def delivered(self, event: int) -> bool:
+        return (event == 0 and not self.known) or not self.lost[event % len(self.lost)]
+
+    def run(self) -> ContinuousRun:
+        return simulate_continuous(
+            self.loop,
+            self.trigger,
+            horizon_s=self.horizon_s,
+            delivered=self.delivered,
+            known_start=self.known,
+        )
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    n = draw(st.integers(1, 8))
+    m = draw(st.integers(1, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    A, B, K = (rng.uniform(-1, 1, shape) * 2 / math.sqrt(n) for shape in ((n, n), (n, m), (m, n)))
+    H = A + B @ K + draw(st.sampled_from([0.05, 0.5])) * rng.uniform(-1, 1, (n, n))
+    if draw(st.booleans()):
+        H = np.zeros((n, n))
+    W = np.eye(n) + 0.5 * rng.uniform(-1, 1, (n, n)) if draw(st.booleans()) else None
+    floor = draw(st.sampled_from([0.0, 0.1]))
+    return Case(
+        loop_with(A, B, K, H, rng.uniform(-1, 1, n), W),
+        DecayingTrigger(0.3, draw(st.sampled_from([0.1, 1.0])), floor, W),
+        draw(st.lists(st.booleans(), min_size=1, max_size=6)),
+        draw(st.booleans()),
+        horizon_s=2.0,
+    )
+
+
+def integrated(case: Case) -> Iterator[tuple[float, Vector]]:
+    """Event times and (x, x_s, x_c) just before, by an integrator in the paper's coordinates."""
+    loop, trigger, n = case.loop, case.trigger, case.loop.n
+    W = np.eye(n) if trigger.weight is None else trigger.weight
+    G = np.block(
+        [
+            [loop.A, np.zeros((n, n)), loop.B @ loop.K],
+            [np.zeros((n, n)), loop.H, np.zeros((n, n))],
+            [np.zeros((n, n)), np.zeros((n, n)), loop.H],
+        ]
+    )
+
+    def excess(t_s: float, y: Vector) -> float:
+        threshold = max(trigger.beta * math.exp(-trigger.alpha_per_s * t_s), trigger.floor)
+        return float(np.linalg.norm(W @ (y[n : 2 * n] - y[:n]))) - threshold
+
+    excess.terminal = True  # type: ignore[attr-defined]
+    excess.direction = 1.0  # type: ignore[attr-defined]
+    x0 = loop.x0
+    y, t_s = np.concatenate([x0, x0, x0 if case.known else 0 * x0]), 0.0
+    for event in itertools.count():
+        if event > 0 or case.known:
+            solution = solve_ivp(
+                lambda _, y: G @ y, (t_s, case.horizon_s), y, method="DOP853",
+                events=excess, rtol=1e-12, atol=1e-14, max_step=0.1,
+            )  # fmt: skip
+            if solution.status != 1:
+                return
+            t_s, y = solution.t_events[0][0], solution.y_events[0][0]
+        yield t_s, y
+        y = y.copy()
+        y[n : 2 * n] = y[:n]
+        if case.delivered(event):
+            y[2 * n :] = y[:n]
+
+
+@given(cases())
+@settings(max_examples=40)
+def test_events_are_the_integrators(case: Case) -> None:
+    """To 1e-8 s: the integrator's error of 1e-12 over the slope of the error norm, grown by far."""
+    run = case.run()
+    states = run.before
+    reference = list(integrated(case))
+    assert len(states) == len(reference)
+    for state, (t_s, y) in zip(states, reference, strict=True):
+        assert state.t_s == pytest.approx(t_s, abs=1e-8)
+        found = np.concatenate([state.x, state.x + state.e_s, state.x + state.e_c])
+        np.testing.assert_allclose(found, y, rtol=0, atol=1e-7)
+
+
+def test_the_random_systems_have_events_and_losses() -> None:
+    """The comparison above looks at something."""
+    counts: list[int] = []
+
+    @given(cases())
+    @settings(max_examples=30)
+    def count(case: Case) -> None:
+        counts.append(len(case.run().before))
+
+    count()
+    assert np.median(counts) >= 3
+    assert max(counts) >= 10
+
+
+@given(cases())
+@settings(max_examples=30)
+def test_what_holds_between_events(case: Case) -> None:
+    """The threshold is met at each event and never passed; x_c − x_s is the missed jumps (I1)."""
+    run, H = case.run(), case.loop.H
+    t_s = np.linspace(0, run.reached_s, 301)
+    samples = run.at(t_s)
+    levels = np.array([run.system.threshold(t) for t in t_s])
+    assert (run.e_s_norm(samples) <= levels * (1 + 1e-12)).all()
+    for state in run.before[0 if case.known else 1 :]:
+        reached = run.system.norms(state.e_s[None])[0]
+        assert reached == pytest.approx(run.system.threshold(state.t_s), rel=1e-12)
+    received = -1
+    for i, t in enumerate(t_s):
+        happened = int(np.searchsorted(run.event_s, t, side="right"))
+        received = max([received, *np.flatnonzero(run.delivered[:happened])])
+        missed = [
+            expm(H * (t - event.t_s)) @ event.e_s for event in run.before[received + 1 : happened]
+        ]
+        if received < 0 and not case.known:
+            continue
+        expected = np.sum([np.zeros(case.loop.n), *missed], axis=0)
+        scale = max(np.abs(samples.x[: i + 1]).max(), 1.0)
+        difference = samples.x_c[i] - samples.x_s[i]
+        np.testing.assert_allclose(difference, expected, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("floored", [False, True])
+@pytest.mark.parametrize("lost", [(False,), (False, True, True), (True, False)])
+def test_a_scalar_loop_has_closed_form_events(floored: bool, lost: tuple[bool, ...]) -> None:
+    """ẋ = a x + b K x_c with x_s and x_c held: e_s = −(v/a)(e^{aτ} − 1), v = ẋ(t_i), τ = t − t_i.
+
+    With a constant threshold ε: e^{aτ} = 1 + aε/|v|. With βe^{−αt} and α = a, w = e^{aτ} solves
+    w² − w = aβe^{−αt_i}/|v|.
+    """
+    a, b, k, beta = 0.7, 1.0, -2.0, 0.3
+    trigger = DecayingTrigger(1e-9 if floored else beta, a, beta if floored else 0.0)
+    loop = loop_with(
+        np.array([[a]]), np.array([[b]]), np.array([[k]]), np.zeros((1, 1)), np.array([2.0])
+    )
+    case = Case(loop, trigger, list(lost), True, horizon_s=4.0)
+    x, x_c, t_s, expected = 2.0, 2.0, 0.0, []
+    for event in itertools.count():
+        v = a * x + b * k * x_c
+        if floored:
+            grown = 1 + a * beta / abs(v)
+        else:
+            grown = (1 + math.sqrt(1 + 4 * a * beta * math.exp(-a * t_s) / abs(v))) / 2
+        t_s += math.log(grown) / a
+        if t_s > case.horizon_s:
+            break
+        x += v / a * (grown - 1)
+        if case.delivered(event):
+            x_c = x
+        expected.append((t_s, x))
+    run = case.run()
+    assert len(expected) > 5
+    np.testing.assert_allclose(run.event_s, [t for t, _ in expected], rtol=1e-12)
+    np.testing.assert_allclose([s.x[0] for s in run.before], [x for _, x in expected], rtol=1e-11)
+
+
+def turning(depth: float, omega: float, floored: bool) -> Case:
+    """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it pokes through around t = π/ω.
+
+    x turns, x_s does not, and (unless floored) both decay like the threshold.
+    """
+    alpha = 0.0 if floored else 0.8
+    turn = np.array([[0.0, omega], [-omega, 0.0]])
+    A, B, K = turn - alpha * np.eye(2), np.ones((2, 1)), np.zeros((1, 2))
+    peak = 2.0 * math.hypot(0.3, 0.4)
+    level = peak * (1 - depth)
+    trigger = DecayingTrigger(level * 1e-3, 0.8, level) if floored else DecayingTrigger(level, 0.8)
+    loop = loop_with(A, B, K, -alpha * np.eye(2), np.array([0.3, 0.4]))
+    return Case(loop, trigger, [False], True, horizon_s=1.5 * math.pi / omega)
+
+
+@pytest.mark.parametrize("floored", [False, True])
+@pytest.mark.parametrize("omega", [0.3, 7.0, 200.0])
+@pytest.mark.parametrize("depth", [1e-2, 1e-5, 1e-7, 1e-9, 1e-12])
+def test_a_crossing_however_short_is_found(depth: float, omega: float, floored: bool) -> None:
+    case = turning(depth, omega, floored)
+    run = case.run()
+    first_s = 2 / omega * math.asin(1 - depth)
+    excursion_s = 2 * (math.pi / omega - first_s)
+    assert excursion_s < 3 * math.sqrt(2 * depth) * 2 / omega
+    # Time is as well determined as rounding of 1e-15 over the slope √(2 depth) permits.
+    tolerance_s = 5e-15 / math.sqrt(depth) / omega + 1e-12 * first_s
+    assert run.event_s[0] == pytest.approx(first_s, abs=tolerance_s)
+    assert turning(-depth, omega, floored).run().event_s.size == 0
+
+
+def test_a_tangency_in_floating_point_is_settled_either_way() -> None:
+    for floored in (False, True):
+        case = turning(0.0, 7.0, floored)
+        assert case.run().event_s == pytest.approx([math.pi / 7.0] * len(case.run().event_s))
+
+
+@pytest.mark.parametrize("depth", [1e-4, 1e-9])
+def test_the_highest_of_many_near_misses_is_found(depth: float) -> None:
+    """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which passes the threshold.
+
+    The weight all but hides the other entries of e_s; the reference is the closed form.
+    """
+    omegas, weights = np.array([1.0, 11.3, 17.7]), np.array([0.5, 0.3, 0.2])
+    horizon_s = 60.0
+
+    def error(t: float) -> float:
+        return float(np.sum(weights * (1 - np.cos(omegas * t))))
+
+    t_s = np.linspace(0, horizon_s, 600_001)
+    curve = (weights * (1 - np.cos(np.outer(t_s, omegas)))).sum(axis=1)
+    inner = np.flatnonzero((curve[1:-1] > curve[:-2]) & (curve[1:-1] >= curve[2:])) + 1
+    assert len(inner) > 100
+    peak = inner[np.argmax(curve[inner])]
+    slope = lambda t: float(np.sum(weights * omegas * np.sin(omegas * t)))  # noqa: E731
+    peak_s = brentq(slope, t_s[peak - 1], t_s[peak + 1], xtol=1e-15)
+    level = error(peak_s) * (1 - depth)
+    first_s = brentq(lambda t: error(t) - level, peak_s - 0.05, peak_s, xtol=1e-14)
+    turns = [np.array([[0.0, w], [-w, 0.0]]) for w in omegas]
+    mix = np.eye(6)
+    mix[0] = [1, 0, 1, 0, 1, 0]  # the first state is the sum of the three cosines
+    A = mix @ block_diag(*turns) @ np.linalg.inv(mix)
+    x0 = mix @ np.array([weights[0], 0, weights[1], 0, weights[2], 0])
+    W = np.diag([1.0, *[1e-12] * 5])
+    loop = loop_with(A, np.zeros((6, 1)), np.zeros((1, 6)), np.zeros((6, 6)), x0, W)
+    trigger = DecayingTrigger(1e-3, 1.0, level, W)
+    run = Case(loop, trigger, [False], True, horizon_s).run()
+    assert run.event_s[0] == pytest.approx(first_s, abs=1e-13 / math.sqrt(depth))
+    missed = DecayingTrigger(1e-3, 1.0, error(peak_s) * (1 + depth), W)
+    assert Case(loop, missed, [False], True, horizon_s).run().event_s.size == 0
+
+
+def scalar_system(trigger: DecayingTrigger) -> ContinuousLoop:
+    """e_s grows like −x, x = e^t: ẋ = x, ẋ_s = 0."""
+    one = np.ones((1, 1))
+    return ContinuousLoop(loop_with(one, one, 0 * one, 0 * one, np.ones(1)), trigger)
+
+
+def test_an_error_on_the_boundary_leaves_at_once_or_comes_back_later() -> None:
+    system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
+    out = LoopState(1.0, np.array([1.0]), np.array([-0.5]), np.zeros(1))
+    event = system.next_event(out, 9.0)
+    assert event is not None
+    assert event.t_s == 1.0
+    back = out._replace(e_s=np.array([0.5]))  # e_s = 1.5 − e^{t−1}: −½ when e^{t−1} = 2
+    event = system.next_event(back, 9.0)
+    assert event is not None
+    assert event.t_s == pytest.approx(1 + math.log(2.0), rel=1e-14)
+    beyond = out._replace(e_s=np.array([0.7]))
+    event = system.next_event(beyond, 9.0)
+    assert event is not None
+    assert event.t_s == 1.0
+
+
+def test_the_floor_takes_over_where_it_meets_the_decaying_threshold() -> None:
+    """|e_s| = x₀(e^t − 1) meets 1·e^{−t} at first, the floor later, by the size of x₀."""
+    system = scalar_system(DecayingTrigger(1.0, 1.0, 0.5))
+    for x0 in (2.0, 0.6, 0.5, 0.4, 1e-6):
+        state = LoopState(0.0, np.array([x0]), np.zeros(1), np.zeros(1))
+        event = system.next_event(state, 99.0)
+        assert event is not None
+        decaying = math.log((1 + math.sqrt(1 + 4 / x0)) / 2)
+        expected = min(decaying, math.inf) if decaying < math.log(2.0) else math.log1p(0.5 / x0)
+        assert event.t_s == pytest.approx(expected, rel=1e-13)
+
+
+def test_an_event_at_the_end_counts_and_one_beyond_does_not() -> None:
+    system = scalar_system(DecayingTrigger(1e-3, 1.0, 0.5))
+    state = LoopState(0.0, np.ones(1), np.zeros(1), np.zeros(1))
+    at_s = math.log1p(0.5)
+    assert system.next_event(state, at_s * (1 - 1e-12)) is None
+    assert system.next_event(state, at_s * (1 + 1e-12)) is not None
+    assert system.next_event(state, 0.0) is None
+
+
+@given(cases(), st.lists(st.floats(0, 2), min_size=1, max_size=20))
+@settings(max_examples=20)
+def test_states_between_events_are_the_matrix_exponentials(case: Case, t_s: list[float]) -> None:
+    system = ContinuousLoop(case.loop, case.trigger)
+    n = case.loop.n
+    rng = np.random.default_rng(n)
+    z = rng.uniform(-1, 1, 3 * n)
+    state = LoopState(0.5, z[:n], z[n : 2 * n], z[2 * n :])
+    samples = system.sample(state, 0.5 + np.array(sorted(t_s)))
+    for i, dt_s in enumerate(sorted(t_s)):
+        expected = expm(system.generator * dt_s) @ z
+        one = system.propagate(state, 0.5 + dt_s)
+        many = np.concatenate([samples.x[i], samples.e_s[i], samples.e_c[i]])
+        scale = float(np.linalg.norm(expm(system.generator * dt_s), 2)) * 3 * n
+        np.testing.assert_allclose(np.concatenate(one[1:]), expected, rtol=0, atol=1e-14 * scale)
+        np.testing.assert_allclose(many, expected, rtol=0, atol=1e-14 * scale)
+
+
+def test_a_small_mismatch_keeps_its_relative_accuracy() -> None:
+    """e_s is driven by E x alone; with E = 1e-9 it is as accurate as any other number."""
+    a, h, small = -1.0, -1.0 - 1e-9, 1e-9
+    one = np.ones((1, 1))
+    loop = loop_with(a * one, one, 0 * one, h * one, np.ones(1))
+    trigger = DecayingTrigger(1e-10, 0.1)
+    run = Case(loop, trigger, [False], True, 5.0).run()
+    excess = lambda t: -math.expm1(-small * t) * math.exp(a * t) - 1e-10 * math.exp(-0.1 * t)  # noqa: E731
+    # E itself, −1 − (−1 − 1e-9), is known to 1e-16/1e-9 only: so is the time.
+    assert run.event_s[0] == pytest.approx(brentq(excess, 0, 1, xtol=1e-15), rel=1e-6)
+    exact = -1.0 - h
+    excess = lambda t: -math.expm1(-exact * t) * math.exp(a * t) - 1e-10 * math.exp(-0.1 * t)  # noqa: E731
+    assert run.event_s[0] == pytest.approx(brentq(excess, 0, 1, xtol=1e-15), rel=1e-12)
+
+
+def test_dense_output_is_right_continuous() -> None:
+    case = turning(0.3, 7.0, False)
+    run = case.run()
+    assert len(run.before) >= 1
+    samples = run.at(run.event_s)
+    assert not samples.e_s.any()
+    np.testing.assert_array_equal(samples.x, [state.x for state in run.after])
+    before = run.at(np.nextafter(run.event_s, 0))
+    np.testing.assert_allclose(before.e_s, [state.e_s for state in run.before], atol=1e-12)
+    assert run.at([]).x.shape == (0, 2)
+    with pytest.raises(ValueError, match="lie in"):
+        run.at([-1.0])
+    with pytest.raises(ValueError, match="order"):
+        run.at([1e-3, 0.0])
+
+
+def test_who_does_not_know_the_start_sends_it() -> None:
+    case = turning(0.3, 7.0, False)._replace(known=False, lost=[True])
+    run = case.run()
+    assert run.event_s[0] == 0.0
+    np.testing.assert_array_equal(run.before[0].e_c, -case.loop.x0)
+    assert not run.after[0].e_c.any()
+    assert run.delivered.tolist() == [True] + [False] * (len(run.before) - 1)
+
+
+def test_a_loop_without_events_that_diverges_says_when() -> None:
+    """ẋ = 100 x, and the model knows it: no event; e^{100t} = 1e100 · 0.5 e^{−0.25t} at the end."""
+    one = np.ones((1, 1))
+    loop = loop_with(100 * one, one, 0 * one, 100 * one, np.ones(1))
+    run = Case(loop, DecayingTrigger(0.5, 0.25), [False], True, 50.0).run()
+    assert run.diverged_at_s == pytest.approx(math.log(0.5e100) / 100.25, rel=1e-12)
+    assert run.event_s.size == 0
+    assert np.isfinite(run.at([0.0, run.reached_s]).x).all()
+
+
+def test_events_that_accumulate_are_an_error() -> None:
+    one = np.ones((1, 1))
+    loop = loop_with(one, one, 0 * one, 0 * one, np.ones(1))
+    case = Case(loop, DecayingTrigger(0.5, 1.0), [False], True, 1e6)
+    with pytest.raises(TooManyEventsError, match="accumulate"):
+        simulate_continuous(
+            loop, case.trigger, horizon_s=1e6, delivered=[], known_start=True, max_events=50
+        )
+
+
+def test_a_threshold_that_vanishes_is_an_error() -> None:
+    one = np.ones((1, 1))
+    loop = loop_with(-one, one, 0 * one, -one, np.ones(1))
+    with pytest.raises(CallerError, match="floor"):
+        Case(loop, DecayingTrigger(0.5, 1.0), [False], True, 1e4).run()
+    assert Case(loop, DecayingTrigger(0.5, 1.0, 1e-9), [False], True, 1e4).run().event_s.size == 0
+
+
+def test_a_reset_keeps_what_was_not_delivered() -> None:
+    state = LoopState(1.0, np.ones(2), np.ones(2), np.ones(2))
+    assert reset(state, True).e_c.tolist() == [0, 0]
+    assert reset(state, False).e_c.tolist() == [1, 1]
+    assert reset(state, False).e_s.tolist() == [0, 0]

@@ -1,0 +1,238 @@
+"""Every policy in continuous time, beside an integrator with its own account of the rules."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad, solve_ivp
+from scipy.linalg import expm
+
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop
+from cosim.simulation.continuous.continuous_run import (
+    ContinuousRun,
+    TooManyEventsError,
+    simulate_continuous,
+)
+from noack.config.resolution import Loop
+from noack.trigger.absolute import AbsoluteTrigger
+from noack.trigger.deadline import DeadlineTrigger
+from noack.trigger.decaying import DecayingTrigger
+from noack.trigger.dwell import DwellTrigger
+from noack.trigger.dynamic import DynamicTrigger
+from noack.trigger.lyapunov import LyapunovTrigger
+from noack.trigger.mixed import MixedTrigger
+from noack.trigger.periodic import PeriodicTrigger
+from noack.trigger.quadratic import QuadraticTrigger
+from noack.trigger.relative import relative_trigger
+from noack.trigger.self_triggered import SelfTrigger
+from noack.trigger.trigger_policy import Policy
+
+Vector = NDArray[np.float64]
+A_MODEL = np.array([[0.0, 1.0], [-2.0, 3.0]])
+B = np.array([[0.0], [1.0]])
+K = np.array([[1.0, -4.0]])
+CLOSED = A_MODEL + B @ K
+P = np.array([[1.0, 0.25], [0.25, 1.0]])  # of V in Tabuada (2007), Section V
+Q = -(CLOSED.T @ P + P @ CLOSED)
+FORM = np.diag([-0.02, -0.02, 1.0, 1.0])
+MS = 1_000_000
+
+
+def loop_of(*, zoh: bool, mismatch: float = 0.1) -> Loop:
+    return Loop(
+        A_MODEL, B, K, np.zeros((2, 2)) if zoh else CLOSED,
+        A_MODEL + mismatch * np.array([[0.1, -0.3], [0.5, 0.2]]), B, np.array([10.0, 0.0]), None,
+        ("x_1", "x_2"), ("u",),
+    )  # fmt: skip
+
+
+POLICIES: dict[str, Policy] = {
+    "decaying": DecayingTrigger(0.5, 0.3, 0.01),
+    "absolute": AbsoluteTrigger(0.3),
+    "relative": relative_trigger(0.05),
+    "mixed": MixedTrigger(0.05, 0.02, np.array([[1.0, 0.2], [0.0, 2.0]])),
+    "lyapunov": DwellTrigger(LyapunovTrigger(np.linalg.cholesky(P).T, 0.2), 20 * MS),
+    "dynamic": DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K, 1.0),
+    "dynamic, at once": DynamicTrigger(0.1, 0.5, 0.0, P, Q, B @ K),
+    "deadline": DeadlineTrigger(MixedTrigger(0.05, 0.1), 500 * MS),
+    "dwell": DwellTrigger(DynamicTrigger(0.1, 0.5, 0.3, P, Q, B @ K), 70 * MS),
+}
+"""Those whose events lie where a continuous quantity passes zero, or a time is reached."""
+Excess = Callable[[float, Vector, float], float]
+"""Positive at an event: of the time, z = (x, e_s), and η."""
+
+
+def excess_of(name: str) -> Excess:
+    def dynamic(t: float, z: Vector, eta: float) -> float:
+        return -(eta + 0.5 * gain(z))
+
+    W = np.array([[1.0, 0.2], [0.0, 2.0]])
+    rules: dict[str, Excess] = {
+        "decaying": lambda t, z, eta: norm(z[2:]) - max(0.5 * math.exp(-0.3 * t), 0.01),
+        "absolute": lambda t, z, eta: norm(z[2:]) - 0.3,
+        "relative": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2,
+        "mixed": lambda t, z, eta: norm(W @ z[2:]) ** 2 - (0.05 * norm(W @ z[:2])) ** 2 - 0.02**2,
+        "deadline": lambda t, z, eta: norm(z[2:]) ** 2 - (0.05 * norm(z[:2])) ** 2 - 0.1**2,
+    }
+    return rules.get(name, dynamic)
+
+
+def gain(z: Vector) -> float:
+    """W of the dynamic rule."""
+    return float(0.1 * z[:2] @ Q @ z[:2] - 2 * z[:2] @ P @ B @ K @ z[2:])
+
+
+def norm(v: Vector) -> float:
+    return float(np.linalg.norm(v))
+
+
+def run_of(policy: Policy, *, zoh: bool, lost: int, horizon_s: float = 6.0) -> ContinuousRun:
+    loop = loop_of(zoh=zoh)
+    return simulate_continuous(
+        loop, policy, horizon_s=horizon_s, known_start=True,
+        delivered=lambda event: event % (lost + 1) == lost, max_events=5000,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+@pytest.mark.parametrize("zoh", [False, True])
+@pytest.mark.parametrize(
+    "name", ["decaying", "absolute", "relative", "mixed", "dynamic", "dynamic, at once", "deadline"]
+)
+def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> None:
+    """From each event of the run on, an integrator with events finds the next one."""
+    policy, excess = POLICIES[name], excess_of(name)
+    run = run_of(policy, zoh=zoh, lost=lost)
+    loop, decay = run.system.loop, getattr(policy, "decay_per_s", 0.0)
+    assert len(run.before) >= 3
+    eta = policy.first_reserve
+    for start in (run.start, *run.after):
+        z0 = np.concatenate([start.x, start.x + start.e_s, start.x + start.e_c, [eta]])
+
+        def flow(t: float, y: Vector) -> Vector:
+            x, x_s, x_c = y[:2], y[2:4], y[4:6]
+            z = np.concatenate([x, x_s - x])
+            return np.concatenate(
+                [loop.A @ x + loop.B @ (loop.K @ x_c), loop.H @ x_s, loop.H @ x_c,
+                 [-decay * y[6] + gain(z)]]
+            )  # fmt: skip
+
+        def crossing(t: float, y: Vector) -> float:
+            return excess(t, np.concatenate([y[:2], y[2:4] - y[:2]]), y[6])
+
+        crossing.terminal, crossing.direction = True, 1  # type: ignore[attr-defined]
+        end_s = run.horizon_s
+        if name == "deadline":
+            end_s = min(end_s, start.t_s + 0.5)
+        if end_s - start.t_s < 1e-6:
+            continue
+        found = solve_ivp(
+            flow, (start.t_s, end_s), z0, "DOP853", events=crossing, rtol=1e-11, atol=1e-13,
+            max_step=0.02,
+        )  # fmt: skip
+        expected_s = found.t_events[0][0] if len(found.t_events[0]) else end_s
+        following = next((one.t_s for one in run.before if one.t_s > start.t_s), run.horizon_s)
+        assert following == pytest.approx(expected_s, abs=1e-7)
+        eta = float(found.y[6, -1])
+
+
+@pytest.mark.parametrize("decay_per_s", [0.0, 30.0])
+def test_time_goes_on_while_the_rule_is_not_looked_at(decay_per_s: float) -> None:
+    """Even when η is used up meanwhile; and what is due before the dwell time ends is sent."""
+    dynamic = DynamicTrigger(0.1, 0.5, decay_per_s, P, Q, 3 * B @ K)
+    for policy, times_s in (
+        (DwellTrigger(dynamic, 500 * MS), None),
+        (DeadlineTrigger(DwellTrigger(dynamic, 500 * MS), 200 * MS), 0.2 * np.arange(1, 30)),
+    ):
+        run = run_of(policy, zoh=True, lost=1, horizon_s=5.9)
+        assert len(run.before) >= 5
+        for state, following in zip((run.start, *run.after), run.before, strict=False):
+            z = expm(run.system.generator * (following.t_s - state.t_s)) @ np.concatenate(state[1:])
+            np.testing.assert_allclose(np.concatenate(following[1:]), z, rtol=1e-9, atol=1e-9)
+        if times_s is not None:
+            np.testing.assert_allclose(run.event_s, times_s, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("zoh", [False, True])
+def test_no_rule_is_broken_between_events(name: str, zoh: bool) -> None:
+    """Looked at densely: at no time after the dwell do both sides say that there is an event."""
+    policy = POLICIES[name]
+    run = run_of(policy, zoh=zoh, lost=1, horizon_s=4.0)
+    ends_s = [*run.event_s, run.horizon_s]
+    for state, end_s in zip([run.start, *run.after], ends_s, strict=True):
+        guard = run.system.guard(state)
+        if guard.reserve is not None:
+            continue
+        t_s = np.linspace(max(state.t_s, guard.earliest_ns * 1e-9), end_s, 50)[1:-1]
+        if len(t_s) == 0 or t_s[-1] <= t_s[0]:
+            continue
+        samples = run.system.sample(state, t_s)
+        for time_s, x, e_s in zip(t_s, samples.x, samples.e_s, strict=True):
+            left, right = guard.sides(time_s * 1e9, x, e_s)
+            assert left <= right * (1 + 1e-9) + 1e-12
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.05, 0.2])
+def test_tabuadas_example_keeps_the_published_bound_and_comes_close_to_it(sigma: float) -> None:
+    """IEEE TAC 52(9), 2007, Corollary IV.1 and Section V: |e| ≤ σ|x|, every update arrives.
+
+    The inter-event time is at least τ with φ(τ) = σ, φ̇ = a + (a + b)φ + bφ², φ(0) = 0, a = |A+BK|,
+    b = |BK|, for all initial states.
+    """
+    a, b = float(np.linalg.norm(CLOSED, 2)), float(np.linalg.norm(B @ K, 2))
+    tau_s, _ = quad(lambda phi: 1 / (a + (a + b) * phi + b * phi**2), 0.0, sigma)
+    system = ContinuousLoop(loop_of(zoh=True, mismatch=0.0), relative_trigger(sigma))
+    shortest_s = math.inf
+    for angle in np.linspace(0, math.pi, 40, endpoint=False):
+        run = simulate_continuous(
+            system, horizon_s=2.0, delivered=lambda event: True, known_start=True,
+            x0=10 * np.array([math.cos(angle), math.sin(angle)]),
+        )  # fmt: skip
+        shortest_s = min(shortest_s, float(np.diff(run.event_s).min()))
+    assert shortest_s >= tau_s
+    assert shortest_s < 1.2 * tau_s
+
+
+def test_periodic_is_a_clock() -> None:
+    run = run_of(PeriodicTrigger(300 * MS), zoh=True, lost=0, horizon_s=6.1)
+    np.testing.assert_allclose(run.event_s, np.arange(1, 21) * 0.3, rtol=1e-12)
+
+
+def test_periodic_event_triggering_is_that_of_the_sampled_rule() -> None:
+    """By matrix powers, sample by sample."""
+    run = run_of(QuadraticTrigger(FORM, 50 * MS, heartbeat=7), zoh=True, lost=1)
+    step = run.system.flow.sample  # of a basis vector: a column of the transition matrix
+    transition = np.stack([step(column, np.array([0.05]))[0] for column in np.eye(6)], axis=1)
+    z, since, expected, number = np.concatenate(run.start[1:]), 0, [], 0
+    for k in range(1, 121):
+        z, since = transition @ z, since + 1
+        if z[:4] @ FORM @ z[:4] > 1e-12 or since == 7:
+            expected.append(k * 0.05)
+            z[2:4] = 0.0
+            if number % 2 == 1:
+                z[4:] = 0.0
+            number, since = number + 1, 0
+    assert len(expected) > 10
+    np.testing.assert_allclose(run.event_s, expected, rtol=1e-9)
+
+
+def test_a_self_trigger_keeps_below_the_threshold_where_its_assumption_holds() -> None:
+    """ZOH, everything delivered: |ė| = |ẋ| ≤ |A| |e| + |A+BK| |x_k|, as x = x_k − e."""
+    loop = loop_of(zoh=True, mismatch=0.0)
+    L, a = np.linalg.norm(loop.A, 2), np.linalg.norm(CLOSED, 2)
+    policy = SelfTrigger(0.5, 0.2, 0.0, float(L), float(a), 0.0, 1000, 10**9)
+    run = simulate_continuous(
+        loop, policy, horizon_s=6.0, delivered=lambda event: True, known_start=True
+    )
+    assert len(run.before) > 20
+    for event in run.before:
+        assert norm(event.e_s) <= 0.5 * math.exp(-0.2 * event.t_s) * (1 + 1e-9)
+
+
+def test_an_envelope_alone_lets_events_accumulate_when_updates_are_lost() -> None:
+    rule = LyapunovTrigger(np.linalg.cholesky(P).T, 0.2)
+    with pytest.raises(TooManyEventsError):
+        run_of(rule, zoh=True, lost=2)

@@ -1,0 +1,301 @@
+"""What the literature says of the policies, beside the exact simulator; each docstring says whether
+its figures are printed there, or follow from what is proved there."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad, solve_ivp
+from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.optimize import brentq
+
+from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
+from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
+from noack.config.resolution import Loop, resolve
+from noack.config.scenario_file import load
+from noack.trigger.absolute import AbsoluteTrigger
+from noack.trigger.dynamic import DynamicTrigger
+from noack.trigger.lyapunov import LyapunovTrigger
+from noack.trigger.quadratic import QuadraticTrigger
+from noack.trigger.relative import relative_trigger
+from noack.trigger.trigger_policy import Policy
+
+Matrix = NDArray[np.float64]
+MS = 1_000_000
+
+System = tuple[Matrix, Matrix, Matrix]
+"""A, B, K."""
+
+
+def shipped(name: str, *settings: str) -> ContinuousLoop:
+    path = Path(__file__).parents[4] / "scenarios" / f"{name}.toml"
+    return continuous_loop_of(resolve(load(path, list(settings))))
+
+
+def system_of(loop: ContinuousLoop) -> System:
+    return loop.loop.A, loop.loop.B, loop.loop.K
+
+
+TABUADA = system_of(shipped("tabuada_dynamic"))
+REACTOR = system_of(shipped("reactor_petc"))
+P = np.array([[1.0, 0.25], [0.25, 1.0]])
+"""Of V = xᵀPx in Tabuada, IEEE TAC 52(9), 2007, Section V."""
+
+
+def held(system: System, policy: Policy) -> ContinuousLoop:
+    """The loop of the literature: the input is held, and the model is the plant."""
+    A, B, K = system
+    n, m = B.shape
+    names = tuple(f"x_{i}" for i in range(n)), tuple(f"u_{i}" for i in range(m))
+    loop = Loop(A, B, K, np.zeros((n, n)), A, B, np.ones(n), None, *names)
+    return ContinuousLoop(loop, policy)
+
+
+def run_from(
+    x0: Matrix, loop: ContinuousLoop, horizon_s: float, max_events: int = 5000
+) -> ContinuousRun:
+    """Every update arrives."""
+    return simulate_continuous(
+        loop, horizon_s=horizon_s, delivered=[], known_start=True, x0=x0, max_events=max_events
+    )
+
+
+def between(run: ContinuousRun) -> Matrix:
+    """Inter-event times, from t = 0 on."""
+    times: Matrix = np.diff(run.event_s, prepend=0.0)
+    return times
+
+
+def step(system: System, t_s: float) -> Matrix:
+    """M of x(t_k + t) = M x(t_k), by a matrix exponential."""
+    A, B, K = system
+    n = len(A)
+    both = expm(np.block([[A, B @ K], [np.zeros((n, 2 * n))]]) * t_s)
+    found: Matrix = both[:n, :n] + both[:n, n:]
+    return found
+
+
+def directions(count: int) -> Matrix:
+    angles = np.linspace(0.0, math.pi, count, endpoint=False)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def test_the_reactors_inter_event_times_are_those_that_etcetera_prints() -> None:
+    """Printed: regions {1}, {2}, {3}, {4}, {5}, in periods, with a heartbeat of 20.
+
+    ETCetera (Delimpaltadakis, de A. Gleizer, van Straalen, Mazo Jr., HSCC 2022), documentation,
+    Examples, Linear PETC; the rule is of Heemels, Donkers, Teel, IEEE TAC 58(4), 2013.
+    """
+    loop = shipped("reactor_petc")
+    seen: set[int] = set()
+    for x0 in np.random.default_rng(0).normal(size=(40, 4)):
+        seen |= set(np.rint(between(run_from(x0, loop, 2.0)) / 0.01).astype(int).tolist())
+    assert seen == {1, 2, 3, 4, 5}
+
+
+def test_the_reactor_sends_after_two_periods_where_etcetera_says() -> None:
+    """Printed: xᵀN(1)x ≤ 0 < xᵀN(2)x with these N, up to a positive factor each (ibid.)."""
+    first = symmetric(
+        0.0325014371942073, -0.758236561497541, 2.28413716988318, -1.57991935089754,
+        2.38486724990143, 0.198562111037632, 2.68392804714407,
+        3.0913841666531, -2.03625414224163, 2.14744812716726,
+    )  # fmt: skip
+    second = symmetric(
+        34.1084257021831, -22.2685952023407, 68.7949413314049, -47.7543148417454,
+        102.519813292189, 8.36602721281553, 82.3989681651887,
+        121.315797670082, -56.7655786995279, 97.0796601856019,
+    )  # fmt: skip
+    loop = shipped("reactor_petc")
+    states = np.random.default_rng(1).normal(size=(400, 4))
+    expected = [bool(x @ first @ x <= 0 < x @ second @ x) for x in states]
+    found = [between(run_from(x, loop, 0.05))[:1].tolist() == [0.02] for x in states]
+    assert found == expected
+    assert 50 < sum(found) < 350
+    # Printed: with a transmission after one period already, one to three more follow; by a
+    # relaxation, so there may be less.
+    early = step(REACTOR, 0.01)
+    follow = {
+        round(float(between(run_from(early @ x, loop, 0.1))[0]) / 0.01)
+        for x in states[np.array(expected)]
+    }
+    assert follow <= {1, 2, 3}
+
+
+def symmetric(*upper: float) -> Matrix:
+    matrix = np.zeros((4, 4))
+    matrix[np.triu_indices(4)] = upper
+    return matrix + np.triu(matrix, 1).T
+
+
+def dynamic(theta_s: float) -> ContinuousLoop:
+    """Girard's rule; at θ → ∞ it is the static one, w < 0."""
+    return shipped("tabuada_dynamic", f"trigger.theta_s={theta_s}")
+
+
+@pytest.mark.parametrize("theta_s", [0.05, 1.0])
+def test_a_dynamic_rule_waits_at_least_as_long_as_the_static_one(theta_s: float) -> None:
+    """Theorem: from the same state, the dynamic rule's next event is not before the static one's.
+
+    Girard, IEEE TAC 60(7), 2015 (arXiv:1301.2182). On Tabuada's example; the static one, w < 0, by
+    an integrator.
+    """
+    loop = dynamic(theta_s)
+    rule = loop.trigger
+    assert isinstance(rule, DynamicTrigger)
+    np.testing.assert_allclose(rule.P, P, rtol=1e-12)
+    A, B, K = TABUADA
+    for x0 in directions(12):
+
+        def w(t_s: float, x: Matrix, x0: Matrix = x0) -> float:
+            return float(rule.sigma * x @ rule.Q @ x - 2 * x @ P @ B @ K @ (x0 - x))
+
+        w.terminal, w.direction = True, -1  # type: ignore[attr-defined]
+        u = B @ K @ x0
+        found = solve_ivp(
+            lambda t_s, x, u=u: A @ x + u, (0, 5), x0, events=w, rtol=1e-10, atol=1e-12
+        )
+        static = found.t_events[0][0]
+        run = run_from(x0, loop, 5.0)
+        assert run.event_s[0] > static
+
+
+def test_dynamic_inter_execution_times_are_larger_and_vary_less() -> None:
+    """Printed, in the abstract: "significantly larger in average and ... their variability is
+    smaller" (Girard, arXiv:1301.2182v1, 2013); here on Tabuada's example.
+    """
+    static, saving = (
+        np.concatenate([between(run_from(x0, loop, 8.0)) for x0 in directions(8)])
+        for loop in (dynamic(1e6), dynamic(1.0))
+    )
+    assert saving.mean() > 2 * static.mean()
+    assert saving.std() / saving.mean() < 0.5 * static.std() / static.mean()
+
+
+def test_the_lyapunov_rule_meets_its_minimum_time_and_no_earlier_one() -> None:
+    """Theorem: with S = V(x_k) e^{−ρt}, no event before the first t at which some state meets S.
+
+    Mazo, Anta, Tabuada, Automatica 46(8), 2010; there as a determinant that vanishes, here as
+    ‖L M(t) L⁻¹‖ = e^{−ρt/2}, P = LᵀL, x(t_k + t) = M(t) x_k. It is attained, in the direction of
+    the largest singular value. On the batch reactor.
+    """
+    A, B, K = REACTOR
+    lyapunov = solve_continuous_lyapunov((A + B @ K).T, -np.eye(4))
+    L = np.linalg.cholesky(lyapunov).T
+    rate_per_s = 0.5 / float(np.linalg.eigvalsh(lyapunov)[-1])
+
+    def above(t_s: float) -> float:
+        moved = np.linalg.norm(L @ step(REACTOR, t_s) @ np.linalg.inv(L), 2)
+        return float(moved - math.exp(-rate_per_s * t_s / 2))
+
+    t_s = np.linspace(1e-3, 1.0, 2000)
+    i = next(i for i in range(len(t_s)) if above(t_s[i]) > 0)
+    assert i > 0
+    shortest_s = brentq(above, t_s[i - 1], t_s[i], xtol=1e-14)
+    loop = held(REACTOR, LyapunovTrigger(L, rate_per_s))
+    worst = np.linalg.svd(L @ step(REACTOR, shortest_s) @ np.linalg.inv(L))[2][0]
+    met = run_from(np.linalg.solve(L, worst), loop, 1.5 * shortest_s)
+    assert met.event_s[0] == pytest.approx(shortest_s, rel=1e-6)  # a square root of rounding
+    for x0 in np.random.default_rng(2).normal(size=(20, 4)):
+        assert (between(run_from(x0, loop, 2.0)) >= shortest_s * (1 - 1e-6)).all()
+
+
+@pytest.mark.parametrize("delta", [0.3, 0.07, 0.011])
+def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float) -> None:
+    """Follows from the definition: e^{−t/τ} is reported at t_k = −τ ln(1 − kδ), ⌊1/δ⌋ times.
+
+    Miskowicz, Sensors 6(1), 2006, takes the step response of a first-order system as an example.
+    """
+    tau_s = 0.8
+    system = np.array([[-1 / tau_s]]), np.array([[1.0]]), np.array([[0.0]])
+    run = run_from(np.array([1.0]), held(system, AbsoluteTrigger(delta)), 40.0)
+    k = np.arange(1, math.floor(1 / delta) + 1)
+    np.testing.assert_allclose(run.event_s, -tau_s * np.log1p(-k * delta), rtol=1e-9)
+
+
+@pytest.mark.parametrize("amplitude", [1.0, 3.7])
+def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -> None:
+    """Theorem: at most mean|ẋ|/δ reports a second, where a clock of equal resolution needs
+    max|ẋ|/δ; the ratio is the signal's own, π/2 for a sine, whatever δ.
+
+    Miskowicz, Sensors 6(1), 2006. The rule watches the first state of an oscillator; the second
+    one's weight is next to nothing.
+    """
+    system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
+    delta, periods = 0.05, 4
+    rule = AbsoluteTrigger(delta, np.diag([1.0, 1e-9]))
+    x0 = amplitude * np.array([math.cos(0.4), math.sin(0.4)])
+    events = len(run_from(x0, held(system, rule), 2 * math.pi * periods).event_s)
+    by_clock = amplitude / delta * 2 * math.pi * periods  # max|ẋ| = amplitude
+    assert by_clock / events >= math.pi / 2
+    # At each of two turning points a period less than one δ is not reported, nor one back.
+    assert events >= by_clock / (math.pi / 2) - 4 * periods - 1
+
+
+def test_the_loop_stays_as_near_to_the_continuous_one_as_lunze_and_lehmann_say() -> None:
+    """Theorem: ‖x − x_CT‖ ≤ ē ∫₀^∞ ‖e^{(A+BK)s} BK‖ ds for a generator with ‖e‖ ≤ ē.
+
+    Lunze, Lehmann, Automatica 46(1), 2010. Sensor and controller run the same model. What disturbs
+    it is another plant, here in both loops; without a disturbance there is no event at all, which
+    they remark.
+    """
+    A, B, K = TABUADA
+    closed, level = A + B @ K, 0.2
+    names = ("x_1", "x_2"), ("u",)
+    same = Loop(A, B, K, closed, A, B, np.array([1.0, 0.0]), None, *names)
+    other = A + np.array([[0.0, 0.0], [0.3, -0.4]])
+    disturbed = Loop(A, B, K, closed, other, B, np.array([1.0, 0.0]), None, *names)
+    gain, _ = quad(
+        lambda s: float(np.linalg.norm(expm((other + B @ K) * s) @ B @ K, 2)), 0, 60, limit=200
+    )
+    quiet = ContinuousLoop(same, AbsoluteTrigger(level))
+    assert len(run_from(np.array([10.0, 0.0]), quiet, 10.0).event_s) == 0
+    loop, x0 = ContinuousLoop(disturbed, AbsoluteTrigger(level)), np.array([10.0, -5.0])
+    run = run_from(x0, loop, 10.0)
+    assert len(run.event_s) > 5
+    t_s = np.linspace(0.0, 10.0, 500)
+    continuous = np.stack([expm((other + B @ K) * t) @ x0 for t in t_s])
+    apart = np.linalg.norm(run.at(t_s).x - continuous, axis=1).max()
+    assert 0.1 * level * gain < apart <= level * gain
+
+
+@pytest.mark.parametrize(
+    "rule",
+    [
+        relative_trigger(0.3),
+        LyapunovTrigger(np.linalg.cholesky(P).T, 0.2),
+        dynamic(1.0).trigger,
+        QuadraticTrigger(np.kron(np.diag([-0.1, 1.0]), np.eye(2)), 10 * MS),
+    ],
+    ids=["relative", "lyapunov", "dynamic", "quadratic"],
+)
+def test_inter_event_times_depend_on_the_direction_only(rule: Policy) -> None:
+    """Theorem: τ(λx) = τ(x) for rules that are homogeneous and plants that are linear.
+
+    Anta, Tabuada, IEEE TAC 55(9), 2010, of the degree 0.
+    """
+    loop = held(TABUADA, rule)
+    for x0 in directions(5):
+        one, other = (between(run_from(scale * x0, loop, 3.0)) for scale in (1.0, -2e4))
+        assert len(one) > 2
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+
+
+def test_inter_event_times_settle_where_the_direction_is_kept() -> None:
+    """Theorem: constant inter-event times τ in the plane mean a state that M(τ) only scales.
+
+    Rajan, Tallapragada, arXiv:2201.02090: the inter-event time is a function of the state's angle,
+    and a steady state is a fixed point of the map of angles.
+    """
+    A, B, _ = TABUADA
+    system = A, B, np.array([[0.0, -6.0]])  # A + BK has the eigenvalues −1 and −2
+    run = run_from(np.array([1.0, 0.3]), held(system, relative_trigger(0.3)), 20.0)
+    tau_s = float(between(run)[-1])
+    np.testing.assert_allclose(between(run)[-5:], tau_s, rtol=1e-6)
+    x, after = run.after[-2].x, run.after[-1].x
+    _, vectors = np.linalg.eig(step(system, tau_s))
+    assert np.isreal(vectors).all()
+    kept = np.abs(vectors.T @ x / np.linalg.norm(x)).max()
+    assert kept == pytest.approx(1.0, abs=1e-9)
+    np.testing.assert_allclose(after, step(system, tau_s) @ x, rtol=1e-9)

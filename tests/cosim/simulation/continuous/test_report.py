@@ -1,0 +1,82 @@
+"""``noack simulate --trigger continuous``: what it says is what the run holds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from cosim.cli import app
+from cosim.simulation.continuous.continuous_report import POINTS, document, run_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.simulation.virtual_time import simulate
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.protocol.record_tables import NETEM_PACKET, Fate
+
+SCENARIOS = Path(__file__).parents[4] / "scenarios"
+
+
+def noack(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
+
+
+@pytest.fixture(scope="module")
+def resolved() -> Scenario:
+    return resolve(load(SCENARIOS / "lane_following.toml", ["plant.rate_hz=50", "horizon_s=10"]))
+
+
+def test_the_fates_are_the_simulated_networks(resolved: Scenario) -> None:
+    packets = simulate(resolved)[NETEM_PACKET]
+    fates = network_fates(resolved)
+    later_first = [fates(i) for i in reversed(range(len(packets)))][::-1]
+    assert later_first == (packets["fate"] != Fate.DROPPED).tolist()
+    assert fates(0)
+
+
+def test_the_document_is_the_run(resolved: Scenario) -> None:
+    run = run_continuous(resolved)
+    found = json.loads(json.dumps(document(run, resolved), allow_nan=False))
+    summary, events, samples = found["summary"], found["events"], found["samples"]
+    assert summary["events"] == len(events) == len(run.before) > 5
+    assert summary["deliveries"] == sum(event["delivered"] for event in events)
+    assert summary["drops"] == summary["events"] - summary["deliveries"]
+    assert summary["longest_drop_run"] <= resolved.network.mansd
+    lost = "".join("." if event["delivered"] else "x" for event in events)
+    assert summary["longest_drop_run"] == max(map(len, lost.split(".")))
+    times = [event["t_s"] for event in events]
+    assert summary["inter_event_min_s"] == pytest.approx(np.diff(times).min())
+    assert len(samples["t_s"]) == len(samples["x"]) == len(samples["x_c"]) == POINTS
+    assert np.max(np.array(samples["e_s_norm"]) / samples["threshold"]) <= 1 + 1e-12
+    errors = np.array(samples["x_c"]) - np.array(samples["x"])
+    np.testing.assert_allclose(np.linalg.norm(errors, axis=1), samples["e_c_norm"], atol=1e-12)
+
+
+def test_the_command_prints_a_table_or_json() -> None:
+    arguments = ("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous")
+    told = noack(*arguments)
+    assert told.exit_code == 0, told.output
+    assert "delivered" in told.stdout
+    document = json.loads(noack(*arguments, "--json").stdout)
+    assert document["summary"]["kind"] == "continuous"
+    assert document["summary"]["exit"]["status"] == 0
+
+
+def test_many_events_are_shown_in_part() -> None:
+    told = noack("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous",
+                 "--set", 'mode="zoh"')  # fmt: skip
+    assert "more events: --json" in told.stdout
+
+
+def test_a_loop_that_diverges_fails() -> None:
+    """A model that knows the unstable loop: no event, and no end of growth."""
+    told = noack("simulate", str(SCENARIOS / "unstable_pendulum.toml"), "--trigger", "continuous",
+                 "--set", 'plant.draw="nominal"', "--set", "model.gain=[[20.0, 20.0]]",
+                 "--set", "model.allow_unstable=true",
+                 "--set", "horizon_s=1000", "--json")  # fmt: skip
+    assert told.exit_code == 1
+    summary = json.loads(told.stdout)["summary"]
+    assert summary["diverged_at_s"] == summary["reached_s"] < 1000
+    assert "diverged" in summary["exit"]["reason"]

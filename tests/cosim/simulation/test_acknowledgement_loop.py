@@ -1,0 +1,322 @@
+"""The acknowledgement baseline on the whole loop in virtual time, and in replay."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.live.simulated_run import simulate_run
+from cosim.output.certificate_report import study
+from cosim.record.align import join_all
+from cosim.record.run_record import RunRecord, load_record, write_record
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.virtual_time import simulate
+from netem.duplex_link import ACKNOWLEDGEMENT_LINK, Duplex, network_of
+from netem.link_machine import Datagram, Link
+from noack.config.impairments import Bernoulli, LinkSettings, LossOf
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load
+from noack.core.errors import CallerError
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import (
+    ACKNOWLEDGEMENTS,
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    NETEM_RELEASE,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_ACKNOWLEDGEMENT,
+    SENSOR_MEASUREMENT,
+    UPDATES,
+    Fate,
+)
+from noack.protocol.wire_format import Flow, read_header
+from noack.theory.assumptions import Verdict, assumptions
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=10")
+LOSSLESS = 'network.loss={model="lossless"}'
+MESSY = (
+    "network.loss.probability=0.3",
+    'network.impairments=[{kind="delay", delay_s=0.01, jitter_s=0.02},'
+    ' {kind="duplicate", probability=0.3}, {kind="corrupt", probability=0.2}]',
+    'network.acknowledgements={timeout_s=0.05, loss={model="bernoulli", probability=0.3},'
+    ' impairments=[{kind="delay", delay_s=0.01, jitter_s=0.02},'
+    ' {kind="duplicate", probability=0.3}, {kind="corrupt", probability=0.2}]}',
+    "trigger.beta=0.02",
+)
+
+
+def acknowledged(*overrides: str) -> Scenario:
+    return resolve(load(SCENARIOS / "lane_acknowledged.toml", [*COARSE, *overrides]))
+
+
+def plain(*overrides: str) -> Scenario:
+    return resolve(load(SCENARIOS / "lane_following.toml", [*COARSE, *overrides]))
+
+
+MESS = simulate(acknowledged(*MESSY))
+
+
+def events(record: RunRecord) -> Any:
+    rows = record[SENSOR_MEASUREMENT]
+    return rows[rows["event"] != NO_SEQUENCE]
+
+
+def fates(record: RunRecord, flow: int) -> list[int]:
+    rows = record[NETEM_PACKET]
+    found: list[int] = rows["fate"][rows["flow"] == flow].tolist()
+    return found
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_without_any_loss_it_is_the_ordinary_loop(mode: str) -> None:
+    """An acknowledgement that takes no time is there before the next measurement."""
+    start = (f"mode={mode}", "network.initial_sync=known_state", LOSSLESS, "trigger.beta=0.05")
+    one = simulate(acknowledged(*start, "network.acknowledgements={}"))
+    other = simulate(plain(*start))
+    assert len(events(one)) > 3
+    np.testing.assert_array_equal(events(one)["t_ns"], events(other)["t_ns"])
+    assert one[PLANT_STEP].tobytes() == other[PLANT_STEP].tobytes()
+    assert one[CONTROLLER_DELIVERY].tobytes() == other[CONTROLLER_DELIVERY].tobytes()
+    assert one[SENSOR_MEASUREMENT]["x_s"].tobytes() == other[SENSOR_MEASUREMENT]["x_s"].tobytes()
+    assert len(one[SENSOR_ACKNOWLEDGEMENT]) == len(events(one))
+
+
+POLICIES = [
+    '{policy="absolute", delta=0.01}',
+    '{policy="relative", sigma=0.02}',
+    '{policy="lyapunov", rate_per_s=0.3}',
+    '{policy="periodic", period_s=0.2}',
+    '{policy="dwell", interval_s=0.1, rule={policy="absolute", delta=0.01}}',
+    '{policy="deadline", interval_s=1.0, rule={policy="absolute", delta=0.01}}',
+]
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_policy_goes_on_from_what_was_acknowledged(policy: str) -> None:
+    start = (f"trigger={policy}", "network.initial_sync=known_state", LOSSLESS)
+    one = simulate(acknowledged(*start, "network.acknowledgements={}"))
+    other = simulate(plain(*start))
+    assert len(events(one)) > 3
+    np.testing.assert_array_equal(events(one)["t_ns"], events(other)["t_ns"])
+    lossy = simulate(acknowledged(f"trigger={policy}"))
+    assert replay(lossy).bit_exact
+
+
+@pytest.mark.parametrize(
+    "record",
+    [MESS, simulate(acknowledged()), simulate(acknowledged("network.initial_sync=known_state"))],
+    ids=["messy", "lossy", "known start"],
+)
+def test_the_models_agree_whenever_all_acknowledgements_have_arrived(record: RunRecord) -> None:
+    joined, answers = join_all(record), record[SENSOR_ACKNOWLEDGEMENT]
+    rows = record[SENSOR_MEASUREMENT]
+    before = np.searchsorted(answers["input"], rows["input"])
+    known = np.append(NO_SEQUENCE, answers["sequence"])[before]
+    arrived = known == joined.received
+    # An event's own update is taken at the time of its sample, after the sample.
+    arrived &= rows["event"] == NO_SEQUENCE
+    assert 10 < arrived.sum() < len(rows)
+    scale = np.abs(joined.x).max()
+    np.testing.assert_allclose(joined.x_s[arrived], joined.x_c[arrived], rtol=0, atol=1e-12 * scale)
+    missed = (known < joined.received) & (rows["event"] == NO_SEQUENCE)
+    assert missed.any()
+    apart = np.abs(joined.x_s[missed] - joined.x_c[missed]).max(axis=1)
+    assert np.median(apart) > 1e-6 * scale
+
+
+@pytest.mark.parametrize("overrides", [(), MESSY])
+def test_the_sensor_waits_for_an_acknowledgement_or_the_timeout(overrides: tuple[str, ...]) -> None:
+    record = simulate(acknowledged(*overrides))
+    timeout_ns = record.scenario.acknowledgement_timeout_ns
+    assert timeout_ns == 50_000_000
+    found, answers = events(record), record[SENSOR_ACKNOWLEDGEMENT]
+    too_soon = waited = 0
+    for one, following in pairwise(found):
+        between = (answers["input"] > one["input"]) & (answers["input"] < following["input"])
+        if one["event"] not in answers["sequence"][between]:
+            too_soon += following["t_ns"] - one["t_ns"] < timeout_ns
+            waited += following["t_ns"] - one["t_ns"] == timeout_ns
+        assert following["x"].tobytes() != one["x"].tobytes()  # the then current state
+    assert too_soon == 0
+    assert waited > 3
+
+
+def test_by_default_the_timeout_allows_for_the_delays_there_and_back() -> None:
+    assert acknowledged("network.acknowledgements={}").acknowledgement_timeout_ns == 50_000_000
+    late = (
+        'network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',
+        'network.acknowledgements={impairments=[{kind="delay", delay_s=0.04}]}',
+    )
+    assert acknowledged(*late).acknowledgement_timeout_ns == 120_000_000
+
+
+def test_lost_acknowledgements_cost_transmissions_and_none_has_none_to_lose() -> None:
+    """The paper's motivation; docs/scenarios.md has the numbers over 20 seeds and 20 s."""
+
+    def mean(make: Any, *overrides: str) -> float:
+        seeds = ([*overrides, f"seeds.loss={k}", f"seeds.plant={k}"] for k in range(6))
+        return float(np.mean([len(events(simulate(make(*each)))) for each in seeds]))
+
+    none = mean(plain, "network.loss.probability=0.5")
+    costs = [
+        mean(
+            acknowledged,
+            "network.loss.probability=0.5",
+            f"network.acknowledgements.loss.probability={lost}",
+        )
+        for lost in (0.0, 0.5, 0.75, 0.9)
+    ]
+    assert costs[0] < 1.5 * none
+    assert all(more > 1.3 * less for less, more in pairwise(costs))
+    assert costs[-1] > 5 * none
+
+
+def test_each_direction_has_its_own_random_stream() -> None:
+    record, other = simulate(acknowledged()), simulate(plain())
+    count = min(len(fates(record, UPDATES)), len(fates(other, UPDATES)))
+    assert count > 5
+    assert fates(record, UPDATES)[:count] == fates(other, UPDATES)[:count]
+    settings = LinkSettings(impairments=(LossOf(loss=Bernoulli(probability=0.5)),))
+    link = Link(settings, record.scenario.seeds.loss, ACKNOWLEDGEMENT_LINK)
+    answers = fates(record, ACKNOWLEDGEMENTS)
+    expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
+    assert answers == expected
+    assert {Fate.DELIVERED, Fate.DROPPED} == set(answers)
+
+
+def test_the_cap_of_the_way_back_holds() -> None:
+    back = 'network.acknowledgements={mansd=2, loss={model="worst_case"}}'
+    found = fates(simulate(acknowledged(back)), ACKNOWLEDGEMENTS)
+    assert len(found) > 6
+    assert [Fate(fate).effective for fate in found] == [k % 3 == 2 for k in range(len(found))]
+
+
+def test_the_summary_counts_acknowledgements() -> None:
+    for record in (MESS, simulate(acknowledged())):
+        summary = summarise(record, 0, "horizon")
+        found = summary["acknowledgements"]
+        assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
+        assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
+        assert found["lost"] > 0
+        assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # under way at the end
+        assert summary["lost_outside_netem"] == summary["missing_samples"] == 0
+        assert summary["identity_residual_max"] is None
+    assert summarise(MESS, 0, "horizon")["rejected_datagrams"]["sensor"].keys() <= {
+        "length", "version", "run", "flow", "tag", "stale",
+    }  # fmt: skip
+    assert "acknowledgements" not in summarise(simulate(plain()), 0, "horizon")
+
+
+def test_a_run_is_replayed_bit_for_bit() -> None:
+    found = replay(MESS)
+    assert found.bit_exact
+    assert found.gaps == []
+    assert found.inputs == sum(len(MESS[table]) for table in MESS.tables)
+    compared = {leg.leg: leg.compared for leg in found.messages}
+    packets = MESS[NETEM_PACKET]
+    assert compared["sensor → netem"] == (packets["flow"] == UPDATES).sum() > 10
+    assert compared["controller → netem"] == (packets["flow"] == ACKNOWLEDGEMENTS).sum() > 10
+    assert compared["netem → sensor"] == len(MESS[SENSOR_ACKNOWLEDGEMENT]) > 10
+    assert (MESS[NETEM_RELEASE]["flow"] == ACKNOWLEDGEMENTS).any()
+
+
+def altered(table: str, row: int, column: str, bit: int) -> RunRecord:
+    rows = MESS[table].copy()
+    raw = bytearray(rows[column][row].tobytes())
+    raw[bit // 8] ^= 1 << bit % 8
+    kind = rows.dtype[column]
+    rows[column][row] = np.frombuffer(raw, kind.base).reshape(kind.shape)
+    every = {name: MESS[name] for name in MESS.tables} | {table: rows}
+    return RunRecord(MESS.scenario, every, MESS.notices, MESS.reports, "simulated")
+
+
+@pytest.mark.parametrize("column", MESS[SENSOR_ACKNOWLEDGEMENT].dtype.names)
+@pytest.mark.parametrize("bit", [0, 3, 62])
+def test_a_flipped_bit_of_an_acknowledgement_is_found(column: str, bit: int) -> None:
+    if column == "now_ns" and bit < 62:
+        pytest.skip("nothing that the sensor does depends on it")
+    row = len(MESS[SENSOR_ACKNOWLEDGEMENT]) // 2
+    first = replay(altered(SENSOR_ACKNOWLEDGEMENT, row, column, bit)).first_difference
+    assert first is not None
+    if column not in ("input", "now_ns"):
+        assert first.table in (SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT)
+
+
+@pytest.mark.parametrize("flow", [UPDATES, ACKNOWLEDGEMENTS])
+@pytest.mark.parametrize("column", ["head", "fate", "flow", "size_bytes", "sequence"])
+def test_a_flipped_bit_of_a_packet_is_found_in_its_row(flow: int, column: str) -> None:
+    row = int(np.flatnonzero(MESS[NETEM_PACKET]["flow"] == flow)[5])
+    # Of the flow the bit that makes the one direction the other, and one that makes it neither.
+    for bit in (0, 5):
+        first = replay(altered(NETEM_PACKET, row, column, bit)).first_difference
+        assert first is not None
+        assert first.table == NETEM_PACKET
+        assert column == "flow" or first.row == row
+
+
+def test_a_record_survives_its_files(tmp_path: Path) -> None:
+    ending = simulate_run(load(SCENARIOS / "lane_acknowledged.toml", [*COARSE, *MESSY]), tmp_path)
+    loaded = load_record(ending.run_dir)
+    assert loaded.tables.keys() == MESS.tables.keys()
+    assert all(loaded[table].tobytes() == MESS[table].tobytes() for table in MESS.tables)
+    write_record(loaded, ending.run_dir)
+    scenario = load(ending.run_dir / "scenario.toml")
+    assert scenario == MESS.scenario
+    assert 'protocol = "ack"' in dumps(scenario)
+
+
+def test_nothing_is_claimed_of_it() -> None:
+    record = simulate(acknowledged())
+    (claim,) = Claims(record).judge()
+    assert claim.verdict is ClaimVerdict.VOID
+    assert 'network.protocol = "ack"' in claim.why
+    assert Claims(record).envelopes() == []
+    (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
+    assert assumption.verdict is Verdict.VIOLATED
+    for refuse in (continuous_loop_of, lambda scenario: study(scenario, 2)):
+        with pytest.raises(CallerError, match=r'network\.protocol: .*"none".* has "ack"'):
+            refuse(record.scenario)
+
+
+def test_without_acknowledgements_there_is_no_trace_of_them() -> None:
+    scenario = plain()
+    record = simulate(scenario)
+    assert SENSOR_ACKNOWLEDGEMENT not in record.tables
+    assert isinstance(network_of(scenario), Link)
+    assert set(record[NETEM_PACKET]["flow"].tolist()) == {UPDATES}
+    heads = map(read_header, (head.tobytes() for head in record[NETEM_PACKET]["head"]))
+    assert {None if head is None else head.flow for head in heads} == {Flow.UPDATE}
+    assert all("acknowledged" not in assumption.what for assumption in assumptions(scenario))
+
+
+def test_the_network_numbers_the_inputs_of_both_directions() -> None:
+    network = network_of(acknowledged())
+    assert isinstance(network, Duplex)
+    numbers = []
+    for k in range(20):
+        (*_, record) = network.handle(Datagram(k % 2, bytes(48)), k)
+        assert isinstance(record, Record)
+        numbers.append(record.row[:2])
+    assert numbers == [(k, k // 2) for k in range(20)]
+    with pytest.raises(ValueError, match="no flow 2"):
+        network.handle(Datagram(2, bytes(48)), 20)
+
+
+def test_settings_of_a_way_back_that_there_is_not_are_a_mistake() -> None:
+    with pytest.raises(
+        CallerError, match=r"network\.acknowledgements.*there are none unless protocol"
+    ):
+        plain("network.acknowledgements.timeout_s=0.1")
+
+
+def test_a_way_back_is_of_no_effect_where_there_is_said_to_be_none() -> None:
+    back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
+    assert not plain(*back).is_acknowledged

@@ -1,0 +1,292 @@
+"""The whole loop with disturbances, noise and observers: what is estimated, and claimed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.step_schedule import live_run
+from cosim.output.certificate_report import study
+from cosim.record.align import join_all
+from cosim.record.estimation_error import estimation_error, expected_rms, true_states
+from cosim.record.run_record import RunRecord
+from cosim.simulation.batch.batch_interface import setting_of
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.design.candidate_measures import Limits
+from cosim.studies.design.design_run import design
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, validate
+from noack.config.state_estimation import steady_state
+from noack.core.errors import CallerError
+from noack.core.linear_systems import row_norms
+from noack.protocol.machine_interface import INCARNATION, RESTART, Start
+from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
+from noack.theory.assumptions import assumptions
+from sensor_node.sensor import sensor_of
+from tests.cosim.live.outage import Deaf, Reborn, simulate_with
+
+NOISE = {"C": [[1.0, 0.0]], "noise_std": [0.02]}
+KALMAN = {"kind": "kalman", "initial_std": [0.4, 0.4]}
+GUSTS = {"kind": "gaussian", "std": [0.5]}
+CHANGE = {"at_s": 0.4, "set": {"trigger.floor": 0.02}}
+
+
+@pytest.fixture
+def observed(content: dict[str, Any]) -> dict[str, Any]:
+    """The double integrator under gusts, its position measured with noise, half of all lost."""
+    content["plant"] |= {"rate_hz": 100.0, "measurement": NOISE, "disturbances": [GUSTS]}
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"] |= {"beta": 0.1, "floor": 0.1}
+    content["observer"] = KALMAN
+    return content
+
+
+def resolved(content: dict[str, Any], **seeds: int) -> Scenario:
+    return resolve(validate(content | {"seeds": seeds}, "test"))
+
+
+def run(content: dict[str, Any], **seeds: int) -> RunRecord:
+    return simulate(resolved(content, **seeds))
+
+
+def test_the_estimation_error_is_as_large_as_the_filter_thinks(observed: dict[str, Any]) -> None:
+    """Over N runs Σ eᵀP⁻¹e is χ² with 2N degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001)."""
+    N, covariance = 80, steady_state(resolved(observed)).covariance
+    ends = np.array(
+        [estimation_error(run(observed, disturbance=s, noise=s + 1000))[-1] for s in range(N)]
+    )
+    distance = float(np.einsum("ki,ij,kj->", ends, np.linalg.inv(covariance), ends))
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * N)
+    assert low < distance < high
+    assert 2 * N / 1.3**2 < low < high < 2 * N * 1.3**2  # so it would tell an error 30 % off
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"plant.measure_every": 3},
+        {"network.protocol": "ack"},
+        {"plant.watchdog": {"policy": "model"}},
+        {"mode": "zoh"},
+        {
+            "controller.setpoint": [0.5, 0.0],
+            "changes": [{"at_s": 0.4, "set": {"trigger.floor": 0.02}}],
+        },
+        {"observer": {"kind": "luenberger", "poles_per_s": [[-6.0, 2.0]]}},
+        {"observer": None, "plant.measurement": {"noise_bound": [0.01, 0.01]}},
+        {"plant.disturbances": [{"kind": "uniform", "at": "state", "bound": [0.1, 0.3]}, GUSTS]},
+    ],
+)
+def test_replay_is_bit_exact(observed: dict[str, Any], changes: dict[str, Any]) -> None:
+    for key, value in changes.items():
+        section, _, last = key.rpartition(".")
+        place = observed[section] if section else observed
+        if value is None:
+            del place[last]
+        else:
+            place[last] = value
+    record = run(observed, disturbance=5, noise=6)
+    found = replay(record)
+    assert found.bit_exact, found.first_difference
+    assert not found.gaps
+    again = simulate(resolve(validate(_content(record.scenario), "again")))
+    assert all(record[table].tobytes() == again[table].tobytes() for table in record.tables)
+
+
+def _content(scenario: Scenario) -> dict[str, Any]:
+    import tomllib
+
+    return tomllib.loads(dumps(scenario))
+
+
+def test_a_replay_finds_an_output_that_was_never_measured(observed: dict[str, Any]) -> None:
+    record = run(observed)
+    rows = record[SENSOR_MEASUREMENT].copy()
+    rows["y"][7] += 1e-12
+    changed = RunRecord(
+        record.scenario,
+        {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows},
+        record.notices, record.reports, "simulated",
+    )  # fmt: skip
+    found = replay(changed)
+    assert not found.bit_exact
+    assert found.first_difference is not None
+    assert (found.first_difference.row, found.first_difference.column[0]) == (7, "y")
+
+
+def test_a_sensor_in_anothers_place_estimates_anew_and_is_replayed(
+    observed: dict[str, Any],
+) -> None:
+    observed["horizon_s"] = 2.0
+    observed["observer"] = KALMAN | {"initial_estimate": [0.5, 0.0]}
+    scenario, at_ns = resolved(observed), 800_000_000
+    successor = sensor_of(scenario, Start(1, at_ns))
+    record = simulate_with(scenario, "sensor", lambda one: Reborn(one, successor, at_ns))
+    said = [one for one in record.notices if "observer" in one["text"]]
+    assert [(one["t_ns"], one["process"]) for one in said] == [(at_ns, "sensor")]
+    rows = record[SENSOR_MEASUREMENT]
+    again = np.flatnonzero(rows["input"] >= INCARNATION)[0]
+    assert rows["t_ns"][again] == at_ns
+    assert rows["event"][again] == INCARNATION
+    weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate against the first output
+    expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
+    np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
+    notice = {"process": "sensor", "level": RESTART, "t_ns": at_ns, "text": "started anew"}
+    tables = {table: record[table] for table in record.tables}
+    again_record = RunRecord(scenario, tables, [notice], {}, "live")
+    found = replay(again_record)
+    assert found.bit_exact, found.first_difference
+    assert found.inputs == sum(map(len, tables.values()))
+    verdicts = {str(claim.verdict) for claim in Claims(again_record).judge()}
+    assert verdicts <= {"held", "void"}
+
+
+def test_measurements_that_are_lost_are_bridged_and_replayed(observed: dict[str, Any]) -> None:
+    observed["plant"]["disturbances"] = [{"kind": "gaussian", "std": [1e-9]}]
+    observed["plant"]["measurement"] = {"C": [[1.0, 0.0]], "noise_std": [1e-9]}
+    scenario = resolved(observed)
+    lost = {30, 31, 32, 33, 70}
+    record = simulate_with(scenario, "sensor", lambda one: Deaf(one, lambda k: k not in lost))
+    assert len(record[SENSOR_MEASUREMENT]) == 101 - len(lost)
+    assert replay(record).bit_exact
+    # What the input was in the gap is not known: it was changing, by what the model decays in it.
+    error = row_norms(estimation_error(record))
+    moved = np.abs(np.diff(record[PLANT_STEP]["u"][:, 0])).max() * 4 * 0.04
+    assert error[60:].max() < moved
+    assert error[20:30].max() < 1e-6
+
+
+def test_what_follows_from_i1_is_judged_against_the_estimate_and_nothing_else_is_claimed(
+    observed: dict[str, Any],
+) -> None:
+    observed["horizon_s"] = 4.0
+    record = run(observed)
+    claims = Claims(record)
+    found = claims.judge()
+    assert [claim.source for claim in found] == ["(I1)", "(I1)"]
+    assert all(claim.verdict == "held" for claim in found)
+    assert "what the sensor takes for x" in found[1].what
+    assert claims.certificates == []
+    assert [one.label for one in claims.envelopes()] == ["bound from (I1)"]
+    # Against the plant's own state the second would not hold: it is not claimed.
+    joined = join_all(record)
+    e_c = row_norms(joined.x_c - true_states(record[PLANT_STEP], joined.t_ns))
+    assert (e_c > joined.e_c_norm + 1e-6).any()
+    assert (e_c <= joined.e_c_norm + row_norms(estimation_error(record)) + 1e-12).all()
+
+
+def test_with_noise_but_no_observer_what_is_measured_is_taken_for_x(
+    observed: dict[str, Any],
+) -> None:
+    del observed["observer"]
+    observed["plant"]["measurement"] = {"noise_std": [0.02, 0.05]}
+    record = run(observed)
+    error = estimation_error(record)
+    assert (np.abs(error) > 0).all()
+    sizes = error.std(axis=0)
+    assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
+    assert [claim.source for claim in Claims(record).judge()] == ["(I1)", "(I1)"]
+    assert summarise(record, 0, "horizon")["estimation"]["observer"] is None
+
+
+def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line(
+    observed: dict[str, Any],
+) -> None:
+    del observed["observer"]
+    del observed["plant"]["measurement"]
+    record = run(observed)
+    assert record.scenario.knows_state
+    sources = [claim.source for claim in Claims(record).judge()]
+    assert sources == ["(I1)", "(I1)", "eq:LossEv3"]
+    summary = summarise(record, 0, "horizon")
+    assert summary["estimation"] is None
+    (pushed,) = summary["disturbances"]
+    assert (pushed["at"], pushed["kinds"]) == ("input", ["gaussian"])
+    assert pushed["rms"] == pytest.approx(np.sqrt((record[PLANT_STEP]["d"] ** 2).mean()))
+
+
+def test_the_summary_says_how_good_the_estimate_was(observed: dict[str, Any]) -> None:
+    record = run(observed, disturbance=1, noise=2)
+    found = summarise(record, 0, "horizon")["estimation"]
+    norms = np.linalg.norm(estimation_error(record), axis=1)
+    assert found["max"] == pytest.approx(norms.max())
+    assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))
+    assert (found["observer"], found["outputs"], found["noise_std"]) == ("kalman", 1, [0.02])
+    assert found["expected_rms"] == pytest.approx(
+        np.sqrt(np.trace(steady_state(record.scenario).covariance))
+    )
+    assert found["sup_e_c_norm"] > 0
+
+
+def test_what_is_exact_or_certified_is_refused_in_one_line(observed: dict[str, Any]) -> None:
+    scenario = resolved(observed)
+    record = simulate(scenario)
+    del observed["plant"]["disturbances"]
+    observed["observer"] = KALMAN | {"input_std": [0.5]}
+    estimated = resolved(observed)
+    del observed["observer"]
+    observed["plant"]["measurement"] = {"noise_std": [0.1, 0.0]}
+    noisy = resolved(observed)
+    assert [one.is_certifiable for one in (scenario, estimated, noisy)] == [False] * 3
+    for take in (continuous_loop_of, setting_of, lambda one: study(one, 0)):
+        for one, key in (
+            (scenario, "plant.disturbances: "),
+            (estimated, "observer: "),
+            (noisy, "plant.measurement: "),
+        ):
+            with pytest.raises(CallerError, match=key) as refusal:
+                take(one)
+            assert "\n" not in str(refusal.value)
+    with pytest.raises(CallerError, match=r"plant\.disturbances: "):
+        live_run(record)
+    with pytest.raises(CallerError, match=r"plant\.disturbances: "):
+        design({("K", "W"): scenario}, Limits(0.5, 0.9, 0.1, {}), draws=100, seed=0)
+
+
+def verdict_on_noise(content: dict[str, Any]) -> str:
+    (found,) = [
+        one for one in assumptions(resolved(content)) if "above the noise" in one.what
+    ]  # fmt: skip
+    return found.verdict
+
+
+def test_a_threshold_within_the_noise_is_told_beforehand(observed: dict[str, Any]) -> None:
+    """And it matters: the noise transmits then."""
+    observed["horizon_s"] = 6.0
+    observed["plant"] |= {"disturbances": [], "initial_state": [0.0, 0.0]}
+    observed["plant"]["measurement"] = {"noise_std": [0.02, 0.02]}
+    observed["network"]["loss"] = {"model": "lossless"}
+    del observed["observer"]
+    size = 2 * 0.02  # of the difference of two, with two entries each
+    events = {}
+    for share in (1.0, 3.1):
+        observed["trigger"] |= {"beta": 1e-3, "floor": share * size}
+        rows = run(observed)[SENSOR_MEASUREMENT]
+        events[share] = int((rows["event"] != NO_SEQUENCE).sum())
+        assert verdict_on_noise(observed) == ("holds" if share > 3 else "violated")
+    assert events[1.0] > 20 * max(events[3.1], 1)
+
+
+def test_numbers_that_no_riccati_equation_bears_are_told(observed: dict[str, Any]) -> None:
+    observed["model"] = {
+        "A": [[0.0, 1.0], [1e9, 0.0]], "B": [[0.0], [1.0]], "gain": [[1.0, 1.0]],
+        "allow_unstable": True,
+    }  # fmt: skip
+    observed["plant"]["rate_hz"] = 500.0
+    scenario = resolved(observed)
+    (found,) = [one for one in assumptions(scenario) if "observer's error" in one.what]
+    assert found.verdict == "violated"
+    assert expected_rms(scenario) == np.inf
+
+
+def test_an_observer_that_does_not_converge_is_told_beforehand(observed: dict[str, Any]) -> None:
+    observed["observer"] = {"kind": "luenberger", "gain": [[-0.1], [0.0]]}
+    (found,) = [one for one in assumptions(resolved(observed)) if "observer's error" in one.what]
+    assert found.verdict == "violated"

@@ -1,0 +1,202 @@
+"""Whole runs of plants of the user's own, in virtual time: kept with the run, repeatable."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cosim.analysis.model_comparison import linearisation
+from cosim.analysis.replay import replay
+from cosim.cli import app
+from cosim.live.finalize import conclude
+from cosim.live.simulated_run import simulate_run
+from cosim.record.run_record import load_record
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import PLANT_STEP
+from tests.plant_server.fmus.build import build
+
+SCENARIO = """
+name = "own"
+horizon_s = 1.0
+[model]
+A = [[0.0, 1.0], [-1.0, 1.0]]
+B = [[0.0], [1.0]]
+gain = [[-3.0, -5.0]]
+[plant]
+system = SYSTEM
+initial_state = [1.0, 0.0]
+[trigger]
+beta = 0.05
+alpha_per_s = 0.5
+floor = 0.002
+[network]
+mansd = 3
+loss = { model = "bernoulli", probability = 0.5 }
+"""
+FMU = (
+    '{ kind = "fmu", file = "models/oscillator.fmu", on_record = ["energy"], '
+    'state_variables = ["x0", "x1"], input_variables = ["u"], parameters = PARAMETERS }'
+)
+PYTHON = '{ kind = "python", file = "models/mine.py", name = "VanDerPol", parameters = PARAMETERS }'
+CODE = """
+class VanDerPol:
+    def __init__(self, mu=1.0, broken_at_s=1e9):
+        self.mu, self.broken_at_s = mu, broken_at_s
+
+    def derivative(self, t_s, z, u):
+        if t_s > self.broken_at_s:
+            raise RuntimeError("no more grease")
+        return z[1], self.mu * (1 - z[0] ** 2) * z[1] - z[0] + u[0]
+"""
+
+
+def prepared(folder: Path, system: str, parameters: str) -> Path:
+    path = folder / "own.toml"
+    path.write_text(SCENARIO.replace("SYSTEM", system).replace("PARAMETERS", parameters))
+    (folder / "models").mkdir()
+    (folder / "models" / "mine.py").write_text(CODE)
+    return path
+
+
+def simulated(path: Path, horizon_s: float = 1.0) -> Path:
+    return simulate_run(load(path, [f"horizon_s={horizon_s}"]), path.parent / "runs").run_dir
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_moves_like_the_class_of_the_same_equations(version: int, tmp_path: Path) -> None:
+    path = prepared(tmp_path, FMU, "{ mu = 1.0 }")
+    build(tmp_path, version).rename(tmp_path / "models" / "oscillator.fmu")
+    of_fmu = load_record(simulated(path, 3.0))
+    path.write_text(SCENARIO.replace("SYSTEM", PYTHON).replace("PARAMETERS", "{ mu = 1.0 }"))
+    of_class = load_record(simulated(path, 3.0))
+    x = of_fmu[PLANT_STEP]["x"]
+    np.testing.assert_allclose(x, of_class[PLANT_STEP]["x"], atol=1e-9)
+    assert np.linalg.norm(x[-1]) < 0.2  # the loop is closed
+    energy = (x**2).sum(axis=1, keepdims=True) / 2
+    np.testing.assert_allclose(of_fmu[PLANT_STEP]["z"], energy, rtol=1e-12)
+    assert replay(of_fmu).bit_exact
+    assert replay(of_class).bit_exact
+
+
+@pytest.mark.parametrize("kind", ["fmu", "python"])
+def test_a_run_keeps_its_plant_and_is_replayed_elsewhere_when_the_original_is_gone(
+    kind: str, tmp_path: Path
+) -> None:
+    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{ mu = 2.0 }")
+    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+    run_dir = simulated(path)
+    shutil.rmtree(tmp_path / "models")
+    elsewhere = tmp_path / "elsewhere"
+    run_dir.rename(elsewhere)
+    assert replay(load_record(elsewhere)).bit_exact
+    (kept,) = (elsewhere / "plant").iterdir()
+    kept.write_bytes(kept.read_bytes() + b"\n")
+    record = load_record(elsewhere)  # what was recorded can be read all the same
+    with pytest.raises(CallerError, match="is not what it was: its SHA-256 is") as refused:
+        replay(record)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "expected"),
+    [
+        ("fmu", "{ fail_at_s = 0.5, fail_status = 3 }",
+         'the plant failed at 0.502 s: plant.system.file = "oscillator.fmu": fmi2DoStep failed '
+         "with status 3 (error). (the spring broke at 0.5)"),
+        ("python", "{ broken_at_s = 0.5 }",
+         'the plant failed at 0.502 s: plant.system.name = "VanDerPol": RuntimeError: no more '
+         "grease (mine.py, line 8)"),
+    ],
+)  # fmt: skip
+def test_a_plant_that_fails_ends_the_motion_and_not_the_run(
+    kind: str, parameters: str, expected: str, tmp_path: Path
+) -> None:
+    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
+    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+    ending = simulate_run(load(path), tmp_path / "runs")
+    outcome = conclude(ending)
+    assert outcome.status == 1
+    assert outcome.reason == expected
+    record = load_record(ending.run_dir)
+    x = record[PLANT_STEP]["x"]
+    assert len(x) == 501
+    assert np.isfinite(x[:251]).all()
+    assert np.isnan(x[251:]).all()
+    (notice,) = [one for one in record.notices if one["level"] == "failed"]
+    assert notice["t_ns"] == 502_000_000
+    assert replay(record).bit_exact
+
+
+def test_replay_tells_of_a_plant_that_is_not_the_same_twice(tmp_path: Path) -> None:
+    path = prepared(tmp_path, PYTHON, "{}")
+    code = CODE.replace("= mu,", "= random.random(),")
+    (tmp_path / "models" / "mine.py").write_text("import random\n" + code)
+    assert not replay(load_record(simulated(path))).bit_exact
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("fmu", "the plant: FMU Oscillator, FMI 3.0, by noack's tests"),
+        ("python", "the plant: class VanDerPol of mine.py"),
+    ],
+)
+def test_check_makes_the_plant_and_says_what_it_is(
+    kind: str, expected: str, tmp_path: Path
+) -> None:
+    path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, "{}")
+    build(tmp_path, 3).rename(tmp_path / "models" / "oscillator.fmu")
+    done = CliRunner().invoke(app, ["check", str(path)])
+    assert done.exit_code == 0
+    assert expected in " ".join(done.stdout.split())
+    done = CliRunner().invoke(app, ["check", str(path), "--json"])
+    assert done.stderr == ""
+    system: dict[str, Any] = json.loads(done.stdout)["plant"]["system"]
+    assert system["kind"] == kind
+    assert len(system["sha256"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("system", "expected"),
+    [
+        (FMU, "own.toml: plant.system.file = \"models/oscillator.fmu\": cannot be read: No such"),
+        ('{ kind = "fmu", file = "x.fmu", state_variables = ["a"], input_variables = ["u"] }',
+         "plant.system.state_variables = [\"a\"]: expected 2 entries"),
+        ('{ kind = "python", name = "a b" }', "use an entry point's name, or package.module:Class"),
+        ('{ kind = "python", name = "a", sha256 = "' + 64 * "0" + '" }', "give file, too"),
+        ('{ kind = "python", file = ".", name = "a" }', '".": cannot be read: not a regular file'),
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_refused_when_they_are_loaded(
+    system: str, expected: str, tmp_path: Path
+) -> None:
+    path = prepared(tmp_path, system, "{}")
+    with pytest.raises(CallerError) as refused:
+        load(path)
+    assert expected in str(refused.value)
+
+
+def test_the_documented_fmu_is_one_that_runs(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[3] / "docs" / "plants.md").read_text()
+    (block,) = re.findall(r"^```toml\n(# oscillator.*?)^```", text, re.DOTALL | re.MULTILINE)
+    path = tmp_path / "oscillator.toml"
+    path.write_text(block)
+    build(tmp_path, 2).rename(tmp_path / "oscillator.fmu")
+    x = load_record(simulated(path, 3.0))[PLANT_STEP]["x"]
+    assert np.linalg.norm(x[-1]) < 0.2
+
+
+def test_an_fmu_that_begins_only_where_it_wants_has_no_linearisation(tmp_path: Path) -> None:
+    path = prepared(tmp_path, FMU.replace("PARAMETERS", "{}, initial_variables = []"), "{}")
+    build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
+    resolved = resolve(load(path, ["plant.initial_state=[0.0, 0.0]"]))
+    found = linearisation(resolved)
+    assert found is not None
+    assert set(found.values()) == {None}

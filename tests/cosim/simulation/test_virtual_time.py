@@ -1,0 +1,202 @@
+"""Simulated runs against the link alone, arithmetic by hand, and each other."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.analysis.run_summary import summarise
+from cosim.record.run_record import RunRecord
+from cosim.simulation.virtual_time import simulate
+from netem.link_machine import Datagram, update_link_of
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.protocol.machine_interface import Record
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NETEM_PACKET,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+    Fate,
+)
+from noack.protocol.wire_format import read_header
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def busy_content(content: dict[str, Any]) -> dict[str, Any]:
+    """Some dozens of events, half of them lost, a plant that is not the model."""
+    mismatch = {"draw": "uniform", "uncertainty_A": [[0.0, 0.0], [0.5, 0.5]]}
+    content["horizon_s"] = 4.0
+    content["plant"] |= {"rate_hz": 100.0} | mismatch
+    content["controller"] = {"rate_hz": 100.0}
+    content["trigger"]["beta"] = 0.01
+    return content
+
+
+@pytest.fixture
+def busy(busy_content: dict[str, Any]) -> Scenario:
+    return resolve(validate(busy_content, "test"))
+
+
+def equal(one: RunRecord, other: RunRecord) -> bool:
+    return all(one[table].tobytes() == other[table].tobytes() for table in one.tables)
+
+
+def test_the_same_scenario_gives_the_same_record_bit_for_bit(busy: Scenario) -> None:
+    assert equal(simulate(busy), simulate(busy))
+
+
+def test_speed_plays_no_part(busy: Scenario) -> None:
+    other = busy.model_copy(update={"speed": 50.0})
+    assert equal(simulate(busy), simulate(other))
+
+
+def test_everything_happens_and_everything_is_on_time(busy: Scenario) -> None:
+    record = simulate(busy)
+    for table, period_ns, phase_ns in (
+        (PLANT_STEP, 10 * MS, 0),
+        (SENSOR_MEASUREMENT, 10 * MS, 0),
+        (CONTROLLER_STEP, 10 * MS, 5 * MS),
+    ):
+        due = np.arange(phase_ns, busy.horizon_ns + 1, period_ns)
+        np.testing.assert_array_equal(record[table]["t_ns"], due)
+        np.testing.assert_array_equal(record[table]["now_ns"], due)
+    assert len(record[PLANT_ACTUATION]) == len(record[CONTROLLER_STEP])
+    # The input of the tick half a period after a step acts from the next step on.
+    np.testing.assert_array_equal(
+        record[PLANT_STEP]["actuation"], np.arange(len(record[PLANT_STEP])) - 1
+    )
+    events = record[SENSOR_MEASUREMENT]["event"]
+    assert (events >= 0).sum() > 20
+    summary = summarise(record, 0, "horizon")
+    assert summary["missing_samples"] == summary["lost_outside_netem"] == 0
+    assert summary["identity_residual_relative"] < 1e-12
+
+
+def test_the_plant_moves_as_its_held_input_says(busy: Scenario) -> None:
+    record = simulate(busy)
+    loop, (n, m) = record.loop, (2, 1)
+    both = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * 0.01)
+    x, u = record[PLANT_STEP]["x"], record[PLANT_STEP]["u"]
+    expected = x[:-1] @ both[:n, :n].T + u[:-1] @ both[:n, n:].T
+    np.testing.assert_allclose(x[1:], expected, rtol=1e-13, atol=1e-13)  # one product's rounding
+
+
+def test_the_fates_are_those_of_the_scenarios_own_link(busy: Scenario) -> None:
+    packets = simulate(busy)[NETEM_PACKET]
+    link = update_link_of(busy)
+    fates = [
+        output.row[5]
+        for _ in packets
+        for output in link.handle(Datagram(0, b"anything"), 0)
+        if isinstance(output, Record)
+    ]
+    np.testing.assert_array_equal(packets["fate"], fates)
+    assert {Fate.DELIVERED, Fate.DROPPED} <= set(fates)
+
+
+def test_another_network_decides_losses_and_delays(busy: Scenario) -> None:
+    """Every third update is lost, the others take 0, 7, 14, … ms in turn, and overtake."""
+    delays_ms = [None if i % 3 == 2 else 7 * (i % 5) for i in range(1000)]
+    asked: list[int] = []
+
+    def network(data: bytes, now_ns: int) -> int | None:
+        header = read_header(data)
+        assert header is not None
+        assert header.t_ns == now_ns
+        asked.append(header.sequence)
+        delay_ms = delays_ms[header.sequence]
+        return None if delay_ms is None else delay_ms * MS
+
+    record = simulate(busy, network)
+    packets, deliveries = record[NETEM_PACKET], record[CONTROLLER_DELIVERY]
+    assert asked == list(range(len(packets)))
+    np.testing.assert_array_equal(
+        packets["fate"] == Fate.DROPPED, [delays_ms[i] is None for i in asked]
+    )
+    runs = [len(list(run)) for lost, run in itertools.groupby(packets["fate"]) if lost]
+    assert packets["drop_run"].max() == max(runs) == 1
+    sequence = deliveries["sequence"]
+    late_ms = (deliveries["now_ns"] - deliveries["t_ns"]) // MS
+    np.testing.assert_array_equal(late_ms, [delays_ms[i] for i in sequence])
+    # Whoever was overtaken is stale; all the others were taken.
+    arrival_ms = {
+        i: packets["t_ns"][i] // MS + delay for i in asked if (delay := delays_ms[i]) is not None
+    }
+    newest_first = [
+        i for i, at in arrival_ms.items()
+        if not any(j > i and other < at for j, other in arrival_ms.items())
+    ]  # fmt: skip
+    stale = record.reports["controller"]["channel"]["rejected"].get("stale", 0)
+    assert len(sequence) + stale == len(arrival_ms)
+    assert set(sequence) >= set(newest_first)
+
+
+def test_a_perfect_network_is_the_lossless_one(busy_content: dict[str, Any]) -> None:
+    busy_content["network"]["loss"] = {"model": "lossless"}
+    lossless = resolve(validate(busy_content, "test"))
+    assert equal(simulate(lossless), simulate(lossless, lambda data, now_ns: 0))
+
+
+def test_a_violated_assumption_is_noticed_by_the_controller(busy_content: dict[str, Any]) -> None:
+    busy_content["network"] |= {"mansd": 0, "enforce_mansd": False}
+    record = simulate(resolve(validate(busy_content, "test")))
+    assert record.notices
+    assert {notice["process"] for notice in record.notices} == {"controller"}
+    assert {notice["level"] for notice in record.notices} == {"violation"}
+    deliveries = record[CONTROLLER_DELIVERY]
+    long_gaps = deliveries[deliveries["dropouts"] > 0]
+    violations = summarise(record, 0, "horizon")["assumption_violations"]
+    assert len(violations) == len(long_gaps) > 0
+    for violation, gap in zip(violations, long_gaps, strict=True):
+        assert violation["t_s"] == pytest.approx(gap["t_ns"] * 1e-9)
+        assert violation["process"] == "controller"
+        assert f"{gap['dropouts']} successive dropouts" in violation["what"]
+
+
+def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str, Any]) -> None:
+    loss = {"model": "worst_case"}
+    busy_content["network"] = {"mansd": 2, "enforce_mansd": False, "loss": loss}
+    record = simulate(resolve(validate(busy_content, "test")))
+    summary = summarise(record, 0, "horizon")
+    (violation,) = summary["assumption_violations"]
+    events = record[SENSOR_MEASUREMENT]
+    event_ns = events["t_ns"][events["event"] >= 0]
+    assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)  # t_0 passes, two may be lost
+    assert summary["longest_drop_run"] == len(event_ns) - 1 > 2
+
+
+def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:
+    """ẋ = 2000 x: no number holds e^(2000 t) for long; what is no number is not received."""
+    content["model"] = {"A": [[2000.0]], "B": [[1.0]], "gain": [[-1.0]], "allow_unstable": True}
+    content["plant"] = {"initial_state": [1.0]}
+    record = simulate(resolve(validate(content, "test")))
+    assert not np.isfinite(record[PLANT_STEP]["x"]).all()
+    assert record.reports["sensor"]["channel"]["rejected"]["not_finite"] > 0
+    summary = summarise(record, 0, "horizon")
+    assert summary["exit"]["status"] == 1
+    assert 0.3 < summary["diverged_at_s"] < 0.4  # 709.8 / 2000: where e^x leaves the numbers
+
+
+def test_progress_is_told_as_time_goes_on(busy: Scenario) -> None:
+    longer = busy.model_copy(update={"horizon_s": 40.0})
+    told: list[int] = []
+    simulate(longer, progress=told.append)
+    assert len(told) > 3
+    assert told == sorted(told)
+    assert 0 <= told[0] < told[-1] <= longer.horizon_ns
+
+
+def test_the_summary_knows_a_simulated_run_and_claims_no_timing(busy: Scenario) -> None:
+    summary = summarise(simulate(busy), 0, "horizon")
+    assert summary["kind"] == "simulated"
+    assert summary["lateness_us"] == summary["realtime"] == {}
+    assert summary["latency_us"] is None
+    assert summary["startup_s"] is None

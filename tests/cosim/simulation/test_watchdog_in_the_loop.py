@@ -1,0 +1,81 @@
+"""A controller that stands still in virtual time, and what the plant does about it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.step_schedule import IncomparableError, live_run
+from cosim.output.run_tables import key_numbers
+from cosim.record.run_record import RunRecord
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_ACTUATION, PLANT_STEP
+from tests.cosim.live.outage import CASES, SCENARIOS, row, with_outage
+
+DOCS = Path(__file__).parents[3] / "docs"
+
+
+@pytest.fixture(scope="module", params=["hold", "zero", "model"])
+def run(request: pytest.FixtureRequest) -> RunRecord:
+    """The controller stands still from 1 s to 1.4 s; its tick at 0.999 s is the last before."""
+    changes = [f"plant.watchdog.policy={request.param}", "horizon_s=2"]
+    return with_outage(resolve(load(SCENARIOS / "lane_following.toml", changes)), 1.0, 1.4)
+
+
+def test_the_input_is_what_the_policy_says(run: RunRecord) -> None:
+    steps, policy = run[PLANT_STEP], run.scenario.plant.watchdog.policy
+    old = steps[(steps["t_ns"] > 1_099_000_000) & (steps["t_ns"] <= 1_400_000_000)]
+    tick = run[CONTROLLER_STEP][run[CONTROLLER_STEP]["t_ns"] == 999_000_000][0]
+    assert (old["actuation"] == tick["sequence"]).all()
+    for step in old:
+        age_s = (step["t_ns"] - 999_000_000) * 1e-9
+        expected = {
+            "hold": tick["u"],
+            "zero": np.zeros(2),
+            "model": run.loop.K @ expm(run.loop.H * age_s) @ tick["x_c"],
+        }[policy]
+        # K x̂ is a difference of terms that are larger than it.
+        np.testing.assert_allclose(step["u"], expected, rtol=1e-12, atol=1e-14)
+    before = steps[(steps["t_ns"] >= 1_000_000_000) & (steps["t_ns"] <= 1_099_000_000)]
+    assert (before["u"] == tick["u"]).all()
+    if policy == "model":
+        taken = run[PLANT_ACTUATION][run[PLANT_ACTUATION]["sequence"] == tick["sequence"]][0]
+        assert taken["x_c"].tobytes() == tick["x_c"].tobytes()
+
+
+def test_it_is_replayed_bit_for_bit(run: RunRecord) -> None:
+    found = replay(run)
+    assert found.bit_exact, found.first_difference
+    assert found.gaps == []
+
+
+def test_its_end_and_its_beginning_are_told(run: RunRecord) -> None:
+    told = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
+    assert told == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
+    summary = summarise(run, 0, "horizon")
+    assert summary["watchdog"] == {
+        "policy": run.scenario.plant.watchdog.policy, "timeout_s": pytest.approx(0.1), "trips": 1,
+        "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),
+    }  # fmt: skip
+    shown = dict(key_numbers(summary | {"replay": None, "fidelity": None}))
+    assert shown["actuations too old (watchdog)"] == "once, first at 1.100 s, 0.302 s in all"
+
+
+def test_no_ideal_loop_has_the_watchdog_s_input(run: RunRecord) -> None:
+    if run.scenario.plant.watchdog.policy == "hold":
+        live_run(run)
+        return
+    with pytest.raises(IncomparableError, match="the watchdog's, or a safe one"):
+        live_run(run)
+
+
+def test_the_table_of_the_documentation_is_what_is_simulated() -> None:
+    """One row of it anew; `python -m tests.cosim.live.outage` makes all."""
+    text = (DOCS / "scenarios.md").read_text()
+    assert row(*CASES[4]) in text.splitlines()
+    for name, mode, lasts_s in CASES:
+        assert f"| `{name}`, `{mode}` | {lasts_s:g} s |" in text

@@ -1,0 +1,63 @@
+"""A small campaign: the double integrator in a box, two modes, two thresholds."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+
+from cosim.studies.campaign.campaign_file import Campaign, load
+from cosim.studies.campaign.campaign_grid import Point, grid
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def plan() -> dict[str, Any]:
+    """A valid campaign as parsed TOML."""
+    return {
+        "name": "few",
+        "scenario": "small.toml",
+        "draws": 7,
+        "chunk": 3,
+        "seed": 11,
+        "settings": {
+            "plant.draw": "uniform",
+            "plant.uncertainty_A": [[0.0, 0.0], [0.2, 0.1]],
+            "plant.initial_state_halfwidth": [0.5, 0.5],
+        },
+        "axes": [
+            {"name": "policy", "variants": {"MB": {"mode": "model"}, "ZOH": {"mode": "zoh"}}},
+            {"name": "beta", "title": "β", "key": "trigger.beta", "values": [0.1, 0.3]},
+        ],
+        "compare": {"axis": "policy", "reference": "ZOH"},
+        "figures": [
+            {"kind": "pareto", "series": "policy"},
+            {"kind": "curve", "x": "beta", "metric": "transmissions"},
+            {"kind": "heat_map", "x": "beta", "y": "policy", "metric": "cost"},
+            {"kind": "distribution", "metric": "inter_event_min_s", "where": {"beta": 0.3}},
+        ],
+    }
+
+
+@pytest.fixture
+def write(tmp_path: Path, content: dict[str, Any]) -> Write:
+    """Writes a campaign file, its scenario beside it."""
+    scenario = tmp_path / "small.toml"
+    scenario.write_text(tomli_w.dumps(content))
+
+    def written(plan: dict[str, Any], **changed: Any) -> Path:
+        path = tmp_path / "few.toml"
+        said = {key: value for key, value in (plan | changed).items() if value is not None}
+        path.write_text(tomli_w.dumps(said))
+        return path
+
+    return written
+
+
+@pytest.fixture
+def campaign(write: Write, plan: dict[str, Any]) -> tuple[Campaign, list[Point]]:
+    path = write(plan)
+    loaded = load(path)
+    return loaded, grid(loaded, path)

@@ -1,0 +1,110 @@
+"""What is drawn: the same for a draw everywhere, and distributed as the scenario says."""
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch.batch_interface import run_batch
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.continuous.continuous_run import simulate_continuous
+from cosim.simulation.continuous.network_fates import network_fates
+from cosim.studies.campaign.campaign_file import Campaign
+from cosim.studies.campaign.campaign_grid import Point
+from cosim.studies.campaign.random_draws import box_of, drawn_scenario
+from noack.config.resolution import loop_of
+from noack.config.scenario import Scenario
+
+Few = tuple[Campaign, list[Point]]
+
+
+def with_plant(scenario: Scenario, **changed: object) -> Scenario:
+    plant = scenario.plant.model_copy(update=changed)
+    return scenario.model_copy(update={"plant": plant})
+
+
+def test_draws_do_not_depend_on_the_chunk_they_are_in(campaign: Few) -> None:
+    box = campaign[1][0].work.box
+    whole = box.population(11, range(40))
+    for part, ranges in ((3, (0, 17, 39)), (1, range(40))):
+        for start in ranges:
+            some = box.population(11, range(start, min(start + part, 40)))
+            for one, all_ in zip(some, whole, strict=True):
+                np.testing.assert_array_equal(one, all_[start : start + part])
+
+
+def test_draws_are_the_same_at_every_grid_point(campaign: Few) -> None:
+    first, *others = (point.work.box.population(11, range(9)) for point in campaign[1])
+    for other in others:
+        for one, another in zip(first, other, strict=True):
+            np.testing.assert_array_equal(one, another)
+
+
+def test_other_seeds_and_other_draws_differ_in_everything(campaign: Few) -> None:
+    box = campaign[1][0].work.box
+    first, second = box.population(11, range(2)), box.population(12, range(2))
+    for one, another in zip(first, second, strict=True):
+        if (one != one[0]).any():  # B has no box
+            assert (one != another).any()
+    assert (first.A[0] != first.A[1]).any()
+    assert (first.x0[0] != first.x0[1]).all()
+    assert first.loss_seeds[0] != first.loss_seeds[1]
+
+
+def test_draws_fill_the_box_evenly_and_never_leave_it(campaign: Few) -> None:
+    point = campaign[1][0]
+    found = point.work.box.population(11, range(20_000))
+    centre, half = loop_of(drawn_scenario(with_plant(point.scenario, draw="nominal"), 0, 0)), 0.2
+    off = found.A[:, 1, 0] - centre.A[1, 0]
+    assert np.abs(off).max() <= half
+    # The standard deviation of a mean of 20,000 is below 0.001, that of a variance below 0.0001.
+    assert abs(off.mean()) < 0.005
+    assert off.var() == pytest.approx(half**2 / 3, abs=0.0005)
+    np.testing.assert_array_equal(found.A[:, 0], np.broadcast_to(centre.A[0], (20_000, 2)))
+    pairs = np.column_stack([off, found.A[:, 1, 1], found.x0, found.loss_seeds.astype(float)])
+    correlation = np.corrcoef(pairs.T) - np.eye(5)
+    assert np.abs(correlation).max() < 0.04  # 5.6 standard deviations
+    assert len(set(found.loss_seeds.tolist())) == 20_000
+
+
+def test_vertices_are_the_boxs_corners_and_nominal_and_given_plants_are_not_drawn(
+    campaign: Few,
+) -> None:
+    scenario = campaign[1][0].scenario
+    vertices = box_of(with_plant(scenario, draw="vertex")).population(0, range(200)).A
+    assert set(np.round(vertices[:, 1, 0], 12)) == {-0.2, 0.2}
+    nominal = box_of(with_plant(scenario, draw="nominal")).population(0, range(5)).A
+    assert (nominal == nominal[0]).all()
+    A, B = ((5.0, 1.0), (0.0, 2.0)), ((3.0,), (1.0,))
+    given = box_of(with_plant(scenario, draw="given", A=A, B=B)).population(0, range(5))
+    assert (np.array(A) == given.A).all()
+    assert (np.array(B) == given.B).all()
+
+
+def test_the_hundred_millionth_draw_is_there_at_once(campaign: Few) -> None:
+    found = campaign[1][0].work.box.population(11, range(10**8, 10**8 + 1))
+    assert found.x0.shape == (1, 2)
+
+
+def test_a_run_of_a_campaign_is_a_scenario_that_can_be_run_on_its_own(campaign: Few) -> None:
+    plan, points = campaign
+    for point in points:
+        rows = point.work.run(range(4))
+        for draw in range(4):
+            alone = drawn_scenario(point.scenario, plan.seed, draw)
+            run = simulate_continuous(
+                continuous_loop_of(alone),
+                horizon_s=alone.horizon_s,
+                delivered=network_fates(alone),
+                known_start=False,
+            )
+            assert rows[draw]["transmissions"] == len(run.event_s)
+            assert rows[draw]["deliveries"] == run.delivered.sum()
+            end = run.at([alone.horizon_s]).x[0]
+            assert rows[draw]["final_norm"] == pytest.approx(np.linalg.norm(end), rel=1e-9)
+
+
+def test_chunks_do_not_change_what_is_measured(campaign: Few) -> None:
+    work = campaign[1][2].work
+    whole = work.run(range(6))
+    parts = np.concatenate([work.run(range(4, 6)), work.run(range(4))])
+    assert whole.tobytes() == np.roll(parts, -2).tobytes()
+    assert len(run_batch(work.setting, work.box.population(0, range(0)))) == 0

@@ -1,0 +1,224 @@
+"""Campaign files: what they mean, and one clear line for every mistake."""
+
+import copy
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cosim.studies.campaign.campaign_file import Campaign, json_schema, load
+from cosim.studies.campaign.campaign_grid import grid
+from noack.config.scenario_file import load as load_scenario
+from noack.core.errors import CallerError
+from tests.cosim.studies.campaign.conftest import Write
+
+ROOT = Path(__file__).parents[4]
+SHIPPED = sorted((ROOT / "campaigns").glob("*.toml"))
+
+
+def test_the_grid_is_all_combinations_and_the_last_axis_varies_fastest(
+    write: Write, plan: dict[str, Any]
+) -> None:
+    path = write(plan)
+    points = grid(load(path), path)
+    assert [tuple(point.labels.values()) for point in points] == [
+        ("MB", "0.1"), ("MB", "0.3"), ("ZOH", "0.1"), ("ZOH", "0.3")
+    ]  # fmt: skip
+    assert [point.scenario.mode for point in points] == ["model", "model", "zoh", "zoh"]
+    assert [point.scenario.trigger.beta for point in points] == [0.1, 0.3, 0.1, 0.3]
+    assert all(point.scenario.decaying.beta == point.values["beta"] for point in points)
+    assert points[0].scenario.plant.initial_state_halfwidth == (0.5, 0.5)
+
+
+def test_a_key_with_dots_sets_a_value_and_one_without_a_whole_table(
+    write: Write, plan: dict[str, Any]
+) -> None:
+    variants = {
+        "one": {"trigger.floor": 0.02},
+        "all": {"trigger": {"policy": "decaying", "beta": 2.0, "alpha_per_s": 1.0}},
+    }
+    path = write(plan, axes=[{"name": "trigger", "variants": variants}], compare=None, figures=[])
+    one, whole = (point.scenario.trigger for point in grid(load(path), path))
+    assert (one.beta, one.floor) == (0.5, 0.02)
+    assert (whole.beta, whole.alpha_per_s, whole.floor) == (2.0, 1.0, 0.0)
+
+
+def test_an_axis_of_tables_goes_before_one_of_their_keys(
+    write: Write, plan: dict[str, Any]
+) -> None:
+    variants = {"t": {"trigger": {"beta": 2.0, "alpha_per_s": 1.0}}, "f": {"trigger.floor": 0.1}}
+    tables = {"name": "trigger", "variants": variants}
+    key = {"name": "beta", "key": "trigger.beta", "values": [0.1, 0.3]}
+    path = write(plan, axes=[tables, key], compare=None, figures=[])
+    assert [p.scenario.trigger.beta for p in grid(load(path), path)] == [0.1, 0.3, 0.1, 0.3]
+    with pytest.raises(CallerError, match="an axis that sets a whole table comes first"):
+        load(write(plan, axes=[key, tables], compare=None, figures=[]))
+
+
+def test_values_that_differ_late_are_told_apart(write: Write, plan: dict[str, Any]) -> None:
+    values = [0.1, 0.1234567, 0.1234568]
+    plan["axes"][1]["values"] = values
+    labels = load(write(plan, figures=[])).axes[1].labels
+    assert labels == ["0.1", "0.1234567", "0.1234568"]
+
+
+def test_points_do_not_see_each_others_settings(write: Write, plan: dict[str, Any]) -> None:
+    variants = {"a": {"trigger.floor": 0.02}, "b": {"mode": "zoh"}}
+    path = write(plan, axes=[{"name": "v", "variants": variants}], compare=None, figures=[])
+    first, second = grid(load(path), path)
+    assert (first.scenario.trigger.floor, second.scenario.trigger.floor) == (0.02, 0.0)
+
+
+MISTAKES: list[tuple[str, Any, str]] = [
+    ("drws", 5, "drws = 5: unknown key; did you mean draws?"),
+    ("draws", 0, "draws = 0: should be greater than or equal to 1"),
+    ("name", "two words", 'name = "two words": use letters'),
+    ("axes", [], "axes = []: needs at least one entry"),
+    ("axes.0.name", "cost", 'axes.0.name = "cost": cost is a column already'),
+    ("axes.0.name", "beta", 'axes.1.name = "beta": there is such an axis already'),
+    ("axes.1.key", None, "key: missing; key and values go together"),
+    ("axes.0.name", "Axis", "use small letters, digits and _, beginning with a letter"),
+    ("axes.1.values", [1, 1.0], "1 is there twice"),
+    (
+        "axes.0.variants",
+        {"MB": {"mode": "model"}, "ZOH": {"mode": "zoh", "trigger.beta": 0.1}},
+        'axes.1.name = "beta": trigger.beta would replace trigger.beta of axis policy',
+    ),
+    ("axes.1.key", "mode", 'axes.1.name = "beta": mode would replace mode of axis policy'),
+    (
+        "axes.1",
+        {"name": "beta", "variants": {"a": {"trigger.beta": 0.1, "trigger": {}}}},
+        "axes.1.variants.a = {",
+    ),
+    ("settings", {"plant.draw": "nominal", "plant": {}}, "plant replaces plant.draw, which stands"),
+    ("axes.1.values", list(range(1, 6000)), "the grid has 11998 points; at most 10000"),
+    (
+        "axes.1.variants",
+        {"a": {"mode": "zoh"}},
+        'axes.1.key = "trigger.beta": give key and',
+    ),
+    ("compare.axis", "polic", 'compare.axis = "polic": no such axis; the axes are policy, beta'),
+    ("compare.reference", "PB", 'compare.reference = "PB": no such value; policy has MB, ZOH'),
+    ("figures.0.kind", "paretto", "did you mean pareto?"),
+    ("figures.0.series", "p", 'figures.0.series = "p": no such axis'),
+    ("figures.1.metric", "costs", 'figures.1.metric = "costs": should be'),
+    ("figures.2.y", "beta", 'figures.2.y = "beta": a map needs two different axes'),
+    ("figures.3.where", {"beta": 0.2}, "no such value; beta has 0.1, 0.3"),
+    ("metrics", {"settle": 1.0}, "metrics.settle = 1.0: should be less than 1"),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "expected"), MISTAKES, ids=lambda v: str(v)[:30])
+def test_a_mistake_is_one_line_with_file_key_and_remedy(
+    write: Write, plan: dict[str, Any], key: str, value: Any, expected: str
+) -> None:
+    spoilt: Any = copy.deepcopy(plan)
+    *path, last = (int(part) if part.isdigit() else part for part in key.split("."))
+    table = spoilt
+    for part in path:
+        table = table[part]
+    if value is None:
+        del table[last]
+    else:
+        table[last] = value
+    file = write(spoilt)
+    with pytest.raises(CallerError) as found:
+        load(file)
+    assert "\n" not in str(found.value)
+    assert str(found.value).startswith(f"{file}: ")
+    assert expected in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"scenario": "lane_folowing"}, "lane_folowing: no such file, nor a shipped scenario"),
+        (
+            {"axes": [{"name": "m", "key": "network.mansd", "values": [1, -1]}]},
+            "few.toml: at m = -1: network.mansd = -1: should be greater than or equal to 0",
+        ),
+        (
+            {"axes": [{"name": "m", "key": "trigger.betta", "values": [1.0]}]},
+            "at m = 1: trigger.betta = 1.0: unknown key; did you mean beta?",
+        ),
+        ({"settings": {"horizon_s.x": 1.0}}, "settings.horizon_s.x: horizon_s is not a table"),
+        (
+            {"axes": [{"name": "r", "key": "plant.rate_hz", "values": [100.0, 200.0]}]},
+            "axes.0: r = 100 and r = 200 are the same runs: what plant.rate_hz says there makes no",
+        ),
+        (
+            {"settings": {"network.impairments": [{"kind": "delay", "delay_s": 0.1}]}},
+            "at policy = MB, beta = 0.1: network.impairments: delay: in continuous time",
+        ),
+        (
+            {"settings": {"network.protocol": "ack"}},
+            "at policy = MB, beta = 0.1: network.protocol: continuous time is for the loop",
+        ),
+        ({"scenario": "none.toml"}, 'scenario = "none.toml": no such file'),
+        ({"metrics": {"Q": [[1.0, 2.0], [0.0, 1.0]]}}, "metrics.Q: must be symmetric"),
+        ({"metrics": {"Q": [[1.0]]}}, "metrics.Q: expected 2 x 2 (one row per state)"),
+        ({"metrics": {"R": [[1.0, 2.0]]}}, "metrics.R: expected 1 x 1 (one row per input)"),
+    ],
+)
+def test_a_scenario_that_is_wrong_at_a_point_is_named_with_the_point(
+    write: Write, plan: dict[str, Any], changed: dict[str, Any], expected: str
+) -> None:
+    path = write(plan | {"compare": None, "figures": []} | changed)
+    with pytest.raises(CallerError) as found:
+        grid(load(path), path)
+    assert "\n" not in str(found.value)
+    assert expected in str(found.value)
+
+
+def test_too_many_curves_for_one_figure_are_refused_with_the_way_out(
+    write: Write, plan: dict[str, Any]
+) -> None:
+    plan["axes"][1]["values"] = [i / 10 for i in range(1, 8)]
+    figure = {"kind": "distribution", "metric": "cost"}
+    with pytest.raises(CallerError, match=r"14 series are too many .* where = "):
+        load(write(plan, figures=[figure]))
+    load(write(plan, figures=[figure | {"where": {"policy": "MB"}}]))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_campaigns_are_valid_and_named_after_their_file(path: Path) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    jsonschema.Draft202012Validator(json_schema()).validate(tomllib.loads(path.read_text()))
+    loaded = load(path)
+    assert loaded.name == path.stem
+    points = grid(loaded, path)
+    assert len({point.scenario.model_dump_json() for point in points}) == len(points)
+
+
+def test_the_shipped_campaigns_are_there() -> None:
+    names = ["acknowledgements", "mansd_sweep", "mb_vs_zoh", "policies_under_loss"]
+    assert [path.stem for path in SHIPPED] == names
+
+
+def test_the_weighted_policys_weight_is_the_shipped_scenarios() -> None:
+    path = ROOT / "campaigns" / "policies_under_loss.toml"
+    points = grid(load(path), path)
+    weight = load_scenario(ROOT / "scenarios" / "lane_weighted.toml").trigger.weight
+    assert weight is not None
+    assert any(point.scenario.trigger.weight == weight for point in points)
+
+
+def test_the_published_schema_is_the_codes() -> None:
+    """``make schema`` brings it up to date."""
+    published = (ROOT / "docs" / "campaign.schema.json").read_text(encoding="utf-8")
+    assert json.loads(published) == json_schema()
+
+
+def test_every_key_is_described() -> None:
+    schema = json_schema()
+    sections = {"Campaign": schema, **schema["$defs"]}
+    bare = [
+        f"{name}.{key}"
+        for name, section in sections.items()
+        for key, entry in section.get("properties", {}).items()
+        if "description" not in entry and "$ref" not in json.dumps(entry)
+    ]
+    assert bare == []
+    assert set(schema["properties"]) == set(Campaign.model_fields)

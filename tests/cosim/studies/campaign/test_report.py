@@ -1,0 +1,316 @@
+"""What a campaign says: metrics, certificates, figures, the page and the command line."""
+
+import json
+import math
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from typer.testing import CliRunner
+
+from cosim.cli import app
+from cosim.output.report.figure_files import inline
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.studies.campaign import campaign_figures as figures_module
+from cosim.studies.campaign.campaign_figures import (
+    curve_figure,
+    distribution_figure,
+    figures,
+    heat_map_figure,
+    pareto_figure,
+    undominated,
+)
+from cosim.studies.campaign.campaign_file import Campaign, load
+from cosim.studies.campaign.campaign_grid import Point, base_of, grid
+from cosim.studies.campaign.campaign_page import Row, page, written
+from cosim.studies.campaign.campaign_report import tables_of, write_report
+from cosim.studies.campaign.campaign_run import run_campaign
+from cosim.studies.campaign.campaign_summary import summarise
+from cosim.studies.campaign.campaign_workers import alone
+from cosim.studies.campaign.chunk_store import Store
+from cosim.studies.campaign.draw_statistics import estimate
+from cosim.studies.campaign.metrics import METRICS, certified_error, measured
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load as load_scenario
+from noack.config.scenario_file import validate
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import certify
+from tests.cosim.studies.campaign.conftest import Write
+
+ROOT = Path(__file__).parents[4]
+HOSTILE = "</title></svg><script>alert('x')</script> & \"$\\frac{1}{2}$\""
+Few = tuple[Campaign, list[Point]]
+
+
+@pytest.fixture
+def full(tmp_path: Path, campaign: Few) -> Store:
+    plan, points = campaign
+    store = Store(tmp_path / "out", points, plan.draws, plan.chunk)
+    run_campaign(store, alone)
+    return store
+
+
+def scalar(content: dict[str, Any], **changed: Any) -> Scenario:
+    """x' = x + u, Â = 1, B̂ = 1, K = −3: the model decays like e^(−2t)."""
+    content["model"] = {"A": [[1.0]], "B": [[1.0]], "gain": [[-3.0]]}
+    content["plant"]["initial_state"] = [1.0]
+    return resolve(validate(content | changed, "here"))
+
+
+def test_a_scalar_models_certified_error_is_m_thresholds(content: dict[str, Any]) -> None:
+    # e^{(−2+α)τ} ≤ 1: each of the M − 1 = 2 missed errors counts once, the present one, too.
+    assert certified_error(scalar(content)) == pytest.approx(3 * 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"),
+    [
+        ("trigger", "alpha_per_s", 2.5),  # faster than the model
+        ("trigger", "floor", 0.01),
+        ("network", "enforce_mansd", False),
+        (None, "mode", "zoh"),
+    ],
+)
+def test_nothing_is_certified_where_the_theory_is_silent(
+    content: dict[str, Any], table: str | None, key: str, value: Any
+) -> None:
+    (content if table is None else content[table])[key] = value
+    assert certified_error(scalar(content)) is None
+
+
+def test_the_certified_error_bounds_that_of_a_plants_own_certificate() -> None:
+    for name in ("lane_following", "lane_weighted"):
+        resolved = resolve(load_scenario(ROOT / "scenarios" / f"{name}.toml"))
+        constants = certify(resolved, ideal_conditions(resolved)).constants
+        assert constants is not None
+        bound = certified_error(resolved)
+        assert bound is not None
+        assert bound >= constants.delta * 0.5 * (1 - 1e-9)
+        assert name != "lane_weighted" or bound == pytest.approx(5 * 0.5, rel=1e-6)  # Δ = M
+
+
+def test_metrics_that_have_no_number_are_infinite_and_shares_are_derived() -> None:
+    columns = {
+        "transmissions": np.array([10, 1]),
+        "deliveries": np.array([4, 1]),
+        "settling_s": np.array([1.5, math.nan]),
+        "sup_e_c_scaled": np.array([0.5, 0.25]),
+        "status": np.array([OK, OK]),
+    }
+    found = measured(columns, 2.0)
+    assert found["lost_share"].tolist() == [0.6, 0.0]
+    assert found["settling_s"].tolist() == [1.5, math.inf]
+    assert found["certificate_used"].tolist() == [0.25, 0.125]
+    assert "certificate_used" not in measured(columns, None)
+
+
+@pytest.mark.parametrize("status", [DIVERGED, TOO_MANY_EVENTS])
+def test_a_run_that_fails_is_not_taken_for_one_that_transmits_little(status: int) -> None:
+    columns = {
+        "transmissions": np.array([10, 1]),
+        "deliveries": np.array([5, 0]),
+        "status": np.array([OK, status]),
+    }
+    found = measured(columns, None)
+    assert found["transmissions"].tolist() == [10.0, math.inf]
+    assert found["lost_share"].tolist() == [0.5, math.inf]
+    assert estimate(found["transmissions"]).mean == 10.0
+
+
+def test_a_curve_has_gaps_where_a_metric_is_not_known(
+    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the two models have a certificate for other values of α."""
+    plan["axes"] = [
+        {"name": "gain", "variants": {"weak": {"model.gain": [[-1.0, -2.0]]},
+                                      "strong": {"model.gain": [[-9.0, -6.0]]}}},
+        {"name": "alpha", "key": "trigger.alpha_per_s", "values": [4.0, 0.25, 2.0]},
+    ]  # fmt: skip
+    figure = {"kind": "curve", "x": "alpha", "metric": "certificate_used"}
+    path = write(plan | {"compare": None}, figures=[figure], draws=2)
+    campaign = load(path)
+    store = Store(tmp_path / "out", grid(campaign, path), 2, 3)
+    run_campaign(store, alone)
+    drawn: list[Any] = []
+    monkeypatch.setattr(figures_module, "curve_figure", lambda *given: drawn.append(given))
+    list(figures(summarise(campaign, store), store))
+    ((x, labels, series, *_),) = drawn
+    assert (x.tolist(), labels) == ([0.25, 2.0], ["0.25", "2"])
+    assert [e is None for e in series["weak"]] == [False, True]
+    assert [e is None for e in series["strong"]] == [False, False]
+    monkeypatch.undo()
+    (one,) = figures(summarise(campaign, store), store)
+    lines = [line.get_xydata() for line in one.figure.axes[0].lines]
+    assert [np.isfinite(line[:, 1]).tolist() for line in lines] == [[True, False], [True, True]]
+
+
+def test_a_summary_is_of_all_draws_and_pairs_them(full: Store, campaign: Few) -> None:
+    summary = summarise(campaign[0], full)
+    rows = [point.work.run(range(7)) for point in campaign[1]]
+    for found, row in zip(summary.found, rows, strict=True):
+        assert found.estimates["cost"].mean == pytest.approx(row["cost"].mean(), rel=1e-12)
+        assert found.ended == {"finished": 7}
+    assert ["certificate_used" in found.estimates for found in summary.found] == [
+        True, True, False, False
+    ]  # fmt: skip
+    assert summary.breaches == 0
+    assert [(c.point.number, c.reference.number) for c in summary.compared] == [(0, 2), (1, 3)]
+    differences = (rows[0]["transmissions"] - rows[2]["transmissions"]).astype(float)
+    assert summary.compared[0].differences["transmissions"].estimate == estimate(differences)
+    assert differences.std() < rows[2]["transmissions"].std() or differences.mean() < 0
+
+
+def test_an_exceeded_certificate_is_said_everywhere(
+    write: Write, plan: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "cosim.studies.campaign.campaign_grid.certified_error", lambda resolved: 1e-3
+    )
+    out = tmp_path / "out"
+    arguments = ["campaign", str(write(plan)), "--workers", "1", "--out", str(out)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 1
+    assert "28 of 28 runs exceed a certified bound." in done.output
+    assert 'class="verdict bad"' in (out / "campaign.html").read_text()
+
+
+def test_the_command_writes_what_it_says_and_keeps_whole_chunks(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["campaign", str(write(plan)), "--workers", "1", "--out", str(out), "--json"]
+    done = CliRunner().invoke(app, [*arguments, "--draws", "4"])
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
+    assert said["made"] == 16
+    assert all(Path(file).exists() for file in said["files"])
+    kept = json.loads((out / "summary.json").read_text())
+    assert kept == {key: value for key, value in said.items() if key not in ("made", "files")}
+    assert json.loads(CliRunner().invoke(app, arguments).stdout)["made"] == 4 * (7 - 3)
+
+
+def test_a_campaign_that_is_not_there_is_one_line() -> None:
+    done = CliRunner().invoke(app, ["campaign", "mb_vs_zho"])
+    assert done.exit_code == 2
+    assert done.stderr == (
+        "noack: mb_vs_zho: no such file, nor a shipped campaign; did you mean mb_vs_zoh? "
+        "There are acknowledgements, mansd_sweep, mb_vs_zoh, policies_under_loss\n"
+    )
+
+
+def test_the_page_is_one_file_and_escapes_what_users_write(
+    write: Write, plan: dict[str, Any], full: Store
+) -> None:
+    plan["axes"][1]["title"] = HOSTILE
+    path = write(plan, description=HOSTILE)
+    campaign = load(path)
+    summary = summarise(campaign, full)
+    base = base_of(campaign, path)[1]
+    write_report(summary, full, base)
+    html = (full.folder / "campaign.html").read_text(encoding="utf-8")
+    assert "<script" not in html
+    assert "http" not in html.replace('"http-equiv', "").replace("http-equiv=", "")
+    assert html.count("Student&#39;s t") == 2  # as docs/campaigns.md and statistics.py have it
+    assert "(normal)" not in html
+    assert html.count("<figure id=") == len(campaign.figures)
+    assert html.count("<svg") == len(campaign.figures)
+    again = list(figures_module.figures(summary, full))
+    assert page(summary, again, base) == html
+
+
+points = st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12)
+
+
+@given(points)
+def test_the_front_is_what_nothing_dominates(drawn: list[tuple[int, int]]) -> None:
+    x, y = np.array(drawn, dtype=float).T
+    front = {(x[i], y[i]) for i in undominated(x, y)}
+    expected = {
+        (a, b) for a, b in drawn
+        if not any((c <= a and d <= b) and (c, d) != (a, b) for c, d in drawn)
+    }  # fmt: skip
+    assert front == expected
+    assert len(undominated(x, y)) == len(expected)
+    assert (np.diff(x[undominated(x, y)]) > 0).all()
+
+
+def test_figures_take_what_is_infinite_alone_or_many() -> None:
+    never, one = estimate(np.full(4, math.inf)), estimate(np.array([2.0]))
+    many = estimate(np.geomspace(1e-9, 1e9, 50))
+    for values in ([never], [one], [never, one, many]):
+        labels = [str(i) for i in range(len(values))]
+        series = {f"series {i}": values for i in range(12)}
+        pairs = {name: (values, list(reversed(values))) for name in series}
+        for figure in (
+            pareto_figure(pairs, "transmissions", "cost"),
+            curve_figure(None, labels, series, HOSTILE, "cost"),
+            curve_figure(np.arange(len(values)) + 1.0, labels, series, "x", "settling_s"),
+        ):
+            assert inline(figure, "f", "what").startswith("<svg")
+    for matrix in (np.full((2, 3), np.nan), np.array([[1.0, np.nan, 1e9]]), np.ones((1, 1))):
+        labels = (("x", ["a", "b", "c"][: matrix.shape[1]]), ("y", ["d", "e"][: matrix.shape[0]]))
+        maps = {f"map {i}": matrix for i in range(4)}
+        assert inline(heat_map_figure(maps, *labels, "cost"), "f", "what").startswith("<svg")
+    values = {"a": np.full(3, math.inf), "b": np.array([1.0]), "c": np.geomspace(1e-3, 1e3, 9)}
+    assert inline(distribution_figure(values, "cost"), "f", "what").startswith("<svg")
+
+
+def test_a_distribution_reaches_the_share_that_is_finite() -> None:
+    values = np.concatenate([np.linspace(1.0, 2.0, 75), np.full(25, math.inf)])
+    figure = distribution_figure({"a": values}, "settling_s")
+    (line,) = figure.axes[0].lines
+    x, y = (np.asarray(data, dtype=float) for data in line.get_data())
+    assert y.max() == pytest.approx(0.75)
+    assert np.interp(0.4, y, x) == pytest.approx(np.quantile(values, 0.4, method="inverted_cdf"))
+
+
+def test_numbers_are_written_with_their_interval() -> None:
+    assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
+    assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (in 50 %)"
+    assert written(estimate(np.array([math.inf]))) == "never"
+    assert set(METRICS) >= {"cost", "settling_s"}
+
+
+def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
+    write: Write, plan: dict[str, Any], tmp_path: Path
+) -> None:
+    name = "[/x] [red]"
+    plan["axes"][0]["variants"] = {name: {"mode": "model"}, "ZOH": {"mode": "zoh"}}
+    plan["axes"][1]["title"] = "[/b]"
+    path = write(plan, figures=[], draws=2, metrics={"most_events": 1})
+    out = str(tmp_path / "out")
+    result = CliRunner().invoke(app, ["campaign", str(path), "--out", out, "--workers", "1"])
+    assert result.exit_code == 0, result.output
+    assert name in result.stdout
+    assert "[/b]" in result.stdout
+    told = " ".join(result.stdout.split())
+    assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
+    assert "continuous time: the trigger watches always, and the network takes none" in told
+
+
+@pytest.mark.parametrize("width", range(40, 120))
+def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
+    headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
+    rows = [
+        Row(["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (in 97.5 %)"]),
+        Row(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
+    ]
+    console = Console(width=width, file=StringIO(), record=True)
+    for table in tables_of("all", ["policy", "β"], headings, rows, width):
+        console.print(table)
+    lines = console.export_text().splitlines()
+    for label in ("MB-ET", "ZOH-ET"):
+        found = [line for line in lines if line.strip().startswith(label)]
+        (row,) = [row for row in rows if row.labels[0] == label]
+        for cell in row.cells:
+            assert sum(cell in line for line in found) == 1
+    for heading in headings:
+        assert all(any(word in line for line in lines) for word in heading.split())
+    assert all(len(line) <= width for line in lines)
+    assert (len(found) == 1) == (width > 83)

@@ -1,0 +1,204 @@
+"""Runs in virtual time, as a campaign measures them."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad_vec
+from scipy.linalg import expm
+
+from cosim.analysis.run_summary import summarise
+from cosim.record.run_record import RunRecord
+from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.campaign.campaign_file import load
+from cosim.studies.campaign.campaign_grid import grid
+from cosim.studies.campaign.random_draws import drawn_scenario
+from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load as load_scenario
+from noack.core.errors import CallerError, ExitStatus
+
+SHIPPED = Path(__file__).parents[4] / "scenarios"
+COARSE = ("horizon_s=4.0", "plant.rate_hz=50.0", "controller.rate_hz=50.0")
+SPREAD = "plant.initial_state_halfwidth=[0.5, 0.1, 0.1, 2.0]"
+LATE = 'network.impairments=[{kind = "delay", delay_s = 0.03}]'
+NEVER = (
+    "network.protocol=ack",
+    "network.acknowledgements.loss.model=bernoulli",
+    "network.acknowledgements.loss.probability=1.0",
+)
+
+
+def scenario(*overrides: str) -> Scenario:
+    return load_scenario(SHIPPED / "lane_following.toml", [*COARSE, SPREAD, *overrides])
+
+
+def work(*overrides: str, **changed: Any) -> SampledWork:
+    settings: dict[str, Any] = {"Q": None, "R": None, "settle": 0.5, "most_events": 1000}
+    return SampledWork(in_virtual_time(scenario(*overrides)), 7, **settings | changed)
+
+
+def record_of(one: SampledWork, draw: int) -> RunRecord:
+    return simulate(drawn_scenario(one.scenario, one.seed, draw))
+
+
+@pytest.mark.parametrize("overrides", [(), (LATE,), NEVER, ("mode=zoh",)])
+def test_a_row_says_what_the_runs_summary_says(overrides: tuple[str, ...]) -> None:
+    one = work(*overrides)
+    for draw, row in enumerate(one.run(range(3))):
+        record = record_of(one, draw)
+        told = summarise(record, ExitStatus.OK, "")
+        assert row["status"] == OK
+        assert row["transmissions"] == told["events"]
+        assert row["deliveries"] == told["deliveries"]
+        assert row["final_norm"] == pytest.approx(told["final_state_norm"], rel=1e-12)
+        shortest_s = math.nan if told["events"] < 2 else told["inter_event_min_s"]
+        assert row["inter_event_min_s"] == pytest.approx(shortest_s, rel=1e-12, nan_ok=True)
+        norms = np.linalg.norm(record["plant_step"]["x"], axis=1)
+        last_s = record["plant_step"]["t_ns"][norms > 0.5 * norms[0]][-1] * 1e-9
+        settled_s = last_s if norms[-1] <= 0.5 * norms[0] else math.nan
+        assert row["settling_s"] == pytest.approx(settled_s, nan_ok=True)
+        # e^{0.25 t} grows from 1 to e over the horizon.
+        assert told["sup_e_c_norm"] <= row["sup_e_c_scaled"] <= np.e * told["sup_e_c_norm"]
+
+
+def test_the_cost_is_the_integral_along_the_held_inputs() -> None:
+    Q, R = np.diag([1.0, 2.0, 3.0, 4.0]), np.diag([0.5, 0.25])
+    one = work("horizon_s=0.2", Q=Q, R=R)
+    (row,) = one.run(range(1))
+    record = record_of(one, 0)
+    drift = np.zeros((6, 6))
+    drift[:4, :4], drift[:4, 4:] = record.loop.A, record.loop.B
+
+    def rate(s: float, z: Any) -> float:
+        now = expm(drift * s) @ z
+        return float(now[:4] @ Q @ now[:4] + now[4:] @ R @ now[4:])
+
+    cost = 0.0
+    for x, u in zip(record["plant_step"]["x"][:-1], record["plant_step"]["u"], strict=False):
+        cost += quad_vec(partial(rate, z=np.concatenate([x, u])), 0.0, 0.02, epsrel=1e-12)[0]
+    assert row["cost"] == pytest.approx(cost, rel=1e-10)
+
+
+def test_what_disturbs_the_plant_is_in_the_integral_and_costs_nothing_itself() -> None:
+    gusts = (
+        'plant.disturbances=[{kind = "gaussian", std = [3.0, 1.0]},'
+        ' {kind = "uniform", at = "state", bound = [0.5, 0.0, 0.0, 2.0]}]'
+    )
+    one = work("horizon_s=0.2", gusts)
+    (row,) = one.run(range(1))
+    steps, loop = record_of(one, 0)["plant_step"], record_of(one, 0).loop
+    cost = 0.0
+    for step in steps[:-1]:
+        moving = loop.B @ (step["u"] + step["d"]) + step["w"]
+        drift = np.zeros((5, 5))
+        drift[:4, :4], drift[:4, 4] = loop.A, moving
+
+        def rate(s: float, z: Any, G: Any) -> float:
+            return float(((expm(G * s) @ z)[:4] ** 2).sum())
+
+        squared = partial(rate, z=np.append(step["x"], 1.0), G=drift)
+        cost += quad_vec(squared, 0.0, 0.02, epsrel=1e-12)[0] + 0.02 * float(step["u"] @ step["u"])
+    assert row["cost"] == pytest.approx(cost, rel=1e-10)
+
+
+def test_a_plant_that_is_not_linear_is_drawn_and_its_cost_is_a_sum() -> None:
+    given = load_scenario(SHIPPED / "cart_pole.toml", ["horizon_s=1.0", "plant.rate_hz=200.0"])
+    one = SampledWork(in_virtual_time(given), 7, None, None, 0.5, 1000)
+    (row,) = one.run(range(1))
+    record = record_of(one, 0)
+    steps = record["plant_step"]
+    assert row["status"] == OK
+    assert not record.scenario.is_linear
+    of_x = (steps["x"] ** 2).sum(axis=1)
+    expected = np.trapezoid(of_x, dx=0.005) + 0.005 * (steps["u"][:-1] ** 2).sum()
+    assert row["cost"] == pytest.approx(expected, rel=1e-12)
+
+
+def test_every_draw_has_disturbances_and_noise_of_its_own() -> None:
+    noisy = ('plant.disturbances=[{kind = "gaussian", std = [1.0, 1.0]}]',
+             "plant.measurement.noise_std=[0.1, 0.1, 0.1, 0.1]")  # fmt: skip
+    seeds = [drawn_scenario(work(*noisy).scenario, 7, draw).seeds for draw in range(3)]
+    assert len({(s.disturbance, s.noise, s.loss) for s in seeds}) == 3
+    assert len({s.disturbance for s in seeds} | {s.noise for s in seeds}) == 6
+
+
+def test_a_draw_depends_on_its_number_alone() -> None:
+    one = work(*NEVER)
+    assert one.run(range(2, 4)).tobytes() == one.run(range(4))[2:].tobytes()
+
+
+def test_acknowledgements_that_are_lost_cost_transmissions() -> None:
+    with_none, with_lost = work().run(range(5)), work(*NEVER).run(range(5))
+    assert with_lost["transmissions"].sum() > 3 * with_none["transmissions"].sum()
+
+
+def test_a_run_that_fails_says_how() -> None:
+    growing = "model.gain=[[0, 0, 0, 0], [0, 0, 0, 0]]"
+    (row,) = work(
+        growing, "model.allow_unstable=true",
+        "horizon_s=2000.0", "plant.rate_hz=5.0", "controller.rate_hz=5.0",
+    ).run(range(1))  # fmt: skip
+    assert row["status"] == DIVERGED
+    assert 0 < row["diverged_at_s"] < 2000
+    assert np.isnan(row["cost"])
+    (row,) = work("mode=zoh", most_events=2).run(range(1))
+    assert (row["status"], np.isnan(row["cost"])) == (TOO_MANY_EVENTS, True)
+
+
+def test_nobody_falls_silent_in_virtual_time_whatever_an_actuation_carries() -> None:
+    """So the watchdog never trips, and its policy makes no difference."""
+    rows = [work(f"plant.watchdog.policy={policy}").run(range(2)) for policy in ("hold", "model")]
+    assert rows[0].tobytes() == rows[1].tobytes()
+    assert (rows[0]["status"] == OK).all()
+
+
+PLAN = {
+    "name": "sampled",
+    "scenario": "lane_following",
+    "draws": 2,
+    "time": "sampled",
+    "settings": {"horizon_s": 1.0, "plant.rate_hz": 50.0},
+}
+
+
+def test_what_takes_time_has_a_place(write: Callable[..., Path]) -> None:
+    delay = [{"kind": "delay", "delay_s": 0.01}]
+    axis = {"name": "network", "variants": {
+        "late": {"network.impairments": delay}, "ack": {"network.protocol": "ack"},
+    }}  # fmt: skip
+    path = write(PLAN | {"axes": [axis]})
+    points = grid(load(path), path)
+    assert [point.certified_error for point in points] == [None, None]
+    assert all(isinstance(point.work, SampledWork) for point in points)
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ({"network.protocol": "ack"}, r'protocol.*with time = "sampled" a campaign runs both'),
+        (
+            {"network.impairments": [{"kind": "delay", "delay_s": 0.01}]},
+            r'delay.*or let time = "sampled"',
+        ),
+    ],
+)
+def test_continuous_time_refers_to_the_other(
+    write: Callable[..., Path], setting: dict[str, Any], says: str
+) -> None:
+    axis = {"name": "network", "variants": {"plain": {"mode": "zoh"}, "other": setting}}
+    path = write(PLAN | {"time": "continuous", "axes": [axis]})
+    with pytest.raises(CallerError, match=says):
+        grid(load(path), path)
+
+
+def test_an_axis_that_plays_no_part_is_refused(write: Callable[..., Path]) -> None:
+    axis = {"name": "speed", "key": "speed", "values": [1.0, 2.0]}
+    path = write(PLAN | {"axes": [axis]})
+    with pytest.raises(CallerError, match="makes no difference"):
+        grid(load(path), path)

@@ -1,0 +1,165 @@
+"""Runs beside each other: numbers, settings, distance, one figure; and what cannot be compared."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import noack
+from cosim.cli import app
+from cosim.record.environment import write_environment
+from cosim.studies.comparison.run_comparison import Comparison, KeyNumber, compare_runs
+from noack.protocol.record_tables import PLANT_STEP
+
+SETTINGS: list[dict[str, Any]] = [
+    {"horizon_s": 3.0},
+    {"horizon_s": 3.0, "mode": "zoh"},
+    {"horizon_s": 2.0, "network.mansd": 1, "plant.rate_hz": 250.0},
+]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("runs")
+    scenarios = [noack.load("lane_following", settings) for settings in SETTINGS]
+    return [noack.simulate(scenario, runs=folder).directory for scenario in scenarios]
+
+
+@pytest.fixture(scope="module")
+def found(runs: list[Path]) -> Comparison:
+    return compare_runs(runs)
+
+
+def compare(*words: object) -> Result:
+    return CliRunner().invoke(app, ["compare", *map(str, words)], prog_name="noack")
+
+
+def number(found: Comparison, name: str) -> KeyNumber:
+    return next(one for one in found.numbers if one.name == name)
+
+
+def test_numbers_are_those_of_the_summaries_and_differences_are_to_the_first(
+    found: Comparison,
+) -> None:
+    events = tuple(run.summary["events"] for run in found.runs)
+    assert number(found, "transmissions").values == events
+    assert number(found, "transmissions").differences == (0, *(n - events[0] for n in events[1:]))
+    for run, share in zip(found.runs, number(found, "loss rate, %").values, strict=True):
+        crossed = run.summary["drops"] + run.summary["deliveries"]
+        assert share == pytest.approx(100 * run.summary["drops"] / crossed)
+
+
+def test_the_distance_is_over_the_times_that_both_have(found: Comparison) -> None:
+    """The third run takes every second step of the first, for two of its three seconds."""
+    first, _, third = (run.record[PLANT_STEP] for run in found.runs)
+    assert len(third) == 501
+    apart = np.linalg.norm(third["x"] - first["x"][:1001:2], axis=1)
+    rms, largest = (number(found, f"distance in x to A, {name}") for name in ("RMS", "maximum"))
+    assert rms.values[0] is largest.values[0] is None
+    assert rms.values[2] == pytest.approx(np.sqrt(np.mean(apart**2)))
+    assert largest.values[2] == pytest.approx(apart.max())
+
+
+def test_a_run_is_at_no_distance_to_itself(runs: list[Path]) -> None:
+    same = compare_runs([runs[0], runs[0]])
+    assert number(same, "distance in x to A, maximum").values == (None, 0.0)
+    assert same.settings == {}
+    assert all(not apart for one in same.numbers for apart in one.differences)
+
+
+def test_settings_that_differ_are_named_and_no_other(found: Comparison) -> None:
+    assert found.settings["mode"] == ("model", "zoh", "model")
+    assert found.settings["network.mansd"] == ("4", "4", "1")
+    assert found.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
+    assert "trigger.beta" not in found.settings
+    assert not any(key.startswith("ports") for key in found.settings)
+
+
+def test_the_overlay_shows_every_run_in_every_panel(found: Comparison) -> None:
+    *states, sensor, controller, transmissions = found.plot().axes
+    assert len(states) == 4
+    for axes in (*states, controller):
+        assert len(axes.lines) == 3
+    assert len(sensor.lines) == 6  # each with its threshold
+    colours = [line.get_color() for line in states[0].lines]
+    assert len(set(colours)) == 3
+    assert [line.get_color() for line in controller.lines] == colours
+    assert [tick.get_text() for tick in transmissions.get_yticklabels()] == ["A", "B", "C"]
+    legend = states[0].get_legend()
+    assert legend is not None
+    assert [text.get_text()[:3] for text in legend.get_texts()] == ["A: ", "B: ", "C: "]
+
+
+@pytest.mark.parametrize("name", ["overlay.html", "overlay.svg", "overlay.png"])
+def test_the_command_prints_and_writes(name: str, runs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "new" / name
+    done = compare(*runs, "--out", out)
+    assert done.exit_code == 0, done.output
+    text = done.stdout
+    assert "transmissions" in text
+    assert "network.mansd" in text
+    assert text.splitlines()[-1] == f"overlay: {out}"
+    begins = {"html": b"<!DOCTYPE html>", "svg": b"<?xml", "png": b"\x89PNG"}
+    assert out.read_bytes().startswith(begins[out.suffix[1:]])
+    assert [path.name for path in out.parent.iterdir()] == [name]
+
+
+def test_the_page_escapes_and_needs_nothing_else(runs: list[Path], tmp_path: Path) -> None:
+    compare_runs(runs[:2]).save(tmp_path / "page.html")
+    html = (tmp_path / "page.html").read_text()
+    assert html.count("<svg") == 1
+    assert "<script" not in html
+    assert "zero-order hold" in html
+
+
+def test_live_and_simulated_runs_can_be_compared(runs: list[Path]) -> None:
+    """A record is of the same tables whichever it is."""
+    before = (runs[1] / "environment.json").read_bytes()
+    try:
+        write_environment(runs[1], "live")
+        assert compare_runs(runs[:2]).runs[1].record.kind == "live"
+    finally:
+        (runs[1] / "environment.json").write_bytes(before)
+
+
+def test_a_document_for_programs(runs: list[Path], tmp_path: Path) -> None:
+    done = compare(*runs[:2], "--out", tmp_path / "a.svg", "--json")
+    document = json.loads(done.stdout)
+    assert [run["label"] for run in document["runs"]] == ["A", "B"]
+    first, second = document["numbers"]["deliveries"]
+    assert document["differences"]["deliveries"] == [0, second - first]
+    assert document["settings"]["mode"] == ["model", "zoh"]
+    assert Path(document["overlay"]).is_file()
+
+
+def test_what_cannot_be_compared_is_one_line(runs: list[Path], tmp_path: Path) -> None:
+    other = noack.simulate(noack.load("double_integrator", {"horizon_s": 1.0}), runs=tmp_path)
+    mistakes = {
+        (runs[0], other.directory): f"noack: {other.directory}: its plant has 2 states, that of "
+        f"{runs[0]} has 4; runs with equally many states can be compared\n",
+        (runs[0],): "noack: give 2 to 7 run directories to compare, not 1; `noack fidelity` "
+        "compares one with the ideal loop\n",
+        (runs[0], tmp_path): f"noack: {tmp_path}: not a run directory (no scenario.toml)\n",
+        (*runs, "--out", tmp_path / "a.pdf"): f"noack: {tmp_path / 'a.pdf'}: a comparison is "
+        "written as .html, .svg or .png\n",
+    }
+    for words, said in mistakes.items():
+        done = compare(*words)
+        assert (done.exit_code, done.stderr, done.stdout) == (2, said, "")
+
+
+def test_a_run_that_diverged_is_overlaid_as_far_as_it_goes(runs: list[Path]) -> None:
+    found = compare_runs(runs[:2])
+    found.runs[1].record[PLANT_STEP]["x"][700:] = np.nan
+    assert all(one.name != "distance in x to A, RMS" for one in found.numbers)
+    assert found.plot().axes
+
+
+def test_the_library_gives_the_same(runs: list[Path], found: Comparison) -> None:
+    temporary = noack.simulate(noack.load("lane_following", SETTINGS[1]))
+    mine = noack.compare(noack.open_run(runs[0]), temporary, runs[2])
+    assert mine.rows == found.rows
+    assert "distance in x to A, RMS" in repr(mine)

@@ -1,0 +1,137 @@
+"""What is chosen meets the limits, and nothing cheaper that was tried does."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.simulation.batch.batch_interface import run_batch, setting_of
+from cosim.studies.campaign.random_draws import box_of
+from cosim.studies.design.candidate_measures import Limits, measure
+from cosim.studies.design.design_result import Found
+from cosim.studies.design.design_space import LEVELS
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load
+from noack.core.errors import CallerError
+from noack.theory.run_conditions import ideal_conditions
+from noack.theory.scenario_certificates import certify_box
+from tests.cosim.studies.design.conftest import LIMITS, designed
+
+
+def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: Found) -> None:
+    assert found.feasible
+    assert found.confirmed
+    setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
+    rows = run_batch(setting, box_of(found.scenario).population(99, range(4000)))
+    share = float(np.mean(rows["settling_s"] <= LIMITS.settling_s))
+    assert share >= LIMITS.quantile
+    # 4 standard deviations of the difference of two means
+    spread = 4 * np.hypot(found.fresh.halfwidth, 0.08) / 1.96
+    assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
+
+
+def test_the_chosen_one_is_certified_as_asked(found: Found, tmp_path: Path) -> None:
+    path = tmp_path / "chosen.toml"
+    path.write_text(dumps(found.scenario))
+    resolved = resolve(load(path))
+    certificate = certify_box(resolved, ideal_conditions(resolved))
+    assert certificate is not None
+    assert certificate.constants is not None
+    weight = resolved.decaying.weight
+    smallest = 1.0 if weight is None else np.linalg.svd(np.array(weight), compute_uv=False)[-1]
+    bound = certificate.constants.delta * resolved.decaying.beta / smallest
+    assert bound <= LIMITS.bounds["error"]
+    # The bound decides here: without it there is a cheaper one.
+    assert found.bounds is not None
+    assert found.bounds["error"] == pytest.approx(bound)
+
+
+def test_a_limit_costs_transmissions(found: Found, scenario: Scenario) -> None:
+    free = designed(scenario, replace(LIMITS, bounds={}))
+    assert free.feasible
+    assert free.bounds is not None
+    assert free.bounds["error"] > LIMITS.bounds["error"]
+    assert free.best.measured.transmissions < found.best.measured.transmissions
+
+
+def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(found: Found) -> None:
+    best = found.best.measured
+    assert found.best.full
+    assert best.settling_high_s <= LIMITS.settling_s
+    cheaper = [t for t in found.trials if t.measured.transmissions < best.transmissions]
+    assert len(cheaper) > 10
+    for trial in cheaper:
+        m = trial.measured
+        late = (m.settling_high_s if trial.full else m.settling_s) > LIMITS.settling_s
+        assert late or trial.bounds["error"] > LIMITS.bounds["error"], trial
+
+
+def test_screening_loses_nothing_that_all_draws_would_find(found: Found) -> None:
+    """Every grid candidate that was only screened out is measured on all draws."""
+    best = found.best.measured
+    population = box_of(found.scenario).population(found.seed, range(best.draws))
+    rescued = 0
+    for trial in found.trials:
+        if trial.full or trial.measured.transmissions > best.transmissions:
+            continue
+        scenario = found.space.families[trial.candidate.family].with_trigger(trial.candidate)
+        rescued += measure(scenario, LIMITS, population).settling_high_s <= LIMITS.settling_s
+    assert rescued == 0
+
+
+def test_the_trade_off_curve_is_what_nothing_dominates(found: Found) -> None:
+    assert len(found.front) > 3
+    points = [(t.measured.transmissions, t.measured.settling_s) for t in found.front]
+    assert points == sorted(points)
+    assert sorted((s for _, s in points), reverse=True) == [s for _, s in points]
+    for trial in found.front:
+        assert trial.full
+        assert trial.bounds["error"] <= LIMITS.bounds["error"]
+    for trial in found.trials:
+        if trial.bounds.get("error", 0.0) <= LIMITS.bounds["error"]:
+            sent, settling_s = trial.measured.transmissions, trial.measured.settling_s
+            assert not any(sent < a and settling_s < b for a, b in points)
+            never = settling_s == float("inf")
+            assert (
+                never
+                or trial in found.front
+                or any(a <= sent and b <= settling_s for a, b in points)
+            )
+
+
+def test_the_same_seed_gives_the_same_design_and_another_one_other_draws(
+    scenario: Scenario,
+) -> None:
+    limits = replace(LIMITS, bounds={})
+    one, again, other = (designed(scenario, limits, draws=80, seed=s) for s in (5, 5, 6))
+    assert again.document() == one.document()
+    assert other.fresh != one.fresh
+
+
+def test_candidates_lie_below_the_decay_rate(found: Found) -> None:
+    # s² + 1.5 s + 1: the real part of both roots is −0.75
+    rates = [trial.candidate.alpha_per_s for trial in found.trials]
+    assert max(rates) < 0.75
+    assert max(rates) > 0.7
+    assert min(trial.candidate.beta for trial in found.trials) > LEVELS[0] / 3
+
+
+def test_what_cannot_be_met_is_said_with_the_closest(scenario: Scenario) -> None:
+    limits = Limits(1.0, 0.9, 0.02, {})
+    found = designed(scenario, limits, draws=80)
+    assert not found.feasible
+    assert not found.confirmed
+    verdict = found.verdict()
+    assert "\n" not in verdict
+    assert verdict.startswith("no design meets the limits; the closest has a settling time of ")
+    closest = found.best.measured.settling_high_s
+    assert f"{found.best.measured.settling_s:.4g} s" in verdict
+    assert all(t.measured.settling_high_s >= closest for t in found.trials if t.full)
+
+
+def test_a_bound_is_not_certified_for_an_initial_state_that_is_drawn(scenario: Scenario) -> None:
+    plant = scenario.plant.model_copy(update={"initial_state_halfwidth": (0.1, 0.1)})
+    with pytest.raises(CallerError, match="initial_state_halfwidth"):
+        designed(scenario.model_copy(update={"plant": plant}), LIMITS)

@@ -1,0 +1,113 @@
+"""The counterexamples, each against a closed form or another way of computing it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.studies.paper.paper_conditions import BASE, load_condition, resolved_draw
+from cosim.studies.paper.paper_evidence import (
+    _eigenvalues,
+    _exact_model,
+    _loss,
+    _slow_model,
+    _standstill,
+    _theorem_3,
+    _trapped,
+)
+from noack.config.named_models import lane_following
+from noack.config.resolution import loop_of
+
+PATH = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
+
+
+def test_the_eigenvalues_are_roots_of_the_characteristic_polynomial() -> None:
+    found = _eigenvalues()
+    for name, speed in (("printed", -12.0), ("flipped", 12.0)):
+        model = lane_following({"speed": speed})
+        H = model.A + model.B @ model.K
+        for real, imaginary in found[name]:
+            shifted = H - (real + 1j * imaginary) * np.eye(4)
+            assert np.linalg.svd(shifted, compute_uv=False)[-1] < 1e-9
+    assert max(real for real, _ in found["printed"]) < 0 < max(r for r, _ in found["flipped"])
+    assert (found["rank"], found["rank_squared"]) == (3, 2)
+
+
+def test_the_share_that_a_capped_loss_loses_is_the_simulated_one() -> None:
+    rng = np.random.default_rng(0)
+    found = _loss(5)
+    for p, share in ((0.8, found["at_0.8"]), (found["half"], 0.5)):
+        lost = run = 0
+        for draw in rng.random(40_000):
+            dropped = draw < p and run < 4
+            run = run + 1 if dropped else 0
+            lost += dropped
+        # The standard deviation of the share is below 0.005 / 2.
+        assert lost / 40_000 == pytest.approx(share, abs=0.015)
+    assert found["most"] == 0.8
+
+
+def test_with_an_exact_model_x_is_the_undisturbed_closed_loop() -> None:
+    found = _exact_model(PATH)
+    model = lane_following({})
+    H, x0 = model.A + model.B @ model.K, np.array([0.5, 0.0, 0.1, 3.0])
+    assert found["events"] == 1
+    expected = [np.linalg.norm(expm(H * t_s) @ x0) for t_s in found["times_s"]]
+    np.testing.assert_allclose(found["norms"], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["model", "zoh"])
+def test_trapped_states_do_not_feel_the_unstable_mode(mode: str) -> None:
+    found = _trapped(PATH)
+    assert found[mode] == found["n"] - found["unstable"] == 3
+    loop = loop_of(resolved_draw(load_condition(PATH, BASE), found["draw"], "model"))
+    n, BK = loop.n, loop.B @ loop.K
+    H = loop.H if mode == "model" else np.zeros((n, n))
+    rate = np.linalg.eigvals(loop.A).real.max()
+    late_s = 20.0 / rate
+    gamma = np.block([[loop.A, BK], [np.zeros((n, n)), H]])
+    # What is left of (x, x) after long, relative to the unstable mode: one direction of x only.
+    pairs = expm((gamma - rate * np.eye(2 * n)) * late_s)[:n] @ np.vstack([np.eye(n)] * 2)
+    singular = np.linalg.svd(pairs, compute_uv=False)
+    # The double zero grows like t e^(−rate t).
+    assert singular[1] < 1e3 * late_s * np.exp(-rate * late_s) < 1e-3 * singular[0]
+
+
+def test_the_slow_models_error_is_the_closed_form() -> None:
+    found = _slow_model(5)
+    assert found["model_per_s"] == pytest.approx(0.1)
+    assert found["model_per_s"] < found["alpha_per_s"] < found["closed_per_s"]
+    since_s = 0.0
+    for end_s, thresholds in zip(found["deliveries_s"], found["thresholds"], strict=True):
+        x, x_c = 5 * np.exp(-end_s), 5 * np.exp(-since_s - 0.1 * (end_s - since_s))
+        assert thresholds == pytest.approx((x_c - x) * np.exp(0.5 * end_s), rel=1e-9)
+        since_s = end_s
+    assert found["thresholds"] == sorted(found["thresholds"])
+    assert found["thresholds"][-1] > 1e30
+
+
+def test_the_vehicle_at_rest_is_where_its_free_motion_ends() -> None:
+    found = _standstill(PATH)
+    model = lane_following({})
+    x0 = np.array(found["x0"])
+    assert np.abs(model.K @ x0).max() < 1e-12
+    # Without input: (V, r) e^(λt), ψ(∞) = 0, Y(∞) = Y(0) + ∫(V + Uψ) dt with ψ = r/λ.
+    rate = found["stable_per_s"]
+    rest = x0[3] + (x0[0] - 12.0 * x0[1] / rate) / -rate
+    assert found["norms"][-1] == pytest.approx(abs(rest), rel=1e-6)
+    # From the second event on ‖e_s‖ tends to what was left when x was measured: d e^(λt).
+    first, second = found["events_s"][1:]
+    left = np.linalg.norm(expm(model.A * first) @ x0 - [0.0, 0.0, 0.0, rest])
+    assert 0.5 * np.exp(-0.25 * second) == pytest.approx(left, rel=1e-3)
+
+
+def test_theorem_3s_equation_is_solved_with_and_without_the_factor() -> None:
+    found = _theorem_3(PATH, 0)
+    gamma = found["gamma_per_s"]
+    for row in found["rows"]:
+        for name, level in (("printed", 0.5), ("derived", 0.5 * np.exp(-0.25 * row["t_s"]))):
+            delta_s = row[name]
+            left = row["norm"] * (np.exp(gamma * delta_s) - 1)
+            assert left == pytest.approx(level * np.exp(-0.25 * delta_s), rel=1e-6)
+    assert found["rows"][-1]["printed"] > 5 * found["rows"][-1]["derived"]

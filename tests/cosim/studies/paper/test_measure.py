@@ -1,0 +1,109 @@
+"""Measures of a draw, against closed forms and against what the simulator's own summary says."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cosim.simulation.continuous.continuous_report import run_continuous, summary
+from cosim.studies.paper.draw_measures import (
+    _ideal_norms,
+    _settling_s,
+    measure_draw,
+    open_loop_eigenvalues,
+    simulate_draw,
+)
+from cosim.studies.paper.paper_bounds_of_draws import certified, printed
+from cosim.studies.paper.paper_conditions import (
+    BASE,
+    CONDITIONS,
+    MODES,
+    load_condition,
+    resolved_draw,
+)
+from noack.config.resolution import loop_of
+
+PATH = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
+SCENARIO = load_condition(PATH, BASE)
+DRAW = 3
+
+
+def test_an_exponential_settles_when_its_logarithm_says() -> None:
+    t_s = np.linspace(0.0, 10.0, 101)
+    assert _settling_s(t_s, np.exp(-t_s), 0.05) == pytest.approx(math.log(20), rel=1e-12)
+
+
+def test_settling_counts_from_the_last_time_above_the_level() -> None:
+    t_s = np.arange(5.0)
+    assert _settling_s(t_s, np.array([1.0, 0.01, 1.0, 0.01, 0.01]), 0.1) == pytest.approx(2.5)
+    assert _settling_s(t_s, np.full(5, 0.01), 0.1) == 0.0
+    assert _settling_s(t_s, np.array([1.0, 0.0, 0.0, 0.0, 1.0]), 0.1) == math.inf
+
+
+def test_the_loop_without_a_network_is_the_exponential() -> None:
+    loop = loop_of(resolved_draw(SCENARIO, DRAW, "model"))
+    closed = loop.A + loop.B @ loop.K
+    t_s, norms = _ideal_norms(closed, loop.x0, 20.0)
+    for k in (0, 137, 2000):
+        assert norms[k] == pytest.approx(np.linalg.norm(expm(closed * t_s[k]) @ loop.x0), rel=1e-10)
+
+
+def test_both_loops_of_a_draw_have_the_same_plant_start_and_losses() -> None:
+    model, zoh = (resolved_draw(SCENARIO, DRAW, mode) for mode in MODES)
+    assert model.model_copy(update={"mode": "zoh"}) == zoh
+    fates = [simulate_draw(resolved).delivered for resolved in (model, zoh)]
+    common = min(map(len, fates))
+    assert (fates[0][:common] == fates[1][:common]).all()
+    assert not fates[0].all()
+
+
+def test_other_draws_have_other_plants_starts_and_losses() -> None:
+    first, second = (resolved_draw(SCENARIO, draw, "model") for draw in (0, 1))
+    assert first.plant.A != second.plant.A
+    assert first.plant.initial_state != second.plant.initial_state
+    assert first.seeds.loss != second.seeds.loss
+
+
+def test_measures_are_those_of_the_simulators_summary() -> None:
+    found = measure_draw(SCENARIO, DRAW)
+    for mode, measures in (("model", found.model), ("zoh", found.zoh)):
+        resolved = resolved_draw(SCENARIO, DRAW, mode)  # type: ignore[arg-type]
+        told = summary(run_continuous(resolved), resolved)
+        assert measures.events == told["events"]
+        assert measures.deliveries == told["deliveries"]
+        assert measures.gap_min_s == told["inter_event_min_s"]
+        assert measures.gap_median_s == told["inter_event_median_s"]
+        assert measures.reception_median_s == told["inter_delivery_median_s"]
+        assert measures.final_norm == pytest.approx(told["final_state_norm"], rel=1e-9)
+        assert found.start_norm == pytest.approx(told["initial_state_norm"], rel=1e-9)
+        assert measures.peak >= 1
+
+
+def test_what_is_measured_respects_what_is_certified_and_printed() -> None:
+    found, bound, theorem = (f(SCENARIO, DRAW) for f in (measure_draw, certified, printed))
+    assert 1 < found.model.controller_error <= bound.delta
+    assert found.start_norm <= found.model.envelope <= bound.state
+    assert theorem.inter_event_s < bound.inter_event_s < found.model.gap_min_s
+    # eq:tau for every t_i is the smaller of its two ends, whichever way F̄ leans.
+    assert theorem.inter_event_s == pytest.approx(min(theorem.first_s, theorem.late_s), rel=1e-9)
+
+
+def test_the_double_eigenvalue_at_zero_is_recognised_in_every_plant() -> None:
+    for draw in range(20):
+        loop = loop_of(resolved_draw(SCENARIO, draw, "model"))
+        assert (open_loop_eigenvalues(loop) == 0).sum() == 2
+        assert np.linalg.matrix_rank(loop.A) == 3
+        lateral = np.sort(np.linalg.eigvals(loop.A[:2, :2]).real)
+        others = np.sort(open_loop_eigenvalues(loop).real)[[0, -1]]
+        np.testing.assert_allclose(others, [lateral[0], max(lateral[1], 0.0)], atol=1e-9)
+
+
+def test_an_exact_model_sends_nothing_after_the_first_packet() -> None:
+    (exact,) = [c for c in CONDITIONS if c.name == "exact_model"]
+    found = measure_draw(load_condition(PATH, exact), 0)
+    assert found.model.events == found.model.deliveries == 1
+    assert found.model.gap_min_s == math.inf
+    assert found.model.settled_1_s == pytest.approx(found.ideal_settled_1_s, abs=1e-6)
+    assert found.zoh.events > 100

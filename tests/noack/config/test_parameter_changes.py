@@ -1,0 +1,178 @@
+"""Changes of settings: what may change, how it is said, and what a machine keeps of it."""
+
+from typing import Any
+
+import pytest
+
+from noack.config.impairments import Bernoulli, GilbertElliott
+from noack.config.parameter_changes import (
+    Change,
+    Schedule,
+    changed,
+    knobs_of,
+    settings_bytes,
+    settings_of,
+)
+from noack.config.resolution import resolve
+from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load, validate
+from noack.core.errors import CallerError
+from noack.protocol.machine_interface import Notice, Record
+from noack.protocol.record_tables import CHANGE_BYTES
+
+
+@pytest.fixture
+def scenario(content: dict[str, Any]) -> Scenario:
+    return resolve(validate(content, "here"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "why"),
+    [
+        ({"speed": 2.0}, "speed: cannot be changed during a run; what can is network.loss, "),
+        ({"trigger.policy": "periodic"}, "trigger.policy: cannot be changed"),
+        ({"trigger.weight": [[1.0]]}, "trigger.weight: cannot be changed"),
+        ({"network.loss.probability": 1.5}, "network.loss.probability = 1.5: should be less than"),
+        ({"network.loss.p": 0.5}, "network.loss.p = 0.5: unknown key; the keys here are"),
+        ({"network.loss.model": "gilbert"}, "must be one of .* did you mean gilbert_elliott"),
+        ({"network.loss.model": "trace", "network.loss.file": "x"}, "read before a run begins"),
+        ({"network.mansd": -1}, "network.mansd = -1: should be greater than or equal to 0"),
+        ({"network.mansd": 1.5}, "network.mansd = 1.5"),
+        ({"trigger.beta": 0.0}, "trigger.beta = 0.0: should be greater than 0"),
+        ({"trigger.beta": None}, "trigger.beta: needs a value"),
+        ({"controller.setpoint": [1.0, 1.0]}, "controller.setpoint.*no equilibrium of the model"),
+        ({"network.loss": {"model": "scripted", "lost": list(range(900))}}, "at most 1024"),
+    ],
+)
+def test_a_mistaken_change_is_one_line(
+    scenario: Scenario, settings: dict[str, Any], why: str
+) -> None:
+    with pytest.raises(CallerError, match=why) as raised:
+        changed(scenario, settings)
+    assert "\n" not in str(raised.value)
+    assert raised.value.exit_status == 2
+
+
+def test_the_rest_stays_as_it_is(scenario: Scenario) -> None:
+    settings = {"network.loss.probability": 0.9, "network.mansd": 1, "trigger.beta": 0.25}
+    found = changed(scenario, settings)
+    assert found.network.loss == Bernoulli(probability=0.9)
+    assert (found.network.mansd, found.decaying.beta) == (1, 0.25)
+    back = {"network.loss.probability": 0.5, "network.mansd": 2, "trigger.beta": 0.5}
+    assert changed(found, back) == scenario
+
+
+def test_another_loss_model_begins_without_the_keys_of_the_one_before(scenario: Scenario) -> None:
+    settings = {
+        "network.loss.model": "gilbert_elliott",
+        "network.loss.mean_loss": 0.5,
+        "network.loss.mean_burst": 3.0,
+    }
+    loss = changed(scenario, settings).network.loss
+    assert loss == GilbertElliott(mean_loss=0.5, mean_burst=3.0)
+
+
+def test_a_change_is_valid_if_the_whole_scenario_is(scenario: Scenario) -> None:
+    for settings in ({"network.loss.probability": 0.2}, {"controller.setpoint": [3.0, 0.0]}):
+        assert changed(scenario, settings) == validate(scenario.changed_content(settings), "x")
+
+
+def test_nothing_changes_where_updates_are_acknowledged(content: dict[str, Any]) -> None:
+    content["network"]["protocol"] = "ack"
+    with pytest.raises(CallerError, match='with "ack", nothing can be changed'):
+        changed(resolve(validate(content, "here")), {"network.mansd": 1})
+
+
+def test_a_scenario_says_what_changes_and_is_read_back(
+    content: dict[str, Any], tmp_path: Any
+) -> None:
+    content["changes"] = [
+        {"at_s": 0.25, "set": {"network.loss.probability": 0.9}},
+        {"at_s": 0.5, "set": {"network.loss": {"model": "lossless"}, "trigger.beta": 0.1}},
+    ]
+    scenario = validate(content, "here")
+    path = tmp_path / "s.toml"
+    path.write_text(dumps(scenario))
+    assert load(path) == scenario
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ([{"at_s": 2.0, "set": {"network.mansd": 1}}], "changes.0.at_s.*the run ends at 1 s"),
+        (
+            [{"at_s": 0.5, "set": {"network.mansd": 1}}, {"at_s": 0.4, "set": {"trigger.beta": 1}}],
+            "changes.1.at_s.*before the change that it follows",
+        ),
+        ([{"at_s": 0.5, "set": {"network.mansd": -1}}], "changes.0.set.*greater than or equal"),
+        ([{"at_s": 0.5, "set": {"horizon_s": 1}}], "changes.0.set.*cannot be changed"),
+        ([{"at_s": 0.5, "set": {}}], "changes.0.set.*needs at least|changes.0.set"),
+    ],
+)
+def test_mistakes_in_what_changes_are_told(
+    content: dict[str, Any], changes: list[dict[str, Any]], why: str
+) -> None:
+    content["changes"] = changes
+    with pytest.raises(CallerError, match=why) as raised:
+        validate(content, "here")
+    assert "\n" not in str(raised.value)
+
+
+def test_short_names_are_names_of_what_can_be_changed(scenario: Scenario) -> None:
+    knobs = knobs_of(scenario)
+    for short in ("loss", "mansd", "beta", "alpha", "floor", "setpoint"):
+        assert full_key(short) in knobs
+    assert full_key("loss.p") == "network.loss.probability"
+    assert full_key("loss.mean_burst") == "network.loss.mean_burst"
+    assert full_key("trigger.beta") == "trigger.beta"
+
+
+def test_what_is_of_the_loss_alone() -> None:
+    assert is_of_loss_alone({"network.loss.probability": 0.1, "network.loss.model": "x"})
+    assert not is_of_loss_alone({"network.loss.probability": 0.1, "network.mansd": 1})
+
+
+def test_settings_are_recorded_in_full() -> None:
+    settings = {"network.loss": {"model": "lossless"}, "trigger.beta": 0.1 + 0.2}
+    data = settings_bytes(settings)
+    assert len(data) == CHANGE_BYTES
+    assert settings_of(data) == settings
+    assert text_of(settings) == 'network.loss = { model = "lossless" }, trigger.beta = 0.3'
+
+
+def test_a_later_change_that_is_told_first_builds_on_an_earlier_one(scenario: Scenario) -> None:
+    schedule = Schedule(scenario)
+    schedule.announce("t", Change(0, 200, {"trigger.beta": 0.1}), 0, 0, -1)
+    schedule.announce("t", Change(1, 100, {"network.mansd": 5}), 1, 0, -1)
+    assert schedule.next_ns == 100
+    assert schedule.take(99) is None
+    first, second = schedule.take(250), schedule.take(250)
+    assert first is not None
+    assert second is not None
+    assert (first.since_ns, first.scenario.network.mansd, first.scenario.decaying.beta) == (
+        100, 5, 0.5,
+    )  # fmt: skip
+    assert (second.scenario.network.mansd, second.scenario.decaying.beta) == (5, 0.1)
+    assert schedule.take(10**9) is None
+    assert schedule.next_ns is None
+    caps = [one.network.mansd for one in schedule.between(0, 150)]
+    assert caps == [2, 5]
+
+
+def test_what_is_heard_of_too_late_is_applied_late_and_said(scenario: Scenario) -> None:
+    schedule = Schedule(scenario)
+    record, notice = schedule.announce("t", Change(0, 100, {"trigger.beta": 0.1}), 7, 350, 300)
+    assert isinstance(record, Record)
+    assert isinstance(notice, Notice)
+    assert record.row[:5] == (7, 0, 100, 350, 301)
+    assert (notice.level, notice.t_ns) == ("violation", 301)
+    assert "too late" in notice.text
+
+
+def test_an_impossible_change_changes_nothing(scenario: Scenario) -> None:
+    schedule = Schedule(scenario)
+    with pytest.raises(CallerError):
+        schedule.announce("t", Change(0, 100, {"trigger.beta": -1.0}), 0, 0, -1)
+    assert schedule.next_ns is None
+    assert schedule.last is scenario

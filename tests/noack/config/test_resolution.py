@@ -1,0 +1,173 @@
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.config.named_models import lane_following
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load, validate
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+SEEDS = range(200)
+WIDTH_A = np.array([[0.1, 0.2], [0.0, 1e-9]])
+WIDTH_B = np.array([[0.05], [0.0]])
+
+
+@pytest.fixture
+def box(content: dict[str, Any]) -> dict[str, Any]:
+    """A scenario whose plant is drawn from a box around the double integrator."""
+    content["plant"] |= {
+        "draw": "uniform",
+        "uncertainty_A": WIDTH_A.tolist(),
+        "uncertainty_B": WIDTH_B.tolist(),
+        "initial_state": [1.0, -2.0],
+        "initial_state_halfwidth": [0.5, 0.0],
+    }
+    return content
+
+
+def resolved(content: dict[str, Any], **seeds: int) -> Scenario:
+    return resolve(validate(content | {"seeds": seeds}, "here"))
+
+
+def deviations(content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    """A − Â and B − B̂ of many draws, (seeds, rows, columns)."""
+    loops = [loop_of(resolved(content, plant=seed)) for seed in SEEDS]
+    A = np.array([loop.A - loop.A_model for loop in loops])
+    B = np.array([loop.B - loop.B_model for loop in loops])
+    return A, B
+
+
+def test_uniform_draws_fill_their_box_and_stay_inside(box: dict[str, Any]) -> None:
+    for deviation, width in zip(deviations(box), (WIDTH_A, WIDTH_B), strict=True):
+        # Â is at most 1 here: the sum Â + d, and the difference taken back, round to 2⁻⁵³ each.
+        assert (np.abs(deviation) <= width + 2.3e-16).all()
+        spread = width > 1e-6
+        # Of 200 draws, the farthest is within 5 % of each end but with probability 2 · 0.975^200.
+        assert (deviation.max(axis=0)[spread] > 0.95 * width[spread]).all()
+        assert (deviation.min(axis=0)[spread] < -0.95 * width[spread]).all()
+        assert (deviation[:, width == 0] == 0).all()
+
+
+def test_vertex_draws_are_corners_and_all_of_them_occur(box: dict[str, Any]) -> None:
+    box["plant"]["draw"] = "vertex"
+    corners = set()
+    for seed in SEEDS:
+        loop = loop_of(resolved(box, plant=seed))
+        for true, model, width in (
+            (loop.A, loop.A_model, WIDTH_A),
+            (loop.B, loop.B_model, WIDTH_B),
+        ):
+            assert ((true == model + width) | (true == model - width)).all()
+        corners.add((*(np.sign(loop.A - loop.A_model)[0]), np.sign(loop.B - loop.B_model)[0, 0]))
+    # Eight corners in 200 draws: one is missed with probability below 8 · (7/8)^200 = 2e-11.
+    assert len(corners) == 8
+
+
+def test_initial_states_fill_their_interval(box: dict[str, Any]) -> None:
+    x0 = np.array([loop_of(resolved(box, initial_state=seed)).x0 for seed in SEEDS])
+    assert (np.abs(x0[:, 0] - 1.0) <= 0.5).all()
+    assert x0[:, 0].max() > 1.475
+    assert x0[:, 0].min() < 0.525
+    assert (x0[:, 1] == -2.0).all()
+
+
+def test_the_same_seeds_give_the_same_scenario(box: dict[str, Any]) -> None:
+    assert resolved(box, plant=3, initial_state=4) == resolved(box, plant=3, initial_state=4)
+
+
+def test_seeds_are_independent_of_each_other(box: dict[str, Any]) -> None:
+    base = resolved(box, plant=3, initial_state=4, loss=5)
+    for other, plant_stays, state_stays in (
+        (resolved(box, plant=9, initial_state=4, loss=5), False, True),
+        (resolved(box, plant=3, initial_state=9, loss=5), True, False),
+        (resolved(box, plant=3, initial_state=4, loss=9), True, True),
+    ):
+        assert ((other.plant.A, other.plant.B) == (base.plant.A, base.plant.B)) is plant_stays
+        assert (other.plant.initial_state == base.plant.initial_state) is state_stays
+
+
+def test_widening_one_interval_leaves_the_other_draws_alone(box: dict[str, Any]) -> None:
+    before = loop_of(resolved(box, plant=3))
+    box["plant"]["uncertainty_A"][0][0] = 5.0
+    del box["plant"]["uncertainty_B"]
+    after = loop_of(resolved(box, plant=3))
+    assert (before.A != after.A).tolist() == [[True, False], [False, False]]
+    assert after.A[0, 0] == pytest.approx(before.A[0, 0] * 50, rel=1e-14)  # Â is 0 there
+    assert after.B.tolist() == after.B_model.tolist()
+
+
+def test_a_resolved_scenario_leaves_nothing_to_chance(box: dict[str, Any]) -> None:
+    once = resolved(box, plant=3, initial_state=4)
+    assert once.plant.draw == "given"
+    assert once.model.name is None
+    assert once.plant.initial_state_halfwidth is None
+    assert resolve(once) == once
+    other_seeds = once.model_copy(update={"seeds": resolved(box, plant=8, initial_state=8).seeds})
+    assert resolve(other_seeds).plant == once.plant
+
+
+@pytest.mark.parametrize("draw", ["nominal", "given"])
+def test_a_plant_that_is_not_drawn_is_what_the_file_says(
+    content: dict[str, Any], draw: str
+) -> None:
+    given = {"A": [[1.0, 2.0], [3.0, 4.0]], "B": [[5.0], [6.0]]} if draw == "given" else {}
+    content["plant"] |= {"draw": draw, **given}
+    loop = loop_of(resolved(content))
+    assert loop.A.tolist() == given.get("A", [[0.0, 1.0], [0.0, 0.0]])
+    assert loop.B.tolist() == given.get("B", [[0.0], [1.0]])
+    assert loop.A_model.tolist() == [[0.0, 1.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    ("mode", "H"), [("model", [[0.0, 1.0], [-1.0, -1.5]]), ("zoh", [[0.0, 0.0], [0.0, 0.0]])]
+)
+def test_the_models_integrate_the_nominal_closed_loop_or_hold(
+    content: dict[str, Any], mode: str, H: list[list[float]]
+) -> None:
+    content |= {"mode": mode}
+    content["plant"] |= {"draw": "given", "A": [[9.0, 9.0], [9.0, 9.0]], "B": [[9.0], [9.0]]}
+    loop = loop_of(resolved(content))
+    assert loop.H.tolist() == H
+    assert (loop.n, loop.m) == (2, 1)
+
+
+def test_names_are_the_models_or_made_up(content: dict[str, Any]) -> None:
+    def names() -> Sequence[Sequence[str]]:
+        loop = loop_of(resolved(content))
+        return loop.state_names, loop.input_names
+
+    assert names() == (("position", "velocity"), ("force",))
+    content["model"] |= {"state_names": ["s", "v"]}
+    assert names() == (("s", "v"), ("force",))
+    content["model"] = {"A": [[0.0]], "B": [[1.0, 2.0]], "gain": [[-1.0], [0.0]]}
+    content["plant"]["initial_state"] = [1.0]
+    assert names() == (("x_1",), ("u_1", "u_2"))
+
+
+def test_a_named_model_may_get_another_gain(content: dict[str, Any]) -> None:
+    content["model"] |= {"gain": [[-7.0, -8.0]], "parameters": {"stiffness": 3.0}}
+    assert loop_of(resolved(content)).K.tolist() == [[-7.0, -8.0]]
+    del content["model"]["gain"]
+    assert loop_of(resolved(content)).K.tolist() == [[-3.0, -1.5]]
+
+
+def test_the_shipped_lane_is_the_papers() -> None:
+    """Â, B̂, K, β, α, M − 1 and the box of Section V."""
+    scenario = load(SCENARIOS / "lane_following.toml")
+    loop, paper = loop_of(resolve(scenario)), lane_following({})
+    np.testing.assert_array_equal(loop.A_model, paper.A)
+    np.testing.assert_array_equal(loop.B_model, paper.B)
+    np.testing.assert_array_equal(loop.K, paper.K)
+    assert (scenario.trigger.beta, scenario.trigger.alpha_per_s) == (0.5, 0.25)
+    assert (scenario.trigger.floor, scenario.trigger.weight) == (0.0, None)
+    assert scenario.network.mansd == 4
+    # Only the six physical parameters are uncertain: a ∈ ±0.1, b ∈ ±0.05.
+    off_A, off_B = np.abs(loop.A - loop.A_model), np.abs(loop.B - loop.B_model)
+    assert ((off_A > 0) == (np.indices((4, 4)).max(axis=0) < 2)).all()
+    assert ((off_B > 0) == np.eye(4, 2, dtype=bool)).all()
+    assert off_A.max() <= 0.1 + 1e-14  # rounding beside 10.45
+    assert off_B.max() <= 0.05 + 1e-14

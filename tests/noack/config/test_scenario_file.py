@@ -1,0 +1,684 @@
+"""Every mistake in a scenario gets one line: file, key, value, and what would be right."""
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomli_w
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load, put, validate, value_of
+from noack.core.errors import CallerError
+
+SHIPPED = sorted((Path(__file__).parents[3] / "scenarios").glob("*.toml"))
+Content = dict[str, Any]
+
+LANE = """
+name = "lane"
+horizon_s = 20.0
+model = { name = "lane_following" }
+[plant]
+draw = "uniform"
+uncertainty_A = [[0.1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
+initial_state = [0.5, 0.0, 0.1, 3.0]
+[trigger]
+beta = 0.5
+alpha_per_s = 0.25
+[network]
+mansd = 4
+loss = { model = "bernoulli", probability = 0.8 }
+[ports]
+plant = 47001
+"""
+
+DOUBLE = """
+name = "double"
+horizon_s = 1.0
+model = { A = [[0, 1], [0, 0]], B = [[0], [1]], gain = [[-1, -1.5]] }
+plant = { initial_state = [1, 0] }
+trigger = { beta = 0.5, alpha_per_s = 0.25 }
+network = { mansd = 2, loss = { model = "worst_case" } }
+"""
+
+
+def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
+    """What a person is told about a scenario whose file says these ``key=value`` too."""
+    content = tomllib.loads(text)
+    for line in lines:
+        key, _, value = line.partition("=")
+        put(content, key, value_of(value, key), key)
+    return mistakes_with(tomli_w.dumps(content), folder, ())
+
+
+def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]:
+    """What a person is told who gives settings, with the file's name shortened to FILE."""
+    path = folder / "some.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(CallerError) as caught:
+        resolve(load(path, settings))
+    return str(caught.value).replace(str(path), "FILE").split("\n")
+
+
+@pytest.mark.parametrize("text", [LANE, DOUBLE], ids=["lane", "double"])
+def test_the_scenarios_that_are_spoilt_below_are_right(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "some.toml"
+    path.write_text(text)
+    resolve(load(path))
+
+
+# One setting each that spoils LANE: how its line begins after the file, and what it must go on to
+# say of the remedy.
+LANE_MISTAKES = [
+    # A key that nobody knows, at every level.
+    ("sped=2", "sped = 2: unknown key; ", "did you mean speed?"),
+    ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are certificate, .*, trigger"),
+    ("pland.rate_hz=9", 'pland = {"rate_hz": 9}: unknown key; ', "did you mean plant?"),
+    ("model.param.a11=2", 'model.param = {"a11": 2}: unknown key; ', "did you mean parameters?"),
+    ("plant.rate=100", "plant.rate = 100: unknown key; ", "did you mean rate_hz?"),
+    ("trigger.bta=1", "trigger.bta = 1: unknown key; ", "did you mean beta?"),
+    ("trigger.alpha=1", "trigger.alpha = 1: unknown key; ", "did you mean alpha_per_s?"),
+    ("network.mandsd=1", "network.mandsd = 1: unknown key; ", "did you mean mansd?"),
+    ("network.lossless=true", "network.lossless = true: unknown key; ", "loss"),
+    ("network.bernoulli=0.5", "network.bernoulli = 0.5: unknown key; ", "loss"),
+    ("network.loss.p=0.5", "network.loss.p = 0.5: unknown key; ", "model, probability"),
+    ("network.loss.prob=0.5", "network.loss.prob = 0.5: unknown key; ", "probability"),
+    ("controller.rate=9", "controller.rate = 9: unknown key; ", "did you mean rate_hz?"),
+    ("seeds.losses=9", "seeds.losses = 9: unknown key; ", "did you mean loss?"),
+    ("ports.recorder=9", "ports.recorder = 9: unknown key; ", "control, controller, netem"),
+    ("realtime.spin=9", "realtime.spin = 9: unknown key; ", "did you mean spin_us?"),
+    ("model.parameters.a13=1", "model.parameters.a13 = 1: ", "a11, a12, a21, a22, b1, b2"),
+    ("plant.watchdog.timeout=1", "plant.watchdog.timeout = 1: unknown key; ", "timeout_s"),
+    ("plant.watchdog.policy=off", 'plant.watchdog.policy = "off": ', "hold.*zero.*model"),
+    ("plant.watchdog.timeout_s=0", "plant.watchdog.timeout_s = 0: ", "greater than 0"),
+    (
+        "plant.watchdog.timeout_s=0.001",
+        "plant.watchdog.timeout_s = 0.001: ",
+        "shorter than a period of the controller .0.002 s.",
+    ),
+    (
+        "controller.safe_input=[1.0]",
+        "controller.safe_input = [1.0]: ",
+        "expected 2 entries .one per input., found 1",
+    ),
+    # Types.
+    ("horizon_s=20 s", 'horizon_s = "20 s": ', "should be a valid number"),
+    ("trigger.beta=true", "trigger.beta = true: ", "should be a valid number"),
+    ('trigger.beta="0.3"', 'trigger.beta = "0.3": ', "should be a valid number"),
+    ("trigger.beta=[1]", "trigger.beta = [1]: ", "should be a valid number"),
+    ("trigger.beta=", 'trigger.beta = "": ', "should be a valid number"),
+    ("network.mansd=4.0", "network.mansd = 4.0: ", "should be a valid integer"),
+    ("network.mansd=true", "network.mansd = true: ", "should be a valid integer"),
+    ("network.mansd=four", 'network.mansd = "four": ', "should be a valid integer"),
+    ("network.enforce_mansd=0", "network.enforce_mansd = 0: ", "should be a valid boolean"),
+    ("seeds.loss=1.5", "seeds.loss = 1.5: ", "should be a valid integer"),
+    ("name=3", "name = 3: ", "should be a valid string"),
+    ("plant.initial_state=3", "plant.initial_state = 3: ", "should be a list"),
+    (
+        'plant.initial_state=[1,2,"x",4]',
+        'plant.initial_state.2 = "x": ',
+        "should be a valid number",
+    ),
+    ("plant.initial_state=[1,2,3,true]", "plant.initial_state.3 = true: ", "valid number"),
+    ('model.parameters.a11="x"', 'model.parameters.a11 = "x": ', "should be a valid number"),
+    ("trigger=3", "trigger = 3: ", "table|object"),
+    ("trigger=[1,2]", "trigger = [1, 2]: ", "table|object"),
+    ("network.loss=bernoulli", 'network.loss = "bernoulli": ', "table|object"),
+    ("trigger.weight=3", "trigger.weight = 3: ", "should be a list"),
+    ("trigger.weight=[3]", "trigger.weight.0 = 3: ", "should be a list"),
+    ("trigger.weight=[]", "trigger.weight = []: ", "at least (1|one)"),
+    ("trigger.weight=[[]]", "trigger.weight.0 = []: ", "at least (1|one)"),
+    ("trigger.weight=[[1],[true]]", "trigger.weight.1.0 = true: ", "should be a valid number"),
+    # Choices.
+    ("mode=modl", 'mode = "modl": ', "should be 'model' or 'zoh'"),
+    ("mode=ZOH", 'mode = "ZOH": ', "should be 'model' or 'zoh'"),
+    ("plant.draw=corner", 'plant.draw = "corner": ', "'nominal', 'uniform', 'vertex' or 'given'"),
+    ("trigger.policy=decayin", 'trigger.policy = "decayin": ', "did you mean decaying?"),
+    ("network.initial_sync=0", "network.initial_sync = 0: ", "'first_packet' or 'known_state'"),
+    ("model.name=lane", 'model.name = "lane": ', "'single_track_lane' or 'double_integrator'"),
+    ("network.loss.model=bernouli", 'network.loss.model = "bernouli": ', "did you mean bernoulli?"),
+    ("network.loss.model=3", "network.loss.model = 3: ", "one of .*bernoulli"),
+    ("network.loss={}", "network.loss.model: missing; ", "one of .*bernoulli"),
+    ("network.loss={probability=1}", "network.loss.model: missing; ", "one of .*bernoulli"),
+    # Impairments are a list of tables, each chosen by its kind, with a loss model within a loss.
+    ("network.impairments=3", "network.impairments = 3: ", "should be a list"),
+    ("network.impairments=[3]", "network.impairments.0 = 3: ", 'e.g. { kind = "duplicate", proba'),
+    ("network.impairments=[{}]", "network.impairments.0.kind: missing; ", "one of loss, duplicate"),
+    (
+        'network.impairments=[{kind="dely"}]',
+        'network.impairments.0.kind = "dely": must be one of loss, ',
+        "did you mean delay?",
+    ),
+    (
+        'network.impairments=[{kind="delay",delay_ms=5}]',
+        "network.impairments.0.delay_ms = 5: unknown key; ",
+        "did you mean delay_s?",
+    ),
+    (
+        'network.impairments=[{kind="delay",delay_s=-1}]',
+        "network.impairments.0.delay_s = -1: ",
+        "should be greater than or equal to 0",
+    ),
+    (
+        'network.impairments=[{kind="delay",distribution="empirical"}]',
+        "network.impairments.0.samples_s: ",
+        "an empirical distribution needs samples_s, or a file",
+    ),
+    (
+        'network.impairments=[{kind="delay",distribution="empirical",samples_s=[0.1]}]',
+        "network.impairments.0.samples_s = [0.1]: ",
+        "needs at least 2 entries",
+    ),
+    (
+        'network.impairments=[{kind="rate"}]',
+        "network.impairments.0.rate_bps: missing ",
+        r"\(bits per second\)",
+    ),
+    ('network.impairments=[{kind="loss"}]', "network.impairments.0.loss: missing ", "loss model"),
+    (
+        'network.impairments=[{kind="loss",loss="x"}]',
+        'network.impairments.0.loss = "x": should be a table, ',
+        'e.g. { model = "bernoulli", probability = ... }',
+    ),
+    (
+        'network.impairments=[{kind="duplicate",probability=0},{kind="loss",loss={model="x"}}]',
+        'network.impairments.1.loss.model = "x": ',
+        "must be one of lossless, bernoulli",
+    ),
+    (
+        'network.impairments=[{kind="loss",loss={model="bernoulli",probability=2}}]',
+        "network.impairments.0.loss.probability = 2: ",
+        "less than or equal to 1",
+    ),
+    (
+        'network.impairments=[{kind="loss",loss={model="bernoulli",prob=0.5,probability=0}}]',
+        "network.impairments.0.loss.prob = 0.5: unknown key; ",
+        "correlation, model, probability",
+    ),
+    (
+        'network.impairments=[{kind="loss",loss={model="periodic",period=2,burst=3}}]',
+        "network.impairments.0.loss.burst = 3: ",
+        "must not exceed the period, 2",
+    ),
+    (
+        'network.impairments=[{kind="blackout",intervals_s=[[3.0,2.0]]}]',
+        "network.impairments.0.intervals_s = [[3.0, 2.0]]: ",
+        "each must end after it begins",
+    ),
+    (
+        'network={mansd=1,loss={model="worst_case"},impairments=[{kind="delay",loss_correlation=1}]}',
+        "network.impairments.0.loss_correlation = 1: ",
+        "needs a loss before it, by model bernoulli or gilbert_elliott",
+    ),
+    ("network.limit=0", "network.limit = 0: ", "greater than or equal to 1"),
+    ("name=lane following", 'name = "lane following": ', "A-Za-z0-9|letters"),
+    ("name=../../etc", 'name = "../../etc": ', "A-Za-z0-9|letters"),
+    ("name=", 'name = "": ', "A-Za-z0-9|letters"),
+    # Ranges.
+    ("horizon_s=0", "horizon_s = 0: ", "should be greater than 0"),
+    ("horizon_s=-1", "horizon_s = -1: ", "should be greater than 0"),
+    ("horizon_s=0.001", "horizon_s = 0.001: ", r"one plant step \(0.002 s\)"),
+    ("horizon_s=1e8", "horizon_s = 100000000.0: ", "less than or equal to 1e7|10000000"),
+    ("speed=0", "speed = 0: ", "should be greater than 0"),
+    ("speed=1e9", "speed = 1000000000.0: ", "less than or equal to 1000"),
+    ("trigger.beta=-1", "trigger.beta = -1: ", "should be greater than 0"),
+    ("trigger.beta=0", "trigger.beta = 0: ", "should be greater than 0"),
+    ("trigger.alpha_per_s=0", "trigger.alpha_per_s = 0: ", "should be greater than 0"),
+    ("trigger.floor=-0.1", "trigger.floor = -0.1: ", "greater than or equal to 0"),
+    ("network.mansd=-1", "network.mansd = -1: ", "greater than or equal to 0"),
+    ("network.loss.probability=1.5", "network.loss.probability = 1.5: ", "less than or equal to 1"),
+    ("network.loss.probability=-0.5", "network.loss.probability = -0.5: ", "or equal to 0"),
+    ("plant.measure_every=0", "plant.measure_every = 0: ", "greater than or equal to 1"),
+    ("plant.rate_hz=0", "plant.rate_hz = 0: ", "should be greater than 0"),
+    ("plant.rate_hz=5e-324", "plant.rate_hz = 5e-324: ", "must be at least 1e-09"),
+    ("controller.rate_hz=1e-10", "controller.rate_hz = 1e-10: ", "must be at least 1e-09"),
+    ("plant.rate_hz=1e6", "plant.rate_hz = 1000000.0: ", "less than or equal to 100000"),
+    ("controller.phase=1", "controller.phase = 1: ", "should be less than 1"),
+    ("seeds.plant=-1", "seeds.plant = -1: ", "greater than or equal to 0"),
+    ("seeds.loss=18446744073709551616", "seeds.loss = 18446744073709551616: ", "less than"),
+    ("ports.netem=70000", "ports.netem = 70000: ", "less than or equal to 65535"),
+    ("ports.netem=47001", "ports.netem = 47001: ", "already given to plant"),
+    ("realtime.fifo_priority=99", "realtime.fifo_priority = 99: ", "less than or equal to 98"),
+    ("realtime.spin_us=-1", "realtime.spin_us = -1: ", "greater than or equal to 0"),
+    # Not numbers to count with.
+    ("horizon_s=nan", "horizon_s = NaN: ", "finite|greater than 0"),
+    ("horizon_s=inf", "horizon_s = Infinity: ", "finite"),
+    ("trigger.beta=nan", "trigger.beta = NaN: ", "finite|greater than 0"),
+    ("trigger.beta=inf", "trigger.beta = Infinity: ", "finite"),
+    ("trigger.alpha_per_s=inf", "trigger.alpha_per_s = Infinity: ", "finite"),
+    ("trigger.floor=inf", "trigger.floor = Infinity: ", "finite"),
+    ("plant.initial_state=[1,2,3,inf]", "plant.initial_state.3 = Infinity: ", "finite"),
+    ("model.parameters.a11=nan", "model.parameters.a11 = NaN: ", "finite"),
+    ("trigger.weight=[[nan]]", "trigger.weight.0.0 = NaN: ", "finite"),
+    # Rates whose period is no whole number of nanoseconds; the remedy is a rate that has one.
+    ("plant.rate_hz=300", "plant.rate_hz = 300: ", r"whole .* 300\.000030000003"),
+    ("controller.rate_hz=60", "controller.rate_hz = 60: ", r"whole .* 59\.9999988"),
+    # Shapes, which only model and plant together tell.
+    ("plant.initial_state=[1,2,3]", "plant.initial_state = [1, 2, 3]: ", "4 entries.*found 3"),
+    (
+        "plant.initial_state_halfwidth=[1,2]",
+        "plant.initial_state_halfwidth = [1, 2]: ",
+        "4 entries.*found 2",
+    ),
+    (
+        "plant.initial_state_halfwidth=[1,2,3,-1]",
+        "plant.initial_state_halfwidth = [1, 2, 3, -1]: ",
+        "half-widths cannot be negative",
+    ),
+    (
+        "plant.uncertainty_A=[[1,2],[3,4]]",
+        "plant.uncertainty_A = [[1, 2], [3, 4]]: ",
+        "expected 4 x 4 .*found 2 x 2",
+    ),
+    (
+        "plant.uncertainty_A=[[1,2],[3]]",
+        "plant.uncertainty_A = [[1, 2], [3]]: ",
+        "all rows need the same length, found lengths",
+    ),
+    (
+        "plant.uncertainty_B=[[1],[2],[3],[4]]",
+        "plant.uncertainty_B = [[1], [2], [3], [4]]: ",
+        "expected 4 x 2 .*found 4 x 1",
+    ),
+    (
+        "plant.uncertainty_B=[[-1,0]]",
+        "plant.uncertainty_B = [[-1, 0]]: ",
+        "half-widths cannot be negative",
+    ),
+    (
+        "trigger.weight=[[1,0],[0,1]]",
+        "trigger.weight = [[1, 0], [0, 1]]: ",
+        "expected 4 x 4 .*found 2 x 2",
+    ),
+    (
+        "trigger.weight=[[1,0,0,0],[0,1,0,0],[0,0,1,0],[1,1,1,0]]",
+        "trigger.weight = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 1, 1, 0]]: ",
+        "W must be invertible",
+    ),
+    ("model.gain=[[1,2,3,4]]", "model.gain = [[1, 2, 3, 4]]: ", "expected 2 x 4 .*found 1 x 4"),
+    ("model.gain=[[1,2],[3]]", "model.gain = [[1, 2], [3]]: ", "all rows need the same length"),
+    ('model.state_names=["a"]', 'model.state_names = ["a"]: ', "expected 4 entries .*, found 1"),
+    ('model.input_names=["a"]', 'model.input_names = ["a"]: ', "expected 2 entries .*, found 1"),
+    # What goes together.
+    ("plant.draw=given", "plant.A: ", 'draw = "given" needs both matrices A and B'),
+    ("plant.A=[[1]]", "plant.A = [[1]]: ", 'matrices are for draw = "given", not .*"uniform"'),
+    ("model.A=[[1]]", 'model.name = "lane_following": ', "give one or the other"),
+    # A gain that does not stabilise.
+    ("model.parameters.gain=-1.0", 'model.parameters = {"gain": -1.0}: ', "u = -K x does: give -K"),
+    ("model.gain=[[0,0,0,0],[0,0,0,0]]", "model.gain = ", "all eigenvalues of A . BK have neg"),
+    # Numbers that the named model cannot use.
+    ("model.parameters.look_ahead=0", "model.parameters.look_ahead = 0: ", "zero|0"),
+]
+
+
+def assert_told(lines: list[str], begins: str, remedy: str) -> None:
+    (line,) = lines
+    assert line.startswith(f"FILE: {begins}"), line
+    assert re.search(remedy, line.removeprefix(f"FILE: {begins}")), line
+
+
+@pytest.mark.parametrize(
+    ("setting", "begins", "remedy"), LANE_MISTAKES, ids=[mistake[0] for mistake in LANE_MISTAKES]
+)
+def test_a_mistake_gets_one_line(setting: str, begins: str, remedy: str, tmp_path: Path) -> None:
+    assert_told(mistakes(LANE, tmp_path, [setting]), begins, remedy)
+
+
+# The same for DOUBLE, whose model is given by its matrices.
+DOUBLE_MISTAKES = [
+    ("model.A=[[0,1]]", "model.A = [[0, 1]]: ", "1 x 1 .*square.*found 1 x 2"),
+    ("model.A=[[0,1],[0]]", "model.A = [[0, 1], [0]]: ", r"same length, found lengths \[1, 2\]"),
+    ("model.B=[[0]]", "model.B = [[0]]: ", r"expected 2 x 1 \(one row per state\), found 1 x 1"),
+    ("model.gain=[[1],[1]]", "model.gain = [[1], [1]]: ", "expected 1 x 2 .*found 2 x 1"),
+    ('model.state_names=["p"]', 'model.state_names = ["p"]: ', "expected 2 entries .*, found 1"),
+    (
+        'model.input_names=["f","g"]',
+        'model.input_names = ["f", "g"]: ',
+        "expected 1 entries .*, found 2",
+    ),
+    (
+        "model.gain=[[1,1.5]]",
+        "model.gain = [[1, 1.5]]: ",
+        "real part 2 /s; u = -K x does: give -K",
+    ),
+    (
+        "model.gain=[[0,-1.5]]",
+        "model.gain = [[0, -1.5]]: ",
+        "real part 0 /s.*allow_unstable = true",
+    ),
+    (
+        "model={A=[[-1,0],[0,-1]],B=[[1e200],[1]],gain=[[1e200,0]]}",
+        "model.gain = [[1e+200, 0]]: ",
+        "infinite entries; check the units",
+    ),
+    ("model.parameters.a=1", 'model.parameters = {"a": 1}: ', "only a named model has parameters"),
+    ("model={}", "model.A: ", r"missing: A, B, gain"),
+    ("model={A=[[0]],B=[[1]]}", "model.gain: ", r"missing: gain"),
+    ("plant.draw=uniform", "plant.uncertainty_A: ", "needs uncertainty_A or uncertainty_B"),
+    ("plant.draw=vertex", "plant.uncertainty_A: ", "needs uncertainty_A or uncertainty_B"),
+    (
+        'plant={draw="given",A=[[1]],B=[[1],[1]],initial_state=[1,0]}',
+        "plant.A = [[1]]: ",
+        "expected 2 x 2 .*found 1 x 1",
+    ),
+    (
+        'plant={draw="given",A=[[1,0],[0,1]],B=[[1]],initial_state=[1,0]}',
+        "plant.B = [[1]]: ",
+        "expected 2 x 1 .*found 1 x 1",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("setting", "begins", "remedy"),
+    DOUBLE_MISTAKES,
+    ids=[mistake[0] for mistake in DOUBLE_MISTAKES],
+)
+def test_a_mistake_in_given_matrices_gets_one_line(
+    setting: str, begins: str, remedy: str, tmp_path: Path
+) -> None:
+    assert_told(mistakes(DOUBLE, tmp_path, [setting]), begins, remedy)
+
+
+@pytest.mark.parametrize(
+    ("loss", "begins", "others"),
+    [
+        (
+            '{model="bernoulli",probability=0.3,good_to_bad=0.1}',
+            "good_to_bad = 0.1: unknown key; ",
+            ["good_to_bad", "loss_in_bad"],
+        ),
+        (
+            '{model="lossless",probability=0.3}',
+            "probability = 0.3: unknown key; ",
+            ["probability", "good_to_bad"],
+        ),
+        ('{model="worst_case",x=1}', "x = 1: unknown key; ", ["probability", "good_to_bad"]),
+        ('{model="bernoulli"}', "probability: missing ", ["good_to_bad", "loss_in_bad"]),
+    ],
+)
+def test_only_the_chosen_loss_models_keys_are_proposed(
+    loss: str, begins: str, others: list[str], tmp_path: Path
+) -> None:
+    begins = f"network.loss.{begins}"
+    lines = mistakes(LANE, tmp_path, [f"network.loss={loss}"])
+    assert_told(lines, begins, "model|probability")
+    remedy = lines[0].removeprefix(f"FILE: {begins}")
+    assert [other for other in others if re.search(rf"\b{other}\b", remedy)] == []
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "name",
+        "horizon_s",
+        "model",
+        "plant",
+        "trigger",
+        "network",
+        "plant.initial_state",
+        "trigger.beta",
+        "trigger.alpha_per_s",
+        "network.mansd",
+        "network.loss",
+    ],
+)
+def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> None:
+    *path, last = key.split(".")
+    section = content
+    for part in path:
+        section = section[part]
+    del section[last]
+    (line,) = mistakes(tomli_w.dumps(content), tmp_path)
+    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)  # what it is for
+
+
+@pytest.mark.parametrize(
+    ("key", "begins"),
+    [("network.mansd", "M − 1, the "), ("network.loss", "what is lost, ")],
+)
+def test_what_a_missing_key_is_for_begins_as_in_a_sentence(
+    content: Content, key: str, begins: str, tmp_path: Path
+) -> None:
+    section, last = key.split(".")
+    del content[section][last]
+    (line,) = mistakes(tomli_w.dumps(content), tmp_path)
+    assert line.partition("(")[2].startswith(begins), line
+
+
+def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
+    settings = ["mode=x", "plant.rate=1", "trigger.beta=-1", "network.loss.probability=2"]
+    lines = mistakes(LANE, tmp_path, settings)
+    assert [line.partition(" = ")[0] for line in lines] == [
+        "FILE: mode",
+        "FILE: plant.rate",
+        "FILE: trigger.beta",
+        "FILE: network.loss.probability",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (["trigger.beta=-1"], ["--set trigger.beta = -1: should be greater than 0"]),
+        (["network.loss={model='bernoulli'}"], ["--set network.loss.probability: missing "]),
+        (["trigger.bet=1"], ["--set trigger.bet = 1: unknown key; did you mean beta?"]),
+        (["plant.initial_state=[1,2]"], ["--set plant.initial_state = [1, 2]: "]),
+        (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
+        (["trigger.beta=1"], ["FILE: name = 1: "]),  # nothing is wrong with what was set
+        # The file alone is right, but not with what was set.
+        (["model.A=[[1]]"], ['FILE with --set model.A: model.name = "lane_following": ']),
+        (
+            ["horizon_s=3", 'network.loss.model="gilbert_elliott"', "network.mansd=9"],
+            ["FILE with --set network.loss.model: network.loss.probability = 0.8: unknown key; "],
+        ),
+        (["mode=zoh", "observer.kind=kalman"], ["FILE with --set observer.kind: observer."]),
+    ],
+)
+def test_what_is_wrong_with_a_setting_is_not_said_of_the_file(
+    settings: list[str], told: list[str], tmp_path: Path
+) -> None:
+    name = "1" if told[0].startswith("FILE: ") else '"lane"'
+    text = LANE.replace('name = "lane"', f"name = {name}", 1)
+    lines = mistakes_with(text, tmp_path, settings)
+    assert len(lines) == len(told)
+    for line, begins in zip(lines, told, strict=True):
+        assert line.startswith(begins), line
+
+
+def test_an_empty_file_lacks_everything_that_is_required(tmp_path: Path) -> None:
+    lines = mistakes("", tmp_path)
+    assert [line.split(": ")[1] for line in lines] == [
+        "name",
+        "horizon_s",
+        "model",
+        "plant",
+        "trigger",
+        "network",
+    ]
+
+
+def test_a_long_value_is_cut_short(tmp_path: Path) -> None:
+    (line,) = mistakes(LANE, tmp_path, [f'mode="{"x" * 500}"'])
+    assert len(line) < 200
+    assert "xxx..." in line
+    assert "should be 'model' or 'zoh'" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("name = \n", "Invalid value (at line 1, column 8)"),
+        ("name = 'a'\nname = 'b'\n", "line 2"),
+        ("[plant\n", "line 1"),
+        ("just words", "line 1"),
+    ],
+)
+def test_text_that_is_not_toml_is_told_by_line(text: str, says: str, tmp_path: Path) -> None:
+    (line,) = mistakes_with(text, tmp_path, ())
+    assert line.startswith("FILE: not valid TOML: ")
+    assert says in line
+
+
+def test_a_missing_file_is_told_with_its_neighbours(tmp_path: Path) -> None:
+    (tmp_path / "lane.toml").write_text(LANE)
+    with pytest.raises(CallerError) as caught:
+        load(tmp_path / "lan.toml")
+    assert str(caught.value) == f"{tmp_path}/lan.toml: no such file; there are {tmp_path}/lane.toml"
+    with pytest.raises(CallerError) as caught:
+        load(tmp_path / "nowhere" / "lan.toml")
+    assert str(caught.value) == f"{tmp_path}/nowhere/lan.toml: no such file"
+
+
+def test_what_cannot_be_read_as_text_is_told(tmp_path: Path) -> None:
+    (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
+    for path in (tmp_path, tmp_path / "bytes.toml"):
+        with pytest.raises(CallerError, match=r"^[^\n]*: cannot be read: [^\n]*$"):
+            load(path)
+
+
+@pytest.mark.parametrize(
+    ("setting", "read"),
+    [
+        ("trigger.beta=0.3", lambda s: s.trigger.beta == 0.3),
+        (" trigger.beta = 0.3 ", lambda s: s.trigger.beta == 0.3),
+        ("trigger.beta=1", lambda s: s.trigger.beta == 1.0),
+        ("mode=zoh", lambda s: s.mode == "zoh"),
+        ('mode="zoh"', lambda s: s.mode == "zoh"),
+        ("description=a = b", lambda s: s.description == "a = b"),
+        ("network.enforce_mansd=false", lambda s: s.network.enforce_mansd is False),
+        ("plant.initial_state=[1, 2, 3, 4]", lambda s: s.plant.initial_state == (1, 2, 3, 4)),
+        ('network.loss={model="worst_case"}', lambda s: s.network.loss.model == "worst_case"),
+        ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that the file does not have
+        ("realtime.enabled=false", lambda s: not s.realtime.enabled),
+    ],
+)
+def test_settings_replace_values_of_the_file(
+    setting: str, read: Callable[[Scenario], bool], tmp_path: Path
+) -> None:
+    path = tmp_path / "some.toml"
+    path.write_text(LANE)
+    assert not read(load(path))
+    changed = load(path, [setting])
+    assert read(changed)
+    assert changed.ports == load(path).ports  # the rest stays
+
+
+def test_the_last_setting_of_a_key_counts(tmp_path: Path) -> None:
+    path = tmp_path / "some.toml"
+    path.write_text(LANE)
+    assert load(path, ["speed=2", "speed=3"]).speed == 3
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("trigger.beta", "--set trigger.beta: write it as key=value, e.g. trigger.beta=0.3"),
+        ("=3", "--set =3: write it as key=value, e.g. trigger.beta=0.3"),
+        (" =3", "--set  =3: write it as key=value, e.g. trigger.beta=0.3"),
+        ("trigger.beta.x=1", "--set trigger.beta.x=1: beta is not a table"),
+        (
+            "plant.initial_state=[1,2",
+            "--set plant.initial_state: not valid TOML: Unclosed array (at end of document)",
+        ),
+        ('mode="zoh', "--set mode: not valid TOML: Unterminated string (at end of document)"),
+        (
+            "plant.initial_state.0=1",
+            "--set plant.initial_state.0=1: initial_state is not a table "
+            "(a list is set as a whole)",
+        ),
+    ],
+)
+def test_a_setting_that_cannot_be_applied_is_told(setting: str, says: str, tmp_path: Path) -> None:
+    assert mistakes_with(LANE, tmp_path, [setting]) == [says]
+
+
+def test_only_the_sources_name_goes_into_the_message(content: Content) -> None:
+    content["speed"] = -1
+    with pytest.raises(CallerError, match=r"^run 7/scenario\.toml: speed = -1: "):
+        validate(content, "run 7/scenario.toml")
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_scenarios_survive_being_written_and_read(path: Path, tmp_path: Path) -> None:
+    resolved = resolve(load(path))
+    for scenario in (load(path), resolved):
+        copy = tmp_path / "copy.toml"
+        copy.write_text(dumps(scenario), encoding="utf-8")
+        assert load(copy) == scenario
+    assert resolve(load(copy)) == resolved
+
+
+numbers = st.floats(-1e3, 1e3)  # a step of larger ones may reach infinity
+
+
+@st.composite
+def contents(draw: st.DrawFn) -> Content:
+    n, m = draw(st.integers(1, 4)), draw(st.integers(1, 2))
+
+    def rows(r: int, c: int, entries: st.SearchStrategy[float] = numbers) -> list[list[float]]:
+        row = st.lists(entries, min_size=c, max_size=c)
+        return draw(st.lists(row, min_size=r, max_size=r))
+
+    plant: Content = {"draw": draw(st.sampled_from(["nominal", "uniform", "vertex", "given"]))}
+    if plant["draw"] == "given":
+        plant |= {"A": rows(n, n), "B": rows(n, m)}
+    else:
+        plant |= {
+            "uncertainty_A": rows(n, n, st.floats(0, 1e3)),
+            "uncertainty_B": rows(n, m, st.floats(0, 1)),
+        }
+    plant["initial_state"] = rows(1, n)[0]
+    return {
+        "name": draw(st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", fullmatch=True)),
+        "description": draw(st.text(st.characters(codec="utf-8"))),
+        "mode": draw(st.sampled_from(["model", "zoh"])),
+        "horizon_s": draw(st.floats(0.01, 1e7)),
+        "speed": draw(st.floats(1e-6, 1000)),
+        "model": {
+            "A": rows(n, n),
+            "B": rows(n, m),
+            "gain": rows(m, n, st.floats(-1, 1)),
+            "allow_unstable": True,
+            "state_names": [draw(st.text(st.characters(codec="utf-8"))) for _ in range(n)],
+        },
+        "plant": plant,
+        "trigger": {
+            "beta": draw(st.floats(5e-324, 1e300)),
+            "alpha_per_s": draw(st.floats(1e-9, 1e9)),
+            "weight": [[2.0 * (i == j) for j in range(n)] for i in range(n)],
+        },
+        "network": {
+            "mansd": draw(st.integers(0, 1_000_000)),
+            "loss": draw(
+                st.sampled_from(
+                    [
+                        {"model": "lossless"},
+                        {"model": "worst_case"},
+                        {"model": "bernoulli", "probability": 1 / 3},
+                        {"model": "gilbert_elliott", "good_to_bad": 0.1, "bad_to_good": 0.7},
+                    ]
+                )
+            ),
+        },
+        "seeds": {"plant": draw(st.integers(0, 2**64 - 1))},
+    }
+
+
+@given(contents())
+def test_any_scenario_survives_being_resolved_written_and_read(content: Content) -> None:
+    scenario = validate(content, "here")
+    resolved = resolve(scenario)
+    for one in (scenario, resolved):
+        text = dumps(one)
+        assert validate(tomllib.loads(text), "there") == one
+    assert resolve(resolved) == resolved
+    assert math.isfinite(sum(resolved.plant.initial_state))
+    assert json.loads(resolved.model_dump_json()) == resolved.model_dump(mode="json")

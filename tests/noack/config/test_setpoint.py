@@ -1,0 +1,76 @@
+"""Set-points: where a model can rest, by hand and against a solver."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.config.resolution import loop_of, resolve
+from noack.config.scenario_file import dumps, validate
+from noack.config.setpoint import input_at
+from noack.core.errors import CallerError
+
+A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+
+
+def test_a_mass_rests_anywhere_without_a_force() -> None:
+    assert input_at(A_DOUBLE, B_DOUBLE, np.array([3.5, 0.0])).tolist() == [0.0]
+
+
+def test_a_spring_wants_the_force_that_holds_it() -> None:
+    A = np.array([[0.0, 1.0], [-2.0, -0.1]])
+    assert input_at(A, B_DOUBLE, np.array([3.0, 0.0])) == pytest.approx([6.0])
+
+
+def test_what_moves_does_not_rest_and_the_nearest_that_does_is_named() -> None:
+    with pytest.raises(ValueError, match=r"dimension 1, and the nearest one is \[2, 0\]"):
+        input_at(A_DOUBLE, B_DOUBLE, np.array([2.0, 1.0]))
+
+
+def test_a_model_may_rest_nowhere_else() -> None:
+    with pytest.raises(ValueError, match="none but 0"):
+        input_at(np.array([[1.0]]), np.zeros((1, 1)), np.array([1.0]))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 6)), int(rng.integers(1, 4))
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    x_r, u_r = rng.normal(size=n), rng.normal(size=m)
+    A -= np.outer(A @ x_r + B @ u_r, x_r) / (x_r @ x_r)
+    found = input_at(A, B, x_r)
+    assert A @ x_r + B @ found == pytest.approx(np.zeros(n), abs=1e-9 * np.abs(A).max() * 10)
+
+
+@pytest.mark.parametrize(
+    ("controller", "more", "why"),
+    [
+        ({"setpoint": [1.0, 2.0]}, {}, r"controller.setpoint.*nearest one is \[1, 0\]"),
+        ({"setpoint": [1.0]}, {}, "controller.setpoint"),
+        ({"setpoint": [1.0, 0.0]}, {"protocol": "ack"}, "not with network.protocol"),
+    ],
+)
+def test_a_mistaken_set_point_is_one_line(
+    content: dict[str, Any], controller: dict[str, Any], more: dict[str, Any], why: str
+) -> None:
+    content["controller"] = controller
+    content["network"] |= more
+    with pytest.raises(CallerError, match=why) as raised:
+        validate(content, "here")
+    assert "\n" not in str(raised.value)
+
+
+def test_the_loop_of_a_scenario_has_it(content: dict[str, Any]) -> None:
+    content["controller"] = {"setpoint": [2.0, 0.0]}
+    scenario = validate(content, "here")
+    loop = loop_of(resolve(scenario))
+    assert loop.setpoint is not None
+    assert loop.setpoint_input is not None
+    assert loop.setpoint.tolist() == [2.0, 0.0]
+    assert loop.setpoint_input.tolist() == [0.0]
+    assert "setpoint" in dumps(scenario)
+    content["controller"] = {"setpoint": [0.0, 0.0]}
+    assert loop_of(resolve(validate(content, "here"))).setpoint is None

@@ -1,0 +1,105 @@
+"""Models from objects of python-control and SciPy."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from noack.config.matrix_files import read_matrices
+from noack.config.named_file import NamedFile
+from noack.config.sections.model_section import Model
+from noack.config.state_space import model_of, save_model
+from noack.core.errors import CallerError
+
+A = np.array([[0.0, 1.0], [4.0, 0.0]])
+B = np.array([[0.0], [1.0]])
+C, D = np.eye(2), np.zeros((2, 1))
+K = np.array([[-8.0, -4.0]])
+EXPECTED = Model(A=((0.0, 1.0), (4.0, 0.0)), B=((0.0,), (1.0,)), gain=((-8.0, -4.0),))
+
+
+def control_object(**names: Any) -> Any:
+    control = pytest.importorskip("control")
+    return control.ss(A, B, C, D, **names)
+
+
+def systems() -> dict[str, Any]:
+    return {
+        "two": (A, B),
+        "four": (A, B, C, D),
+        "lists": (A.tolist(), B.tolist()),
+        "scipy": signal.StateSpace(A, B, C, D),
+        "lti": signal.lti(A, B, C, D),
+    }
+
+
+@pytest.mark.parametrize("name", systems())
+def test_a_system_of_scipy_or_a_tuple_is_a_model(name: str) -> None:
+    assert model_of(systems()[name], K) == EXPECTED
+
+
+def test_a_system_of_python_control_is_a_model_with_its_names() -> None:
+    assert model_of(control_object(), K) == EXPECTED
+    named = control_object(states=["angle", "rate"], inputs=["torque"], outputs=["a", "r"])
+    model = model_of(named, K)
+    assert (model.state_names, model.input_names) == (("angle", "rate"), ("torque",))
+    assert model_of(named, K, state_names=["p", "q"]).state_names == ("p", "q")
+
+
+def test_a_gain_of_lqr_is_of_the_opposite_sign_and_refused_as_it_is() -> None:
+    control = pytest.importorskip("control")
+    gain, _, _ = control.lqr(control_object(), np.eye(2), np.eye(1))
+    with pytest.raises(CallerError, match=r"K x does not stabilise .*; u = -K x does: give -K"):
+        model_of(control_object(), gain)
+    assert np.allclose(np.array(model_of(control_object(), -gain).gain), -gain)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+def test_what_is_saved_is_read_back(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"plant{suffix}"
+    save_model(path, signal.StateSpace(A, B, C, D), K)
+    found = read_matrices(NamedFile(path.name, tmp_path))
+    assert np.array_equal(found["A"], A)
+    assert np.array_equal(found["B"], B)
+    assert np.array_equal(found["gain"], K)
+    save_model(path, (A, B))
+    assert read_matrices(NamedFile(path.name, tmp_path)).keys() == {"A", "B"}
+
+
+@pytest.mark.parametrize(
+    ("system", "gain", "expected"),
+    [
+        (signal.StateSpace(A, B, C, D, dt=0.1), K, "dt is 0.1, so it is a system in discrete time"),
+        (signal.StateSpace(A, B, C[:1], D[:1]), K, "C is not the identity"),
+        (signal.StateSpace(A, B, C, D + 1), K, "D is not zero"),
+        (signal.TransferFunction([1.0], [1.0, 2.0]), K, "a TransferFunctionContinuous has no A"),
+        ((A, B, C), K, "a tuple of 3"),
+        ((A, B[:, 0]), K, "B: a matrix of finite numbers is needed"),
+        ((A[:1], B), K, "expected 2 x 2 (B has a row for each state), found 1 x 2"),
+        ((A, B), K.T, "gain: expected 1 x 2"),
+        ((A, "B"), K, "B: is not a matrix of real numbers"),
+        ((A * np.nan, B), K, "A: a matrix of finite numbers is needed"),
+    ],
+)
+def test_what_is_no_such_system_is_refused_in_one_line(
+    system: Any, gain: Any, expected: str
+) -> None:
+    with pytest.raises(CallerError) as refused:
+        model_of(system, gain)
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_discrete_time_system_of_python_control_is_refused() -> None:
+    control = pytest.importorskip("control")
+    with pytest.raises(CallerError, match=r"discrete time; .*d2c"):
+        model_of(control.ss(A, B, C, D, True), K)
+
+
+def test_a_file_of_another_kind_or_place_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match=r"must end in \.npz"):
+        save_model(tmp_path / "plant.csv", (A, B))
+    with pytest.raises(CallerError, match="cannot be written"):
+        save_model(tmp_path / "nowhere" / "plant.npz", (A, B))

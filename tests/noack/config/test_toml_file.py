@@ -1,0 +1,187 @@
+"""A settings file is bounded before it is parsed: in size, in depth, in what is said of it."""
+
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from cosim.studies.campaign.campaign_file import load as load_campaign
+from netem.words.links_file import load_links
+from noack.config import toml_file
+from noack.config.named_file import NamedFile
+from noack.config.scenario_file import load, put, validate
+from noack.core.errors import CallerError
+
+MOST = toml_file.MOST_LEVELS
+READERS = [load, load_campaign, load_links]
+
+
+def key(parts: int, part: str = "a", dot: str = ".") -> str:
+    return dot.join([part] * parts)
+
+
+LONG = key(MOST + 1)
+TRICKY = [
+    '"""a"b""c\\""""',  # ends in a quotation mark of its own
+    '"""\n#\n\\"""\n"""',
+    "'''it's ''it'''''",
+    '"\\"#\\\\"',
+    "'\\'",
+    '""',
+]
+"""Strings that end where a careless reader does not see it."""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{LONG} = 1",
+        f"[{LONG}]",
+        f"[[{LONG}]]",
+        f"x = {{ {LONG} = 1 }}",
+        f"x = [1.5, {{ {LONG} = 1 }}]",
+        key(MOST + 1, '"a.b"', " . ") + " = 1",
+        key(MOST + 1, "'#'", "\t.") + " = 1",
+        *(f"x = [{string}, {{ {LONG} = '' }}, '']" for string in TRICKY),
+        *(f"x = {string} # '\n{LONG} = '''\n'''" for string in TRICKY),
+    ],
+)
+def test_long_key_is_refused_before_it_is_parsed(text: str) -> None:
+    tomllib.loads(text)  # it is TOML
+    with pytest.raises(CallerError, match=rf"^here: a key has more than {MOST} parts$"):
+        toml_file.parsed(text, "here")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{key(MOST)} = 1",
+        f"x = '{LONG}' # {LONG} = 1",
+        f'x = """\n{LONG} = 1\n"""\n# """\ny = 1.5',
+        *(f"x = [{string}, '{LONG}']" for string in TRICKY),
+        "x = [" + "0.5, " * 1000 + "]",
+    ],
+)
+def test_whatever_else_has_dots_is_none(text: str) -> None:
+    assert toml_file.parsed(text, "here") == tomllib.loads(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a" * 10**6,
+        "a " * 500_000,
+        "a.b " * 250_000,
+        '"""\\' * 250_000,
+        '"' * 10**6,
+        "'''\\" * 10**5,
+    ],
+)
+def test_what_is_none_is_seen_in_linear_time(text: str) -> None:
+    """Quadratic time would be that of 10¹² steps, beyond the test's own limit."""
+    with pytest.raises(CallerError, match=r"^here: not valid TOML"):
+        toml_file.parsed(text, "here")
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+from cosim.studies.campaign.campaign_file import load as load_campaign
+from netem.words.links_file import load_links
+from noack.core.errors import CallerError
+from noack.config.scenario_file import load
+usage = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+limit = usage + 64 * 2**20
+resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+for path in sys.argv[1:]:
+    for read in (load, load_campaign, load_links):
+        try:
+            read(Path(path))
+        except CallerError as error:
+            print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc and /dev of Linux")
+def test_hostile_files_take_little_memory(tmp_path: Path) -> None:
+    (tmp_path / "key.toml").write_text(f"{key(100_000)} = 1\n")
+    (tmp_path / "large.toml").write_text("x = 1\n" * 200_000)
+    (tmp_path / "endless.toml").symlink_to("/dev/zero")
+    os.mkfifo(tmp_path / "fifo.toml")
+    paths = sorted(map(str, tmp_path.glob("*.toml")))
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *paths], capture_output=True, text=True, timeout=200
+    )
+    assert done.stderr == ""
+    said = [
+        "endless.toml: cannot be read: not a regular file",
+        "fifo.toml: cannot be read: not a regular file",
+        "key.toml: a key has more than 32 parts",
+        "large.toml: cannot be read: larger than 1 MiB",
+    ]
+    assert done.stdout.splitlines() == [f"{tmp_path}/{line}" for line in said for _ in READERS]
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        (f"x = {'[' * 100}{']' * 100}", "tables and lists lie within each other more than 32"),
+        (f"x = {'[' * 9999}{']' * 9999}", "tables and lists lie within each other more than 32"),
+        (
+            f"x = {('{' + key(30) + ' = ') * 100}1{'}' * 100}",
+            "tables and lists lie within each other more than 32",
+        ),
+        (f"x = 0x{'f' * 20_000}", "an integer is too large"),
+    ],
+)
+def test_depth_and_digits_are_one_line(tmp_path: Path, read, text: str, wrong: str) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "file.toml"
+    path.write_text(text)
+    with pytest.raises(CallerError, match=f"^[^\n]*file.toml: {wrong}[^\n]*$"):
+        read(path)
+
+
+def test_set_key_is_bounded() -> None:
+    content: dict[str, object] = {}
+    put(content, key(MOST), 1, "--set")
+    with pytest.raises(CallerError, match=r"^--set: the key has more than 32 parts$"):
+        put(content, key(MOST + 1), 1, "--set")
+
+
+def test_many_mistakes_are_counted() -> None:
+    with pytest.raises(CallerError) as caught:
+        validate({f"a{i}": 0 for i in range(10_000)}, "here")
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 51
+    assert lines[-1] == "here: 9956 more mistakes"  # 6 that are needed are missing, too
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "fifo"])
+def test_named_file_is_a_regular_one(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    file = NamedFile(name, tmp_path, "run.toml: network.loss")
+    with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
+        file.content()
+    with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
+        file.sha256()
+
+
+class _Named(BaseModel):
+    name: str
+    note: str = ""
+
+
+def test_missing_file_names_files_of_its_kind_only(tmp_path: Path) -> None:
+    (tmp_path / "one.toml").write_text("name = 'one'\nmore = 1")
+    (tmp_path / "pyproject.toml").write_text("[project]\nname = 'other'")
+    (tmp_path / "broken.toml").write_text("name = ")
+    os.mkfifo(tmp_path / "fifo.toml")
+    with pytest.raises(CallerError) as caught:
+        toml_file.read(tmp_path / "none.toml", _Named)
+    there = f"; there are {tmp_path}/one.toml"
+    assert str(caught.value) == f"{tmp_path}/none.toml: no such file{there}"

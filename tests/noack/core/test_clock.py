@@ -1,0 +1,84 @@
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.core.clock import ManualClock, RunClock
+
+EPOCH_NS = 123_456_789_012_345
+speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])
+
+
+class Wall:
+    """A wall clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.now_ns = EPOCH_NS
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def test_a_manual_clock_stands_until_it_is_set() -> None:
+    clock = ManualClock(5)
+    assert [clock.now_ns(), clock.now_ns()] == [5, 5]
+    clock.advance_to(5)
+    clock.advance_to(10**12)
+    assert clock.now_ns() == 10**12
+    with pytest.raises(ValueError, match="cannot go back from 1000000000000 ns to 999999999999 ns"):
+        clock.advance_to(10**12 - 1)
+    assert clock.now_ns() == 10**12
+
+
+@given(st.integers(-(10**12), 10**15))
+def test_at_speed_one_no_nanosecond_is_lost(wall_ns: int) -> None:
+    wall = Wall()
+    clock = RunClock(EPOCH_NS, monotonic_ns=wall)
+    wall.now_ns = EPOCH_NS + wall_ns
+    assert clock.now_ns() == wall_ns
+
+
+@given(speeds, st.integers(0, 10**14))
+def test_simulated_time_is_wall_time_times_speed(speed: float, wall_ns: int) -> None:
+    wall = Wall()
+    clock = RunClock(EPOCH_NS, speed, wall)
+    wall.now_ns = EPOCH_NS + wall_ns
+    exact = Fraction(speed) * wall_ns
+    # Rounded down to a nanosecond, after one rounding of a product good to 2⁻⁵³.
+    assert abs(clock.now_ns() - exact) <= 1 + exact / 2**53
+
+
+@given(speeds, st.lists(st.integers(-(10**12), 10**14), min_size=2))
+def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
+    wall = Wall()
+    clock = RunClock(EPOCH_NS, speed, wall)
+    seen = []
+    for wall_ns in sorted(walls):
+        wall.now_ns = EPOCH_NS + wall_ns
+        seen.append(clock.now_ns())
+    assert seen == sorted(seen)
+
+
+@given(speeds, st.integers(0, 10**12), st.integers(0, 10**13))
+def test_whoever_waits_as_told_wakes_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
+    wall = Wall()
+    clock = RunClock(EPOCH_NS, speed, wall)
+    wall.now_ns = EPOCH_NS + wall_ns
+    wait_s = clock.wall_s_until(t_ns)
+    assert (wait_s > 0) == (t_ns > wall_ns * Fraction(speed)) or abs(wait_s) < 1e-9
+    wall.now_ns += round(wait_s * 1e9)
+    # To half a nanosecond of wall time, and to the rounding of times of up to 10¹⁵ ns.
+    assert abs(clock.now_ns() - t_ns) <= 2 + speed
+
+
+def test_a_fast_run_waits_less() -> None:
+    wall = Wall()
+    waits = [RunClock(EPOCH_NS, speed, wall).wall_s_until(10**9) for speed in (1.0, 2.0, 0.5)]
+    assert waits == [1.0, 0.5, 2.0]
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
+def test_time_that_stands_or_runs_back_is_refused(speed: float) -> None:
+    with pytest.raises(ValueError, match="speed must be positive"):
+        RunClock(EPOCH_NS, speed)

@@ -1,0 +1,24 @@
+"""What a person reads of an error, whatever it quotes."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.core.errors import CallerError, one_line, printable
+
+
+@given(st.text())
+def test_what_is_quoted_can_be_printed_on_one_line(text: str) -> None:
+    assert printable(text).isprintable()
+    assert printable(text) == text or not text.isprintable()
+
+
+def test_an_error_moves_no_cursor_and_rings_no_bell() -> None:
+    assert str(CallerError("key = \x1b[2J\x07é\ud800")) == "key = \\x1b[2J\\x07é\\ud800"
+
+
+def test_each_mistake_has_a_line() -> None:
+    assert str(CallerError("a: wrong\nb: \twrong")) == "a: wrong\nb: \\twrong"
+
+
+def test_an_error_of_others_becomes_one_line() -> None:
+    assert one_line(ValueError("Couldn't read:\n  no data\n")) == "Couldn't read: no data"

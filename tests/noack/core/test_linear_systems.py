@@ -1,0 +1,180 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.integrate import solve_ivp
+
+from noack.config.named_models import double_integrator
+from noack.core.linear_systems import (
+    HeldInputPropagator,
+    Matrix,
+    Propagator,
+    discretise,
+    norm,
+    row_norms,
+    spectral_abscissa,
+    transition,
+)
+
+ROUNDING = 1e-13
+"""A few hundred operations, each good to 2⁻⁵³."""
+
+STEPS_NS = [1, 1_000, 2_000_000, 333_333_333, 1_000_000_000, 60_000_000_000]
+
+
+def square(n: int) -> st.SearchStrategy[Matrix]:
+    return arrays(np.float64, (n, n), elements=st.floats(-1, 1))
+
+
+generators = st.integers(1, 5).flatmap(square)
+steps_ns = st.integers(0, 2_000_000_000)
+
+
+@st.composite
+def systems(draw: st.DrawFn) -> tuple[Matrix, Matrix]:
+    n, m = draw(st.integers(1, 5)), draw(st.integers(1, 3))
+    return draw(square(n)), draw(arrays(np.float64, (n, m), elements=st.floats(-1, 1)))
+
+
+@pytest.mark.parametrize("dt_ns", STEPS_NS)
+def test_the_double_integrator_moves_as_newton_says(dt_ns: int) -> None:
+    dt = dt_ns * 1e-9
+    model = double_integrator({})
+    Ad, Bd = discretise(model.A, model.B, dt_ns)
+    np.testing.assert_allclose(Ad, [[1, dt], [0, 1]], rtol=ROUNDING)
+    np.testing.assert_allclose(Bd, [[dt**2 / 2], [dt]], rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("dt_ns", STEPS_NS[:-1])
+@pytest.mark.parametrize("a", [-30.0, -1.0, -1e-9, 0.0, 0.5, 20.0])
+def test_a_scalar_system_is_discretised_as_its_closed_form(a: float, dt_ns: int) -> None:
+    dt, b = dt_ns * 1e-9, 3.0
+    Ad, Bd = discretise(np.array([[a]]), np.array([[b]]), dt_ns)
+    assert Ad.item() == pytest.approx(math.exp(a * dt), rel=ROUNDING)
+    assert Bd.item() == pytest.approx(b * (math.expm1(a * dt) / a if a else dt), rel=ROUNDING)
+
+
+@pytest.mark.parametrize("dt_ns", STEPS_NS[:-1])
+def test_an_oscillator_turns_by_its_angle(dt_ns: int) -> None:
+    w = 2.5
+    c, s = math.cos(w * dt_ns * 1e-9), math.sin(w * dt_ns * 1e-9)
+    np.testing.assert_allclose(
+        transition(np.array([[0, w], [-w, 0]]), dt_ns), [[c, s], [-s, c]], atol=ROUNDING
+    )
+
+
+def test_a_singular_matrix_that_is_not_nilpotent_is_no_special_case() -> None:
+    v, w, dt = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -1.0]), 0.7
+    A, rate = np.outer(v, w), float(w @ v)  # A² = rate · A, so its series can be summed
+    B = np.array([[1.0, 0.0], [0.0, 2.0], [-1.0, 1.0]])
+    Ad, Bd = discretise(A, B, 700_000_000)
+    grown = math.expm1(rate * dt)
+    np.testing.assert_allclose(Ad, np.eye(3) + grown / rate * A, rtol=ROUNDING, atol=ROUNDING)
+    expected = dt * B + (grown - rate * dt) / rate**2 * A @ B
+    np.testing.assert_allclose(Bd, expected, rtol=ROUNDING, atol=ROUNDING)
+
+
+@given(systems(), st.integers(1, 500_000_000), st.integers(0, 2**32))
+def test_a_held_input_gives_what_an_integrator_gives(
+    system: tuple[Matrix, Matrix], dt_ns: int, seed: int
+) -> None:
+    A, B = system
+    x0, u = np.split(np.random.default_rng(seed).uniform(-1, 1, sum(B.shape)), [len(A)])
+    Ad, Bd = discretise(A, B, dt_ns)
+    solution = solve_ivp(
+        lambda t, x: A @ x + B @ u,
+        (0.0, dt_ns * 1e-9),
+        x0,
+        method="DOP853",
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    # The integrator's local errors of 1e-12 grow by at most e^{‖A‖ dt} ≤ e^2.5 over its few steps.
+    np.testing.assert_allclose(Ad @ x0 + Bd @ u, solution.y[:, -1], atol=1e-9)
+    advanced = HeldInputPropagator(A, B)(x0, u, dt_ns)
+    np.testing.assert_array_equal(advanced, Ad @ x0 + Bd @ u)
+
+
+@given(generators, steps_ns, steps_ns)
+def test_transitions_form_a_group(G: Matrix, s_ns: int, t_ns: int) -> None:
+    first, second = transition(G, s_ns), transition(G, t_ns)
+    scale = np.linalg.norm(first) * np.linalg.norm(second)
+    np.testing.assert_allclose(second @ first, transition(G, s_ns + t_ns), atol=1e-13 * scale)
+    back = transition(G, -s_ns)
+    scale = np.linalg.norm(first) * np.linalg.norm(back)
+    np.testing.assert_allclose(back @ first, np.eye(len(G)), atol=1e-13 * scale)
+
+
+@given(generators, st.integers(0, 1_000_000_000))
+def test_volumes_grow_with_the_trace(G: Matrix, dt_ns: int) -> None:
+    """Liouville's formula: det e^{Gt} = e^{t tr G}."""
+    Phi = transition(G, dt_ns)
+    scale = np.linalg.norm(Phi) ** len(G)  # of the terms that make up the determinant
+    grown = math.exp(float(np.trace(G)) * dt_ns * 1e-9)
+    assert np.linalg.det(Phi) == pytest.approx(grown, abs=1e-13 * scale)
+
+
+@given(systems(), st.lists(st.integers(1, 10**9), min_size=1, max_size=5))
+def test_cached_and_fresh_matrices_are_the_same_bits(
+    system: tuple[Matrix, Matrix], steps: list[int]
+) -> None:
+    A, B = system
+    free, held = Propagator(A, steps[:2]), HeldInputPropagator(A, B)
+    state, u = np.ones(len(A)), np.ones(len(B.T))
+    for dt_ns in [*steps, *reversed(steps)]:
+        assert free.transition(dt_ns).tobytes() == transition(A, dt_ns).tobytes()
+        assert [part.tobytes() for part in held.step(dt_ns)] == [
+            part.tobytes() for part in discretise(A, B, dt_ns)
+        ]
+        assert free(state, dt_ns).tobytes() == Propagator(A)(state, dt_ns).tobytes()
+        assert (
+            held(state, u, dt_ns).tobytes() == HeldInputPropagator(A, B)(state, u, dt_ns).tobytes()
+        )
+
+
+def test_propagators_keep_their_own_matrices() -> None:
+    A, B, state = np.array([[-1.0]]), np.array([[1.0]]), np.array([1.0])
+    free, held = Propagator(A), HeldInputPropagator(A, B)
+    A[:], B[:] = 7.0, 7.0
+    assert free(state, 10**9) == pytest.approx(math.exp(-1), rel=ROUNDING)
+    assert held(state, state, 10**9) == pytest.approx(1.0, rel=ROUNDING)
+
+
+def test_no_time_and_no_dynamics_change_nothing() -> None:
+    state, G = np.array([0.1, -0.0]), np.array([[0.3, 1.0], [-2.0, 0.4]])
+    assert Propagator(G)(state, 0).tobytes() == state.tobytes()
+    assert HeldInputPropagator(G, G)(state, state, 0).tobytes() == state.tobytes()
+    assert Propagator(np.zeros((2, 2)))(state, 10**12).tobytes() == state.tobytes()
+
+
+@given(arrays(np.float64, st.integers(1, 64), elements=st.floats(-1e100, 1e100)))
+def test_the_norm_is_the_hypotenuse(vector: np.ndarray) -> None:
+    # Squares of entries below 1e-154 underflow; they count for nothing beside 1e-150.
+    assert norm(vector) == pytest.approx(math.hypot(*vector), rel=1e-14, abs=1e-150)
+
+
+def test_the_abscissa_is_the_largest_real_part() -> None:
+    # Eigenvalues −0.5 ± 3i and −2, from the block structure.
+    matrix = np.array([[-0.5, 3.0, 1.0], [-3.0, -0.5, 4.0], [0.0, 0.0, -2.0]])
+    assert spectral_abscissa(matrix) == pytest.approx(-0.5, rel=ROUNDING)
+
+
+def test_row_norms_are_numpys_where_squares_are_numbers() -> None:
+    rows = np.random.default_rng(1).normal(size=(100, 5)) * np.logspace(-130, 130, 100)[:, None]
+    assert row_norms(rows).tobytes() == np.linalg.norm(rows, axis=1).tobytes()
+
+
+@pytest.mark.parametrize("size", [1e300, 1e160, 1e-160, 1e-300, 5e-324])
+def test_row_norms_neither_overflow_nor_vanish(size: float) -> None:
+    rows = np.array([[3.0, 4.0], [0.0, -2.0], [0.0, 0.0]]) * size
+    expected = [norm(row) for row in rows]
+    np.testing.assert_allclose(row_norms(rows), expected, rtol=1e-12)
+
+
+def test_row_norms_of_what_is_not_finite_are_not_finite() -> None:
+    with np.errstate(invalid="ignore"):
+        found = row_norms(np.array([[np.inf, 1.0], [np.nan, 1.0], [1.0, 0.0]]))
+    np.testing.assert_array_equal(found, [np.inf, np.nan, 1.0])

@@ -1,0 +1,100 @@
+import hashlib
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.core.random_streams import stream, stream_key, stream_keys, uniforms, words
+
+seeds = st.integers(0, 2**64 - 1)
+names = st.lists(st.text("abc/", max_size=4), min_size=1, max_size=4)
+
+
+@given(seeds, names)
+def test_a_stream_is_fixed_by_its_seed_and_name(seed: int, name: list[str]) -> None:
+    first, again = stream(seed, *name), stream(seed, *name)
+    other = stream(seed, "something", "else")
+    other.random(100)  # drawing from one leaves the others alone
+    assert first.random(20).tobytes() == again.random(20).tobytes()
+
+
+def test_a_stream_is_what_it_is_documented_to_be() -> None:
+    """NumPy's PCG64DXSM, seeded by the seed and a hash of the name: the same everywhere, always."""
+    digest = hashlib.blake2b(b"netem\0update\0loss\0" + b"0", digest_size=16).digest()
+    key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
+    by_hand = np.random.PCG64DXSM(np.random.SeedSequence(2, spawn_key=key))
+    found = stream(2, "netem", "update", "loss", "0").bit_generator
+    np.testing.assert_array_equal(found.random_raw(5), by_hand.random_raw(5))
+
+
+def test_the_numbers_of_published_runs_stay_the_same() -> None:
+    """Written down once: a scenario's seeds must mean the same draws in every later version."""
+    found = stream(2, "netem", "update", "loss", "0").random(3)
+    assert found.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]
+
+
+def test_other_seeds_and_names_give_other_numbers() -> None:
+    paths = [("a",), ("b",), ("a", "b"), ("ab",), ("a", ""), ("", "a"), ("plant",)]
+    seeds = [0, 1, 2, 2**32, 2**32 + 1, 2**64 - 1]
+    firsts = {stream(seed, *path).random() for seed, path in itertools.product(seeds, paths)}
+    assert len(firsts) == len(seeds) * len(paths)
+
+
+def test_neighbouring_streams_are_uncorrelated() -> None:
+    draws = np.array([stream(0, "loss", str(k)).random(20_000) for k in range(8)])
+    correlation = np.corrcoef(draws) - np.eye(8)
+    assert np.abs(correlation).max() < 5 / np.sqrt(20_000)  # five standard errors
+
+
+def test_a_nameless_stream_or_a_negative_seed_is_refused() -> None:
+    with pytest.raises(ValueError, match="needs a name"):
+        stream(0)
+    with pytest.raises(ValueError, match="non-negative"):
+        stream(-1, "a")
+
+
+def test_a_streams_key_is_the_seed_sequences_own() -> None:
+    """Two words of what seeds the stream of the same name; written down once, like its numbers."""
+    digest = hashlib.blake2b(b"netem\0a\0loss", digest_size=16).digest()
+    key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
+    words = np.random.SeedSequence(2, spawn_key=key).generate_state(2)
+    assert stream_key(2, "netem", "a", "loss") == tuple(words.tolist())
+    assert stream_key(2, "netem", "a", "loss") == (0xA1E54851, 0x9C1E9ED0)
+    assert all(type(word) is int for word in stream_key(2, "netem", "a", "loss"))
+
+
+def test_other_seeds_and_names_have_other_keys() -> None:
+    paths = [("a",), ("b",), ("a", "b"), ("ab",), ("a", ""), ("", "a")]
+    keys = {stream_key(seed, *path) for seed in (0, 1, 2**32, 2**64 - 1) for path in paths}
+    assert len(keys) == 4 * len(paths)
+    with pytest.raises(ValueError, match="needs a name"):
+        stream_key(0)
+
+
+def test_rows_of_a_table_are_the_same_whichever_are_asked_for() -> None:
+    whole = words(7, "a", "table", rows=range(100), width=6)
+    assert whole.shape == (100, 6)
+    for rows in (range(1), range(37, 41), range(99, 100)):
+        some = words(7, "a", "table", rows=rows, width=6)
+        np.testing.assert_array_equal(some, whole[rows.start : rows.stop])
+    assert words(7, "a", "table", rows=range(0), width=6).shape == (0, 6)
+    assert len(np.unique(whole)) == 600
+    for other in (words(8, "a", "table", rows=range(100), width=6),
+                  words(7, "another", rows=range(100), width=6)):  # fmt: skip
+        assert (whole != other).all()
+
+
+def test_a_table_is_the_generators_own_sequence() -> None:
+    low, high = stream_key(7, "t")
+    sequence = np.random.Generator(np.random.Philox(key=low | high << 32)).random(40)
+    np.testing.assert_array_equal(uniforms(7, "t", rows=range(10), width=4).ravel(), sequence)
+
+
+def test_many_keys_are_the_keys_one_by_one() -> None:
+    seeds = [0, 1, 2**32 - 1, 2**32, 2**64 - 1, *range(7, 2**63, 2**58)]
+    for path in (("netem", "a", "loss"), ("b",)):
+        keys = stream_keys(np.array(seeds, np.uint64), *path)
+        assert keys.tolist() == [list(stream_key(seed, *path)) for seed in seeds]
+    assert stream_keys(np.array([], np.uint64), "a").shape == (0, 2)

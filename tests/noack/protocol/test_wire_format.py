@@ -1,0 +1,366 @@
+"""Every datagram here is built by :func:`datagram`, from ``docs/wire.md`` and not from the code."""
+
+import hashlib
+import itertools
+import math
+import re
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from noack.protocol.wire_format import (
+    Decoder,
+    Encoder,
+    Flow,
+    Header,
+    Message,
+    Rejection,
+    read_header,
+)
+
+PAGE = (Path(__file__).parents[3] / "docs" / "wire.md").read_text(encoding="utf-8")
+FLOWS = {"measurement": 1, "update": 2, "actuation": 3, "acknowledgement": 4}
+KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
+RUN = 0x0123_4567_89AB_CDEF
+
+run_ids = st.integers(0, 2**64 - 1)
+sequences = st.integers(0, 2**63 - 1)
+times_ns = st.integers(0, 2**62 - 1)
+finite = st.floats(allow_nan=False, allow_infinity=False)
+vectors = st.lists(finite, min_size=1, max_size=64)
+flows = st.sampled_from(Flow)
+
+
+def datagram(
+    values: list[float],
+    *,
+    magic: bytes = b"NA",
+    version: int = 1,
+    flow: int = 2,
+    dimension: int | None = None,
+    reserved: int = 0,
+    run_id: int = RUN,
+    sequence: int = 0,
+    t_ns: int = 0,
+    key: bytes = KEY,
+) -> bytes:
+    """A datagram by the table of ``docs/wire.md``, with a right tag under ``key``."""
+    content = b"".join(
+        [
+            magic,
+            version.to_bytes(1, "little"),
+            flow.to_bytes(1, "little"),
+            (len(values) if dimension is None else dimension).to_bytes(2, "little"),
+            reserved.to_bytes(2, "little"),
+            run_id.to_bytes(8, "little"),
+            sequence.to_bytes(8, "little"),
+            t_ns.to_bytes(8, "little", signed=True),
+            *(struct.pack("<d", value) for value in values),
+        ]
+    )
+    return content + hashlib.blake2b(content, key=key, digest_size=16).digest()
+
+
+def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN) -> Decoder:
+    return Decoder(Flow(flow), dimension, run_id, KEY)
+
+
+def assert_rejected(
+    decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True
+) -> None:
+    """The datagram is rejected for that reason, is counted once, and leaves no other trace."""
+    accepted, rejected = decoder.accepted, dict(decoder.rejected)
+    assert decoder.decode(data, from_peer=from_peer) is None
+    counted = {key: n - rejected[key] for key, n in decoder.rejected.items() if n != rejected[key]}
+    assert counted == {reason: 1}
+    assert decoder.accepted == accepted
+
+
+class Vector(NamedTuple):
+    flow: str
+    run_id: int
+    sequence: int
+    t_ns: int
+    values: list[float]
+    data: bytes
+
+
+def published_vectors() -> list[Vector]:
+    found = []
+    for block in re.findall(r"```vector\n(.*?)```", PAGE, re.DOTALL):
+        fields = dict(
+            re.findall(r"^([a-z_ ]+): +(.*?)(?=^[a-z]|\Z)", block, re.DOTALL | re.MULTILINE)
+        )
+        found.append(
+            Vector(
+                fields["flow"].strip(),
+                int(fields["run id"], 16),
+                int(fields["sequence"]),
+                int(fields["t_ns"]),
+                [float(value) for value in fields["vector"].split() if value != "none"],
+                bytes.fromhex(fields["datagram"]),
+            )
+        )
+    return found
+
+
+def test_the_page_has_a_vector_for_every_flow_and_names_its_key() -> None:
+    assert {vector.flow for vector in published_vectors()} == set(FLOWS)
+    assert {flow.name.lower(): flow.value for flow in Flow} == FLOWS
+    assert f"The key of all vectors is `{KEY.hex()}`" in PAGE
+
+
+@pytest.mark.parametrize("vector", published_vectors(), ids=lambda v: f"{v.flow}-{v.sequence}")
+def test_published_vectors_hold_in_both_directions(vector: Vector) -> None:
+    flow, run_id, sequence, t_ns, values, data = vector
+    by_hand = datagram(
+        values, flow=FLOWS[flow], run_id=run_id, sequence=sequence, t_ns=t_ns, key=KEY
+    )
+    assert by_hand.hex() == data.hex()
+    message = Message(Flow(FLOWS[flow]), sequence, t_ns, np.array(values))
+    assert Encoder(run_id, KEY).encode(message).hex() == data.hex()
+    decoded = Decoder(Flow(FLOWS[flow]), len(values), run_id, KEY).decode(data)
+    assert decoded is not None
+    assert decoded[:3] == message[:3]
+    assert decoded.vector.tobytes() == struct.pack(f"<{len(values)}d", *values)
+    assert read_header(data) == Header(1, FLOWS[flow], len(values), run_id, sequence, t_ns)
+
+
+def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
+    listed = re.findall(r"^\| (\d+) \| `(\w+)` \|", PAGE, re.MULTILINE)
+    assert [int(order) for order, _ in listed] == list(range(1, 11))
+    assert [reason for _, reason in listed] == ["length", *(reason for reason, _ in FAULTS)]
+    assert {reason for _, reason in listed} == {reason.value for reason in Rejection}
+
+
+@given(flows, run_ids, sequences, times_ns, vectors)
+@example(Flow.UPDATE, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308])
+def test_what_is_sent_is_what_arrives(
+    flow: Flow, run_id: int, sequence: int, t_ns: int, values: list[float]
+) -> None:
+    values = [] if flow is Flow.ACKNOWLEDGEMENT else values
+    data = Encoder(run_id, KEY).encode(Message(flow, sequence, t_ns, np.array(values)))
+    assert data == datagram(values, flow=flow, run_id=run_id, sequence=sequence, t_ns=t_ns)
+    decoder = Decoder(flow, len(values), run_id, KEY)
+    message = decoder.decode(data)
+    assert message is not None
+    assert message[:3] == (flow, sequence, t_ns)
+    assert message.vector.dtype == np.float64
+    assert message.vector.tobytes() == struct.pack(f"={len(values)}d", *values)
+    assert decoder.accepted == 1
+    assert set(decoder.rejected.values()) == {0}
+
+
+def reason_by_offset(offset: int) -> Rejection:
+    """Which test a changed byte fails first, by the table of the layout."""
+    if offset < 3:
+        return Rejection.VERSION  # magic and version
+    if offset == 3:
+        return Rejection.FLOW
+    if offset in (4, 5):
+        return Rejection.LENGTH  # dimension
+    if 8 <= offset < 16:
+        return Rejection.RUN
+    return Rejection.TAG  # reserved, sequence number, time, vector, and the tag itself
+
+
+@given(vectors, sequences, times_ns)
+def test_any_flipped_bit_is_noticed(values: list[float], sequence: int, t_ns: int) -> None:
+    decoder = new_decoder(dimension=len(values))
+    data = datagram(values, sequence=sequence, t_ns=t_ns)
+    stride = 1 if len(values) <= 3 else 7  # of the longer ones every seventh bit
+    for bit in range(0, 8 * len(data), stride):
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        assert_rejected(decoder, bytes(damaged), reason_by_offset(bit // 8))
+    assert decoder.decode(data) is not None
+
+
+@given(vectors, st.binary(min_size=1, max_size=64))
+def test_any_other_length_is_noticed(values: list[float], more: bytes) -> None:
+    decoder = new_decoder(dimension=len(values))
+    data = datagram(values)
+    for size in range(len(data)):
+        assert_rejected(decoder, data[:size], Rejection.LENGTH)
+    assert_rejected(decoder, data + more, Rejection.LENGTH)
+    assert decoder.decode(data) is not None
+
+
+@given(vectors, vectors)
+def test_a_vector_of_another_dimension_is_noticed(expected: list[float], sent: list[float]) -> None:
+    decoder = new_decoder(dimension=len(expected))
+    if len(sent) != len(expected):
+        assert_rejected(decoder, datagram(sent), Rejection.LENGTH)
+        # Of the right size, but with a header that says otherwise.
+        assert_rejected(decoder, datagram(expected, dimension=len(sent)), Rejection.LENGTH)
+    assert decoder.decode(datagram(expected)) is not None
+
+
+@given(st.binary(min_size=32, max_size=32), run_ids, st.integers(0, 255), st.integers(0, 255))
+def test_other_keys_runs_flows_and_versions_are_noticed(
+    key: bytes, run_id: int, flow: int, version: int
+) -> None:
+    decoder, values = new_decoder(), [1.0, 2.0, 3.0]
+    if key != KEY:
+        assert_rejected(decoder, datagram(values, key=key), Rejection.TAG)
+    if run_id != RUN:
+        assert_rejected(decoder, datagram(values, run_id=run_id), Rejection.RUN)
+    if flow != Flow.UPDATE:
+        assert_rejected(decoder, datagram(values, flow=flow), Rejection.FLOW)
+    if version != 1:
+        assert_rejected(decoder, datagram(values, version=version), Rejection.VERSION)
+    assert decoder.decode(datagram(values)) is not None
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=40))
+def test_only_newer_datagrams_are_accepted(arrivals: list[int]) -> None:
+    decoder, newest = new_decoder(), -1
+    for sequence in arrivals:  # in any order, some twice
+        data = datagram([float(sequence), 0.0, 0.0], sequence=sequence)
+        if sequence > newest:
+            message = decoder.decode(data)
+            assert message is not None
+            assert (message.sequence, message.vector[0]) == (sequence, sequence)
+            newest = sequence
+        else:
+            assert_rejected(decoder, data, Rejection.STALE)
+    assert decoder.accepted == len(set(itertools.accumulate(arrivals, max)))
+
+
+@given(vectors, st.data(), st.sampled_from([math.inf, -math.inf, math.nan]))
+def test_infinities_and_nans_are_noticed(
+    values: list[float], data: st.DataObject, bad: float
+) -> None:
+    decoder = new_decoder(dimension=len(values))
+    damaged = list(values)
+    damaged[data.draw(st.integers(0, len(values) - 1))] = bad
+    assert_rejected(decoder, datagram(damaged, sequence=5), Rejection.NOT_FINITE)
+    assert decoder.decode(datagram(values, sequence=5)) is not None  # its number is not used up
+
+
+@pytest.mark.parametrize(
+    ("number", "accepted"), [(2**40, True), (2**63 - 1, True), (2**63, False), (2**64 - 1, False)]
+)
+def test_no_sequence_number_is_accepted_that_no_record_could_hold(
+    number: int, accepted: bool
+) -> None:
+    decoder = new_decoder()
+    data = datagram([0.0, 0.0, 0.0], sequence=number)
+    if not accepted:
+        assert_rejected(decoder, data, Rejection.RANGE)
+        return
+    message = decoder.decode(data)
+    assert message is not None
+    assert np.int64(message.sequence) == number
+    # It does not wrap: what comes after the last of all is old.
+    assert_rejected(decoder, datagram([0.0, 0.0, 0.0], sequence=0), Rejection.STALE)
+
+
+@pytest.mark.parametrize(
+    ("t_ns", "accepted"),
+    [(0, True), (10**16, True), (2**62 - 1, True), (2**62, False), (-1, False), (-(2**63), False)],
+)
+def test_no_time_is_accepted_that_no_run_has(t_ns: int, accepted: bool) -> None:
+    decoder = new_decoder()
+    data = datagram([0.0, 0.0, 0.0], t_ns=t_ns)
+    if accepted:
+        assert decoder.decode(data) is not None
+    else:
+        assert_rejected(decoder, data, Rejection.RANGE)
+
+
+FAULTS = [
+    ("version", {"version": 2}),
+    ("length", {"dimension": 2}),
+    ("run", {"run_id": RUN + 1}),
+    ("flow", {"flow": 3}),
+    ("tag", {"key": OTHER_KEY}),
+    ("source", {"from_peer": False}),
+    ("range", {"t_ns": -1}),
+    ("stale", {"sequence": 8}),
+    ("not_finite", {"values": [0.0, math.nan, 0.0]}),
+]
+
+
+@pytest.mark.parametrize("first", range(len(FAULTS)))
+def test_of_several_faults_the_first_in_order_is_counted(first: int) -> None:
+    decoder = new_decoder()
+    assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=8)) is not None
+    reason, fault = FAULTS[first]
+    for others in itertools.product((False, True), repeat=len(FAULTS) - first - 1):
+        faults = {"values": [0.0, 0.0, 0.0], "sequence": 9} | fault
+        for (_, other), present in zip(FAULTS[first + 1 :], others, strict=True):
+            faults |= other if present else {}
+        from_peer = faults.pop("from_peer", True)
+        assert_rejected(decoder, datagram(**faults), Rejection(reason), from_peer=from_peer)
+    assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=9)) is not None
+
+
+@given(st.data())
+def test_random_bytes_never_raise_and_are_never_accepted(data: st.DataObject) -> None:
+    decoder = new_decoder()
+    junk = data.draw(
+        st.binary(max_size=700)
+        | st.binary(min_size=72, max_size=72)  # of the right size
+        | st.binary(max_size=700).map(lambda tail: b"NA\1\2\3\0\0\0" + tail)
+        # A right header, anything behind it.
+        | st.binary(min_size=40, max_size=40).map(lambda tail: datagram([0.0] * 3)[:32] + tail)
+    )
+    assert decoder.decode(junk) is None
+    assert sum(decoder.rejected.values()) == 1
+    assert decoder.accepted == 0
+    header = read_header(junk)
+    assert header is None or junk.startswith(b"NA")
+
+
+@given(st.binary(max_size=40))
+def test_a_header_is_read_from_whatever_begins_like_one(head: bytes) -> None:
+    """The network emulator keeps 32 bytes of each datagram, of any program."""
+    header = read_header(b"NA" + head)
+    assert (header is None) == (len(head) < 30)
+    if not head.startswith(b"NA"):
+        assert read_header(head) is None
+
+
+@pytest.mark.parametrize("shape", [(0,), (65,), (2, 2), (1, 3)])
+def test_only_vectors_of_1_to_64_entries_can_be_sent(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"1 to 64 entries, not shape"):
+        Encoder(RUN, KEY).encode(Message(Flow.UPDATE, 0, 0, np.zeros(shape)))
+
+
+def test_an_acknowledgement_carries_no_vector() -> None:
+    with pytest.raises(ValueError, match=r"carries no vector of shape \(1,\)"):
+        Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(1)))
+    decoder = new_decoder(flow=4, dimension=0)
+    assert_rejected(decoder, datagram([0.0], flow=4), Rejection.LENGTH)
+    assert_rejected(decoder, datagram([], flow=2), Rejection.FLOW)
+    message = decoder.decode(datagram([], flow=4, sequence=7, t_ns=5))
+    assert message is not None
+    assert (*message[:3], message.vector.size) == (Flow.ACKNOWLEDGEMENT, 7, 5, 0)
+
+
+@pytest.mark.parametrize("size", [0, 16, 31, 33, 64])
+def test_a_key_has_32_bytes(size: int) -> None:
+    with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
+        Encoder(RUN, bytes(size))
+    with pytest.raises(ValueError, match=f"32 bytes, not {size}"):
+        Decoder(Flow.UPDATE, 3, RUN, bytes(size))
+
+
+def test_the_reserved_bytes_are_covered_by_the_tag_but_mean_nothing() -> None:
+    data = datagram([1.0, 2.0, 3.0], reserved=0xFFFF)
+    assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG)
+    assert new_decoder().decode(data) is not None
+
+
+def test_a_decoded_vector_is_the_receivers_own() -> None:
+    data = datagram([1.0, 2.0, 3.0])
+    message = new_decoder().decode(data)
+    assert message is not None
+    message.vector[0] = 9.0
+    assert data == datagram([1.0, 2.0, 3.0])

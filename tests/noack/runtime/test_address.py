@@ -1,0 +1,64 @@
+"""Addresses as people write them."""
+
+import socket
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.core.errors import CallerError
+from noack.runtime.address import Address, family_of, parse_address, text_of
+
+
+@given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))
+def test_an_address_is_written_so_that_it_is_read_back(host: object, port: int) -> None:
+    address = (str(host), port)
+    read = parse_address(text_of(address), "here")
+    family = family_of(address)
+    assert socket.inet_pton(family, read[0]) == socket.inet_pton(family, address[0])
+    assert read[1] == port
+
+
+@pytest.mark.parametrize(
+    ("text", "like", "address"),
+    [
+        (":9000", None, ("127.0.0.1", 9000)),
+        (":9000", ("192.0.2.1", 1), ("127.0.0.1", 9000)),
+        (":9000", ("::1", 1), ("::1", 9000)),
+        ("localhost:9000", None, ("127.0.0.1", 9000)),
+        ("[::1]:9000", ("192.0.2.1", 1), ("::1", 9000)),
+        ("192.0.2.1:9000", ("::1", 1), ("192.0.2.1", 9000)),
+    ],
+)
+def test_what_is_left_out_is_the_loopback_of_the_same_family(
+    text: str, like: Address | None, address: Address
+) -> None:
+    assert parse_address(text, "here", like) == address
+
+
+def test_an_address_of_a_link_keeps_its_interface() -> None:
+    number = socket.if_nametoindex("lo")
+    assert parse_address("[fe80::1%lo]:9000", "here") == (f"fe80::1%{number}", 9000)
+    assert parse_address(f"[fe80::1%{number}]:9000", "here") == (f"fe80::1%{number}", 9000)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "here: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; found ''"),
+        ("9000", "expected HOST:PORT"),
+        ("host:", "expected HOST:PORT"),
+        ("host:65536", "expected HOST:PORT"),
+        ("host:x", "expected HOST:PORT"),
+        ("::1:9000", "found '::1:9000'; an IPv6 address stands in brackets"),
+        ("[]:9000", "expected HOST:PORT"),
+        ("[127.0.0.1]:9000", "here: 127.0.0.1: no such host ("),
+        ("a b:9000", "here: a b: no such host ("),
+        (f"{'a' * 70}.b:9000", "no such host ("),
+    ],
+)
+def test_a_mistake_gets_one_line(text: str, says: str) -> None:
+    with pytest.raises(CallerError) as caught:
+        parse_address(text, "here")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,348 @@
+"""The control plane's door: who has the run's key comes in, over loopback, and nobody else."""
+
+import hashlib
+import json
+import re
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import psutil
+import pytest
+import zenoh
+from zenoh.handlers import FifoChannel, RingChannel
+
+import noack.runtime.control_plane
+import noack.runtime.process_entry
+from cosim.live.coordinator import Coordinator
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.errors import NoAnswerError, PeerError
+from noack.protocol.topology import COORDINATOR, LOOP_ROLES
+from noack.runtime.control_messages import Admission, Begin, Missing, heard
+from noack.runtime.control_plane import Plane, secret_of
+from noack.runtime.join_ticket import Ticket, new_ticket
+from noack.runtime.process_entry import _admitted
+from noack.runtime.process_life import Node
+from noack.runtime.signals import Signals
+from noack.runtime.udp_sockets import free_tcp_port
+from noack.runtime.zenoh_session import Secret, open_star, star_config
+from tests.fuzz.plane import FakePlane
+from tests.integration.conftest import wait_for
+
+HELLO = '{"pid": 1, "instance": "evil", "address": ["127.0.0.1", 9]}'
+STRANGERS = ["no secret", "wrong password", "wrong user", "no password", "another run's"]
+
+
+@pytest.fixture
+def ticket(content: dict[str, Any], tmp_path: Path) -> Ticket:
+    endpoint = f"tcp/127.0.0.1:{free_tcp_port()}"
+    return new_ticket(resolve(validate(content, "")), endpoint, tmp_path, launched=True)
+
+
+@pytest.fixture
+def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
+    coordinator = Coordinator(ticket)
+    yield coordinator
+    coordinator.close()
+
+
+def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
+    """What a stranger shows at the door."""
+    own = secret_of(ticket)
+    secrets = {
+        "wrong password": Secret(own.user, "0" * len(own.password)),
+        "wrong user": Secret("root", own.password),
+        "no password": Secret(own.user, ""),
+        "another run's": secret_of(ticket._replace(key=bytes(32), run_id=ticket.run_id ^ 1)),
+    }
+    if stranger not in secrets:
+        return {}
+    return {f"transport/auth/usrpwd/{k}": v for k, v in secrets[stranger]._asdict().items()}
+
+
+@pytest.mark.parametrize("stranger", STRANGERS)
+def test_a_stranger_is_not_let_in(coordinator: Coordinator, ticket: Ticket, stranger: str) -> None:
+    for mode in ("client", "peer", "router"):
+        more = {"mode": mode, "connect/timeout_ms": 200, **shown_by(stranger, ticket)}
+        with pytest.raises(zenoh.ZError, match="Unable to connect"):
+            zenoh.open(star_config(ticket.endpoint, listen=False, more=more))
+
+
+def test_who_is_not_let_in_neither_hears_nor_says_anything(
+    coordinator: Coordinator, ticket: Ticket
+) -> None:
+    """Sessions that stay open and try again and again, as zenoh's do by default."""
+    strangers = []
+    for stranger in STRANGERS:
+        more = {"connect/exit_on_failure": False, "connect/timeout_ms": 0, "mode": "peer"}
+        more |= shown_by(stranger, ticket)
+        config = star_config(ticket.endpoint, listen=False, more=more)
+        strangers.append(zenoh.open(config))
+    with Plane(ticket, "plant") as plant:
+        batches = coordinator.plane.session.declare_subscriber(
+            plant.key("telemetry", "**"), RingChannel(100)
+        )
+        goodbyes = coordinator.plane.session.declare_queryable(
+            plant.key("goodbye", "*"), FifoChannel(100)
+        )
+        heard = [session.declare_subscriber("**", RingChannel(100)) for session in strangers]
+        lives = [
+            session.liveliness().declare_subscriber("**", RingChannel(100), history=True)
+            for session in strangers
+        ]
+        asked = []
+        for session in strangers:
+            for key in (
+                "stop",
+                f"left/plant/{plant.instance}",
+                "progress",
+                "telemetry/plant/plant_step",
+                "kept/plant",
+            ):
+                session.put(plant.key(*key.split("/")), "evil")
+            session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
+            for what in ("admit", "join", "goodbye"):
+                key = plant.key(what, "plant")
+                asked.append(session.get(key, FifoChannel(4), payload=HELLO, timeout=0.3))
+        plant.publish_telemetry_blocking("plant_step", b"{}", b"own")
+        # What comes after it on the same way: when that has arrived, so has all that was before.
+        wait_for(lambda: (sample := batches.try_recv()) is not None and _is_own(sample))
+        coordinator.poll()
+        assert batches.try_recv() is None
+        assert goodbyes.try_recv() is None
+        assert coordinator.missing() == (*LOOP_ROLES, "recorder")
+        assert coordinator.gone() == {}
+        assert coordinator.progress() is None
+        assert plant.stop_requested() is None
+        assert plant.kept() is None
+        for channel in (*heard, *lives):  # each hears itself, and nobody else
+            while (sample := channel.try_recv()) is not None:
+                assert sample.payload.to_bytes() in (b"", b"evil")
+                assert sample.payload.to_bytes() or "alive/sensor" in str(sample.key_expr)
+        for replies in asked:
+            assert all(reply.ok is None for reply in replies)
+    for session in strangers:
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def _is_own(sample: zenoh.Sample) -> bool:
+    assert sample.payload.to_bytes() == b"own"
+    return True
+
+
+def test_a_process_does_not_go_in_where_nothing_is_asked_of_it(ticket: Ticket) -> None:
+    """Whoever has taken a dead coordinator's port, without knowing the key."""
+    secret = secret_of(ticket)._asdict()
+    shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
+    more = {"connect/timeout_ms": 200, **shown}
+    config = star_config(ticket.endpoint, listen=False, more=more)
+    with (
+        zenoh.open(star_config(ticket.endpoint, listen=True)),
+        pytest.raises(zenoh.ZError, match="Unable to connect"),
+    ):
+        zenoh.open(config)
+
+
+def test_the_secret_is_the_documented_one(ticket: Ticket) -> None:
+    known = ticket._replace(run_id=0x0123456789ABCDEF, key=bytes(range(32)))
+    password = hashlib.blake2b(
+        b"the control plane's password", key=bytes(range(32)), digest_size=32
+    ).hexdigest()
+    assert secret_of(known) == ("0123456789abcdef", password)
+
+
+def test_the_secret_follows_from_the_key_and_does_not_tell_it(ticket: Ticket) -> None:
+    secret = secret_of(ticket)
+    assert secret == secret_of(ticket)
+    assert ticket.key.hex() not in secret.password
+    assert re.fullmatch("[0-9a-f]{64}", secret.password)
+    assert secret_of(ticket._replace(key=bytes(32))).password != secret.password
+
+
+def test_it_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
+    port = int(ticket.endpoint.rpartition(":")[2])
+    own = psutil.Process().net_connections()
+    listening = {c.laddr for c in own if c.status == psutil.CONN_LISTEN}
+    assert [address.ip for address in listening if address.port == port] == ["127.0.0.1"]
+    assert not any(c.laddr.port in (7446, 7447) for c in own)  # zenoh's scouting, its default port
+
+
+def test_no_zenoh_is_opened_but_with_a_secret() -> None:
+    root = Path(noack.__file__).parents[1]
+    rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
+    files = [file for room in rooms for file in (root / room).rglob("*.py")]
+    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["star.py"]
+
+
+def test_the_password_is_on_no_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
+    own = psutil.Process()
+    before = [file.path for file in own.open_files()], pipes()
+    with open_star(ticket.endpoint, secret_of(ticket), listen=True):
+        assert not [f for f in own.open_files() if "password" in f.path]
+        assert pipes() == before[1]
+
+
+def pipes() -> set[str]:
+    links = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        try:
+            links.append(str(descriptor.readlink()))
+        except FileNotFoundError:
+            continue
+    return {link for link in links if link.startswith("pipe:")}
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind", "line"),
+    [
+        ("", Admission, "no admission of this version of noack: "),
+        ("{", Admission, "no admission of this version of noack: "),
+        (b"\xff\xfe", Admission, "no admission of this version of noack: "),
+        ("[" * 100_000, Admission, "no admission of this version of noack: "),
+        ("{}", Begin, "epoch_ns: "),
+        ('{"epoch_ns": -1, "addresses": {}}', Begin, "epoch_ns: "),
+        ('{"epoch_ns": 1.5, "addresses": {}}', Begin, "epoch_ns: "),
+        ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', Begin, "plant"),
+        ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', Begin, "plant"),
+        ("null", Missing, "no missing of this version of noack: "),
+        ("[]", Missing, "no missing of this version of noack: "),
+        ('{"rows": {"plant_step": 5}}', Missing, "plant_step: "),
+        ('{"rows": {"plant_step": [[0]]}}', Missing, "plant_step"),
+        ('{"rows": {"plant_step": [[0, -5]]}}', Missing, "plant_step"),
+    ],
+)
+def test_an_answer_that_is_none_is_a_line(
+    coordinator: Coordinator, ticket: Ticket, answer: str | bytes, kind: Any, line: str
+) -> None:
+    queries = coordinator.plane.session.declare_queryable(
+        coordinator.plane.key("ask", "*"), FifoChannel(4)
+    )
+
+    def serve() -> None:
+        with queries.recv() as query:
+            query.reply(query.key_expr, answer)
+
+    threading.Thread(target=serve, daemon=True).start()
+    with Plane(ticket, "plant") as plant, pytest.raises(PeerError) as caught:
+        heard(kind, plant.request("ask", {}, timeout_s=30))
+    assert line in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 500
+
+
+def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticket) -> None:
+    address = ["127.0.0.1", 5]
+    said = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, address), "more": [1]}
+    queries = coordinator.plane.session.declare_queryable(
+        coordinator.plane.key("ask", "*"), FifoChannel(4)
+    )
+    threading.Thread(target=lambda: Plane.answer(queries.recv(), said), daemon=True).start()
+    with Plane(ticket, "plant") as plant:
+        told = heard(Begin, plant.request("ask", {}, timeout_s=30))
+    assert told["epoch_ns"] == 7
+    assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
+
+
+def test_a_question_whose_answer_was_lost_is_asked_again(
+    coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(noack.runtime.control_plane, "_ASK_AGAIN_S", 0.2)
+    queries = coordinator.plane.session.declare_queryable(
+        coordinator.plane.key("ask", "*"), FifoChannel(4)
+    )
+    kept = []
+
+    def serve() -> None:
+        kept.append(queries.recv())
+        Plane.answer(queries.recv(), "heard")
+
+    threading.Thread(target=serve, daemon=True).start()
+    with Plane(ticket, "plant") as plant:
+        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "heard"
+    kept.clear()
+
+
+@pytest.mark.parametrize("launched", [True, False])
+def test_a_launched_process_connects_anew_until_it_is_let_in(
+    ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
+) -> None:
+    """A connection over which nothing is answered stays so; a person is told of it instead."""
+    tries: list[FakePlane] = []
+
+    class Silent(FakePlane):
+        def __init__(self, _ticket: Ticket, role: str) -> None:
+            super().__init__()
+            tries.append(self)
+            if len(tries) == 1:
+                raise NoAnswerError("cannot reach the run's coordinator")
+
+        def request(self, what: str, *_: object, **__: object) -> bytes:
+            if len(tries) < 3:
+                raise NoAnswerError(f"no answer to {what!r}")
+            address = after = None
+            return json.dumps({
+                "incarnation": 0, "admitted_ns": 0, "from_ns": 0, "address": address, "after": after
+            }).encode()  # fmt: skip
+
+    monkeypatch.setattr(noack.runtime.process_entry, "Plane", Silent)
+    monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)
+    asking = partial(_admitted, "plant", ticket._replace(launched=launched), Signals())
+    if launched:
+        assert asking().plane is cast(Any, tries[2])
+        assert [one.is_closed for one in tries] == [False, True, False]
+    else:
+        with pytest.raises(NoAnswerError, match="cannot reach"):
+            asking()
+
+
+def meet(plane: Plane) -> None:
+    """Wait until a process knows that there is a coordinator."""
+    everyone = plane.key("alive", COORDINATOR, "*")
+    wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
+
+
+def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> None:
+    """As when the machine did not run one end of a connection for a lease."""
+    first = Coordinator(ticket)
+    with Plane(ticket, "plant") as plant:
+        meet(plant)
+        assert not plant.coordinator_gone()
+        first.close()
+        wait_for(plant.coordinator_gone)
+        assert not plant.coordinator_gone(for_s=3600)
+        second = Coordinator(ticket)
+        wait_for(lambda: not plant.coordinator_gone())
+        second.close()
+        wait_for(lambda: plant.coordinator_gone(for_s=0.2))
+        assert not plant.coordinator_gone(for_s=3600)
+
+
+def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> None:
+    ticket = ticket._replace(launched=False)
+    first = Coordinator(ticket)
+    with Plane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
+        node = Node("plant", ticket, plane, Signals())
+        meet(plane)
+        first.close()
+        wait_for(plane.coordinator_gone)
+        knocking = pool.submit(node.knock)
+        second = Coordinator(ticket)
+        while not knocking.done():
+            second.poll()
+        second.close()
+        knocking.result()
+
+
+def test_a_process_that_gets_no_answer_is_named_by_who_reports_it(
+    ticket: Ticket, coordinator: Coordinator
+) -> None:
+    """So that nobody reads ``noack sensor: sensor: no answer``."""
+    with (
+        Plane(ticket, "sensor") as plane,
+        pytest.raises(PeerError, match=r"^no answer to 'nothing'"),
+    ):
+        plane.request("nothing", {}, timeout_s=0.05)

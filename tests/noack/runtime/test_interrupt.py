@@ -1,0 +1,45 @@
+"""Ctrl-C while a program is being imported ends it with status 130, and nothing is printed."""
+
+import subprocess
+import sys
+
+import pytest
+
+INTERRUPTED = """
+import os, runpy, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == imported:
+            os.kill(os.getpid(), signal.SIGINT)
+
+module, imported, *sys.argv[1:] = sys.argv[1:]
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's & has it ignored
+sys.meta_path.insert(0, Interrupt())
+runpy.run_module(module, run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["cosim.cli", "typer", "--version"],
+        ["cosim.cli", "noack.config.scenario", "check", "lane_following"],
+        [
+            "cosim.cli",
+            "cosim.output.certificate_report",
+            "certify",
+            "lane_following",
+        ],  # which the command imports
+        ["cosim.cli", "netem.run_relay", "netem", "--help"],
+        ["netem", "netem.run_relay", "--help"],
+        ["plant_server", "noack.runtime.process_life", "--help"],
+        ["sensor_node", "noack.runtime.process_life", "--help"],
+        ["controller_node", "noack.runtime.process_life", "--help"],
+    ],
+)
+def test_interrupt_during_imports_leaves_no_traceback(words: list[str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, *words], capture_output=True, text=True, timeout=200
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")

@@ -1,0 +1,87 @@
+"""Tickets: what is one, that what is none keeps the key to itself, and one a session."""
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Barrier
+from typing import Any
+
+import pytest
+
+from noack.config.resolution import resolve
+from noack.config.scenario_file import validate
+from noack.core.errors import CallerError
+from noack.runtime.join_ticket import loads, new_ticket, published, ticket_path
+
+KEY = "ab" * 32
+
+
+@pytest.fixture
+def fields(content: dict[str, Any]) -> dict[str, Any]:
+    scenario = resolve(validate(content, "small"))
+    ticket = new_ticket(scenario, "tcp/127.0.0.1:7447", Path("run"), launched=True)
+    told: dict[str, Any] = json.loads(ticket._replace(key=bytes.fromhex(KEY)).dumps())
+    return told
+
+
+def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
+    ticket = loads(json.dumps(fields))
+    assert ticket.key.hex() == KEY
+    assert json.loads(ticket.dumps()) == fields
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("run_id", -1), ("run_id", 2**64), ("run_id", "7"), ("key", KEY[:-2]), ("key", KEY + "00"),
+        ("key", KEY.replace("a", "g")), ("key", f"{KEY} "), ("key", [KEY]), ("key", {KEY: KEY}),
+        ("endpoint", None), ("run_dir", 3), ("launched", 1), ("launched", "yes"),
+        ("scenario", None), ("scenario", {}), ("more", 0),
+    ],
+)  # fmt: skip
+def test_what_is_no_ticket_gets_a_line_without_the_key(
+    fields: dict[str, Any], key: str, value: object
+) -> None:
+    with pytest.raises(CallerError) as caught:
+        loads(json.dumps(fields | {key: value}))
+    line = str(caught.value)
+    assert line.startswith(f"not a ticket of this version of noack: {key}")
+    assert "\n" not in line
+    assert KEY[:8] not in line
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", f'{{"key": "{KEY}"', "[" * 100_000])
+def test_neither_is_other_text(text: str) -> None:
+    with pytest.raises(CallerError) as caught:
+        loads(text)
+    assert KEY[:8] not in str(caught.value)
+
+
+@pytest.mark.parametrize("left_behind", [False, True])
+def test_of_many_who_open_a_session_at_once_one_succeeds(
+    fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    ticket, at_once = loads(json.dumps(fields)), 8
+    together = Barrier(at_once)
+    if left_behind:  # by one that was killed
+        with published(ticket, "lab") as path:
+            text = path.read_text()
+        path.write_text(text)
+
+    def opened(number: int, stack: ExitStack) -> str:
+        together.wait()
+        try:
+            stack.enter_context(published(ticket._replace(run_id=number), "lab"))
+        except CallerError as error:
+            return str(error)
+        return ""
+
+    with ExitStack() as stack, ThreadPoolExecutor(at_once) as pool:
+        errors = list(pool.map(lambda number: opened(number, stack), range(at_once)))
+        winner = errors.index("")
+        refusal = "session 'lab': another run is open in it; choose --session NAME"
+        assert sorted(errors) == ["", *[refusal] * (at_once - 1)]
+        assert loads(ticket_path("lab").read_text()).run_id == winner
+    assert list(ticket_path("lab").parent.iterdir()) == []

@@ -1,0 +1,227 @@
+"""Strangers' datagrams: kept apart by the kernel, looked at within bounds, counted."""
+
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+
+import pytest
+
+from noack.protocol.wire_format import Encoder, Rejection
+from noack.runtime import udp_sockets
+from noack.runtime.peer_sockets import IN_A_FLOOD, IN_AN_INTERVAL, FloodWatch, open_beside
+from noack.runtime.udp_sockets import LOOPBACK, SHED, bind, drops_of
+from noack.runtime.unknown_sources import SourceCount
+from tests.noack.runtime.any_socket import KEY, RUN_ID, Ear, opened, sent_to
+
+BEGUN, OVER = "flood:", "the flood is over:"
+
+
+def looked_at(watch: FloodWatch, came: int) -> int:
+    """Let as many come as ``came``; return how many nobody looked at."""
+    looked = min(came, watch.left)
+    watch.left -= looked
+    return came - looked
+
+
+def test_a_few_strangers_are_no_flood() -> None:
+    watch = FloodWatch()
+    for came in (0, 1, IN_AN_INTERVAL - 1, 0, IN_AN_INTERVAL - 1):
+        assert looked_at(watch, came) == 0
+        assert watch.next_interval(0) is None
+        assert watch.left == IN_AN_INTERVAL
+
+
+def test_a_flood_is_said_once_and_its_end_with_what_was_dropped() -> None:
+    watch, dropped, lines = FloodWatch(), 7, []
+    assert watch.next_interval(dropped) is not None  # what was dropped before counts as the first
+    watch = FloodWatch()
+    for _ in range(100):
+        dropped_now = looked_at(watch, 5000)
+        assert watch.left == 0
+        dropped += dropped_now
+        lines.append(watch.next_interval(dropped))
+        assert watch.left == IN_A_FLOOD
+    assert lines[0] is not None
+    assert lines[0].startswith(BEGUN)
+    assert lines[1:] == [None] * 99
+    calm = 0
+    while (line := watch.next_interval(dropped)) is None:
+        calm += 1
+    assert line == f"{OVER} the kernel has dropped {dropped} datagrams from elsewhere"
+    assert 10 <= calm <= 40  # between half a second and two
+    assert watch.left == IN_AN_INTERVAL
+
+
+def test_a_pause_does_not_end_a_flood() -> None:
+    watch, dropped = FloodWatch(), 0
+    for interval in range(200):
+        dropped += 2 * IN_AN_INTERVAL if interval % 10 == 0 else 0
+        line = watch.next_interval(dropped)
+        assert line is None or line.startswith(BEGUN)
+    assert watch.is_flood
+
+
+def test_what_is_no_flood_by_itself_does_not_prolong_one() -> None:
+    watch, dropped = FloodWatch(), 5000
+    assert watch.next_interval(dropped) is not None
+    for _ in range(100):
+        dropped += looked_at(watch, IN_AN_INTERVAL // 2)
+        if (line := watch.next_interval(dropped)) is not None:
+            assert line.startswith(OVER)
+            break
+    assert not watch.is_flood
+    assert looked_at(watch, IN_AN_INTERVAL // 2) == 0
+
+
+def test_floods_without_end_do_not_make_lines_without_end() -> None:
+    """One that pauses just long enough to be over, for a day."""
+    watch, dropped, lines = FloodWatch(), 0, 0
+    for _ in range(24 * 3600 * 20):
+        dropped += 0 if watch.is_flood else 1000
+        lines += watch.next_interval(dropped) is not None
+    assert 100 < lines < 24 * 60 * 3
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+needs_linux = pytest.mark.skipif(
+    sys.platform != "linux", reason="only Linux keeps strangers' datagrams apart"
+)
+
+
+@needs_linux
+def test_each_hears_its_own_and_nobody_can_join_in(stack: ExitStack) -> None:
+    endpoint, first, second, stranger = (stack.enter_context(opened()) for _ in range(4))
+    beside = open_beside(endpoint, [first.getsockname(), second.getsockname()])
+    for one in beside:
+        stack.enter_context(one)
+    for number, sender in enumerate((first, second, stranger)):
+        for _ in range(number + 1):
+            sender.sendto(bytes([number]), endpoint.getsockname())
+    for number, one in enumerate((*beside, endpoint)):
+        for _ in range(number + 1):
+            assert one.recv(9) == bytes([number])
+        with pytest.raises(BlockingIOError):
+            one.recv(9)
+    for option in (socket.SO_REUSEPORT, socket.SO_REUSEADDR):
+        thief = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        thief.setsockopt(socket.SOL_SOCKET, option, 1)
+        with pytest.raises(OSError, match="in use"):
+            thief.bind(endpoint.getsockname())
+
+
+@needs_linux
+def test_a_flood_displaces_nothing_and_every_datagram_is_accounted_for(stack: ExitStack) -> None:
+    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
+    ear = stack.enter_context(closing(Ear(peer)))
+    stranger_sent = 0
+    for round_ in range(10):
+        for _ in range(1000):
+            sent_to(ear, stranger, b"x" * 80)
+        sent_to(ear, peer, ear.encoder.encode(ear.message(round_)))
+        stranger_sent += 1000
+        assert ear.turns(300) == [round_]
+        ear.tend()
+    report = ear.channel.report()
+    rejected = report["rejected"]
+    assert isinstance(rejected, dict)
+    assert rejected[SHED] > 5000
+    assert sum(rejected.values()) == stranger_sent
+    assert report["accepted"] == 10
+    assert report["lost_in_kernel"] == 0
+    assert report["shielded"] is True
+    assert [line.text.split(":")[0] for line in ear.lines] == ["flood"]
+
+
+@needs_linux
+def test_a_peer_is_heard_before_strangers(stack: ExitStack) -> None:
+    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
+    ear = stack.enter_context(closing(Ear(peer)))
+    ear.tend()
+    for _ in range(50):
+        sent_to(ear, stranger, b"")
+    sent_to(ear, peer, ear.encoder.encode(ear.message(0)))
+    assert ear.turns(1) == [0]
+
+
+@needs_linux
+def test_work_between_two_looks_at_the_clock_is_bounded(stack: ExitStack) -> None:
+    """A forged address gets junk to where the peer's datagrams are; here the peer sends it."""
+    peer = stack.enter_context(opened())
+    ear = stack.enter_context(closing(Ear(peer)))
+    for _ in range(100):
+        sent_to(ear, peer, b"x")
+    assert ear.turns(1) == []
+    assert 0 < ear.decoder.rejected[Rejection.LENGTH] <= 16
+
+
+def test_what_came_before_the_peer_was_known_is_heard_first(stack: ExitStack) -> None:
+    """Who takes another's place in a run is sent to before it can know by whom."""
+    peer = stack.enter_context(opened())
+    endpoint = stack.enter_context(bind(0, "port"))
+    encoder, early = Encoder(RUN_ID, KEY), 2 * IN_AN_INTERVAL
+    for sequence in range(early):
+        peer.sendto(encoder.encode(Ear.message(sequence)), endpoint.getsockname())
+    ear = stack.enter_context(closing(Ear(peer, endpoint)))
+    sent_to(ear, peer, encoder.encode(ear.message(early)))
+    assert ear.turns(2 * early) == list(range(early + 1))
+    ear.tend()
+    assert ear.lines == []
+
+
+def test_without_a_shield_the_loop_hears_as_well(
+    stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
+    peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
+    ear = stack.enter_context(closing(Ear(peer)))
+    for _ in range(100):
+        sent_to(ear, stranger, ear.encoder.encode(ear.message(7)))
+    sent_to(ear, peer, ear.encoder.encode(ear.message(0)))
+    assert ear.turns(30) == [0]
+    ear.tend()
+    report = ear.channel.report()
+    assert report["rejected"] == {"source": 100}
+    assert report["shielded"] is False
+    assert report["lost_in_kernel"] == 0
+    assert ear.lines == []
+
+
+def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
+    peer, rare = (LOOPBACK, 1), (LOOPBACK, 2)
+    count = SourceCount([peer, rare])
+    count.add(rare)
+    total = 1
+    for number in range(100_000):
+        for source in (peer, (f"127.0.1.{number % 251}", number % 65_521)):
+            count.add(source)
+            total += 1
+    assert len(count._others) <= 256
+    report = count.report()
+    assert report["127.0.0.1:1"] == 100_000
+    assert report["127.0.0.1:2"] == 1
+    assert len(report) <= 20
+    assert sum(report.values()) == total
+    assert count.report() == report
+
+
+def test_the_kernels_count_of_what_it_dropped_is_exact(stack: ExitStack) -> None:
+    endpoint, sender = stack.enter_context(opened()), stack.enter_context(opened())
+    for _ in range(2000):
+        sender.sendto(b"x", endpoint.getsockname())
+    dropped = drops_of(endpoint)
+    if dropped is None:
+        pytest.skip("this system does not say what it dropped")
+    taken = 0
+    try:
+        while endpoint.recv(9):
+            taken += 1
+    except BlockingIOError:
+        pass
+    assert dropped > 0
+    assert taken + dropped == 2000

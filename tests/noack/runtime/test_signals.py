@@ -1,0 +1,41 @@
+"""Signals that end a process."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from noack.core.errors import ExitStatus
+from noack.runtime.signals import Signals
+
+
+def test_a_signal_is_noted_once_however_often_it_is_passed_on() -> None:
+    with Signals().handled() as signals:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+        assert signals.received == signal.SIGINT
+        assert signals.status is ExitStatus.INTERRUPTED
+
+
+def test_who_asks_again_later_means_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = time.monotonic_ns()
+    with Signals().handled() as signals:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert signals.received == signal.SIGTERM
+        monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns + 10**10)
+        with pytest.raises(SystemExit) as ended:
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert ended.value.code is ExitStatus.TERMINATED
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_terminal_that_closes_ends_what_nohup_does_not_keep(ignored: bool) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+    try:
+        with Signals().handled() as signals:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert signals.received == (None if ignored else signal.SIGHUP)
+            assert signals.status is (ExitStatus.OK if ignored else ExitStatus.TERMINATED)
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -1,0 +1,179 @@
+import itertools
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cosim.record.run_record import merge_rows
+from noack.core.errors import MachineError
+from noack.runtime.spool import SpoolTail, SpoolWriter, read_chunks
+
+ROW = np.dtype([("input", "<i8")])
+
+
+def spool(folder: Path, writer: str, table: str, *batches: tuple[int, bytes]) -> Path:
+    with_writer = SpoolWriter(folder, writer)
+    for first, payload in batches:
+        with_writer.append(table, first, payload)
+    with_writer.close()
+    return folder / f"{table}.{writer}"
+
+
+def numbers(first: int, end: int) -> bytes:
+    return np.arange(first, end, dtype="<i8").tobytes()
+
+
+def test_batches_come_back_as_they_were_written(tmp_path: Path) -> None:
+    batches = [(0, b"abc"), (3, b""), (3, bytes(10_000)), (2**64 - 1, b"x")]
+    spool(tmp_path / "spool", "recorder", "plant_step", *batches)
+    assert list(read_chunks(tmp_path / "spool", "plant_step")) == batches
+
+
+def test_the_file_is_the_documented_sequence_of_chunks(tmp_path: Path) -> None:
+    path = spool(tmp_path, "recorder", "plant_step", (7, b"abc"), (8, b"de"))
+    expected = struct.pack("<QQ", 7, 3) + b"abc" + struct.pack("<QQ", 8, 2) + b"de"
+    assert path.read_bytes() == expected
+
+
+def test_a_batch_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
+    writer = SpoolWriter(tmp_path, "recorder")
+    for k in range(3):
+        writer.append("plant_step", k, b"x")
+        assert [first for first, _ in read_chunks(tmp_path, "plant_step")] == list(range(k + 1))
+    writer.close()
+
+
+def test_a_chunk_that_was_cut_short_is_ignored_wherever_it_was_cut(tmp_path: Path) -> None:
+    batches = [(0, b"first"), (5, b"second")]
+    path = spool(tmp_path, "recorder", "plant_step", *batches)
+    whole = path.read_bytes()
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
+
+
+def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
+    spool(tmp_path, "recorder", "step", (0, b"a"))
+    spool(tmp_path, "recorder", "step_more", (0, b"b"))
+    spool(tmp_path, "plant", "step", (1, b"c"))
+    assert sorted(read_chunks(tmp_path, "step")) == [(0, b"a"), (1, b"c")]
+    assert list(read_chunks(tmp_path, "step_more")) == [(0, b"b")]
+    assert list(read_chunks(tmp_path, "nothing")) == []
+    assert list(read_chunks(tmp_path / "nowhere", "step")) == []
+
+
+def test_a_reopened_file_is_continued(tmp_path: Path) -> None:
+    for first in (0, 1):
+        spool(tmp_path, "recorder", "step", (first, b"a"))
+    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0, 1]
+
+
+@given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
+def test_what_was_spooled_twice_is_merged(
+    tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
+) -> None:
+    """The recorder kept the first rows, the process all of them, cut into other batches."""
+    folder = tmp_path_factory.mktemp("spool")
+    for writer, cuts, end in (("recorder", cuts_a, 13), ("plant", cuts_b, 20)):
+        edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
+        batches = [(a, numbers(a, b)) for a, b in itertools.pairwise(edges)]
+        spool(folder, writer, "step", *batches)
+    rows = merge_rows([np.frombuffer(data, ROW) for _, data in read_chunks(folder, "step")], ROW)
+    assert rows["input"].tolist() == list(range(20))
+
+
+def test_a_folder_that_cannot_be_written_is_the_machines_error(tmp_path: Path) -> None:
+    writer = SpoolWriter(tmp_path / "spool", "recorder")
+    (tmp_path / "spool").rmdir()
+    with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
+        writer.append("step", 0, b"a")
+
+
+def test_a_disk_that_fills_up_is_told_by_the_batch_it_cuts_short(tmp_path: Path) -> None:
+    """Not by the next one: there may be none, and what follows would be read as rows."""
+    resource = pytest.importorskip("resource")
+    writer = SpoolWriter(tmp_path, "recorder")
+    writer.append("step", 0, bytes(100))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # as if the disk had 34 bytes left
+    try:
+        with pytest.raises(MachineError, match=r"the record cannot be written: File too large$"):
+            writer.append("step", 100, bytes(100))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        writer.close()
+    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0]
+
+
+def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
+    tail = SpoolTail(tmp_path / "spool")
+    assert list(tail.read()) == []
+    writer = SpoolWriter(tmp_path / "spool", "recorder")
+    writer.append("plant_step", 0, numbers(0, 2))
+    assert list(tail.read()) == [("plant_step", 0, numbers(0, 2))]
+    assert list(tail.read()) == []
+    writer.append("plant_step", 2, numbers(2, 3))
+    writer.append("notices_plant", 0, b"{}")
+    assert sorted(tail.read()) == [("notices_plant", 0, b"{}"), ("plant_step", 2, numbers(2, 3))]
+    writer.close()
+    tail.close()
+
+
+def test_half_a_batch_waits_for_its_other_half(tmp_path: Path) -> None:
+    chunk = struct.pack("<QQ", 0, 3) + b"abc"
+    tail, path = SpoolTail(tmp_path), tmp_path / "plant_step.recorder"
+    for size in range(len(chunk)):
+        path.write_bytes(chunk[:size])
+        assert list(tail.read()) == []
+    path.write_bytes(chunk)
+    assert list(tail.read()) == [("plant_step", 0, b"abc")]
+    tail.close()
+
+
+def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> None:
+    path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
+    tail = SpoolTail(tmp_path)
+    next(tail.read())
+    with path.open("ab") as file:
+        file.write(struct.pack("<QQ", 3, 2) + b"de")
+    path.unlink()
+    assert list(tail.read()) == [("plant_step", 3, b"de")]
+    tail.close()
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
+    (tmp_path / "spool").write_text("")
+    with pytest.raises(MachineError, match=r"spool: the record cannot be written: File exists$"):
+        SpoolWriter(tmp_path / "spool", "recorder")
+
+
+@pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])
+def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str) -> None:
+    folder = tmp_path / "spool"
+    writer = SpoolWriter(folder, "recorder")
+    writer.prepare(["step", "other"])
+    writer.append("step", 0, b"abc")
+    writer.require_present()
+    path = folder / "step.recorder"
+    if what == "folder":
+        shutil.rmtree(folder)
+    elif what == "moved":
+        path.rename(tmp_path / "elsewhere")
+    else:
+        path.unlink()
+        if what == "replaced":
+            path.write_bytes(b"")
+    writer.append("step", 3, b"de")  # the system takes it: nobody will find it
+    with pytest.raises(MachineError, match=r"/step\.recorder: was deleted or moved"):
+        writer.require_present()
+    writer.close()
+
+
+def test_no_spool_is_made_where_the_run_directory_is_gone(tmp_path: Path) -> None:
+    with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
+        SpoolWriter(tmp_path / "gone" / "spool", "recorder")
+    assert not (tmp_path / "gone").exists()

@@ -1,0 +1,246 @@
+import json
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from noack.protocol.machine_interface import Notice, Record
+from noack.runtime import telemetry
+from noack.runtime.telemetry import NOTICES, Received, TelemetryBuffer, first_row, notices_of
+
+ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
+TABLES = {"one": ROW, "two": ROW}
+BATCH = 256
+
+
+class Wire:
+    """Keeps what is published; forgets some of it when told to."""
+
+    def __init__(self) -> None:
+        self.batches: list[tuple[str, int, int, bytes]] = []
+
+    def __call__(self, table: str, header: bytes, payload: bytes) -> None:
+        fields = json.loads(header)
+        assert first_row(header) == (fields["incarnation"], fields["first"])
+        self.batches.append((table, fields["first"], fields["rows"], payload))
+
+    def rows(self, table: str) -> list[tuple[int, Any]]:
+        return [(first, np.frombuffer(p, ROW)) for t, first, _, p in self.batches if t == table]
+
+
+def row(number: int) -> tuple[int, np.ndarray]:
+    return number, np.array([number / 2, -number])
+
+
+# True appends a row to the second table, False to the first, None flushes.
+actions = st.lists(st.sampled_from([True, False, None]), max_size=30).flatmap(
+    lambda once: st.integers(1, 40).map(lambda times: once * times)
+)
+
+
+@given(actions)
+def test_batches_number_every_row_in_order(actions: list[bool | None]) -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    appended = {"one": 0, "two": 0}
+    for action in actions:
+        if action is None:
+            buffer.flush()
+            continue
+        table = "two" if action else "one"
+        buffer.append(Record(table, row(appended[table])))
+        appended[table] += 1
+    buffer.flush()
+    for table, count in appended.items():
+        batches = wire.rows(table)
+        assert all(len(rows) for _, rows in batches)
+        following = 0
+        for first, rows in batches:
+            assert first == following
+            following += len(rows)
+        numbers = np.concatenate([rows["number"] for _, rows in batches] or [[]])
+        assert numbers.tolist() == list(range(count))
+        for _, rows in batches:
+            np.testing.assert_array_equal(rows["x"][:, 1], -rows["number"])
+    assert buffer.totals() == {**appended, NOTICES: 0}
+    assert [rows for _, _, rows, _ in wire.batches] == [
+        len(payload) // ROW.itemsize for *_, payload in wire.batches
+    ]
+
+
+def test_a_full_batch_takes_the_other_tables_along() -> None:
+    """So that a reader that merges tables never waits for one of them."""
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    buffer.append(Record("two", row(0)))
+    for number in range(BATCH):
+        assert wire.batches == []
+        buffer.append(Record("one", row(number)))
+    assert sorted((table, rows) for table, _, rows, _ in wire.batches) == [
+        ("one", BATCH),
+        ("two", 1),
+    ]
+    buffer.flush()
+    assert len(wire.batches) == 2
+
+
+def test_a_row_is_copied_when_it_is_appended() -> None:
+    wire, x = Wire(), np.array([1.0, 2.0])
+    buffer = TelemetryBuffer(TABLES, wire)
+    buffer.append(Record("one", (0, x)))
+    x[:] = 9.0
+    buffer.flush()
+    ((_, rows),) = wire.rows("one")
+    assert rows["x"].tolist() == [[1.0, 2.0]]
+
+
+@given(st.integers(1, 6 * BATCH), st.data())
+def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject) -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    flushed = data.draw(st.sets(st.integers(0, count - 1), max_size=5))
+    for number in range(count):
+        buffer.append(Record("one", row(number)))
+        if number in flushed:
+            buffer.flush()
+    buffer.flush()
+    sent = len(wire.batches)
+    lost = data.draw(st.sets(st.integers(0, sent - 1)))
+    arrived = [batch for k, batch in enumerate(wire.batches) if k not in lost]
+    received = Received()
+    for _, first, n, _ in data.draw(st.permutations(arrived)):
+        received.add(first, first + n)
+    missing = received.missing(count)
+    again = Wire()
+    assert buffer.resend({"one": missing}, again) == len(lost) == len(again.batches)
+    assert again.batches == [batch for k, batch in enumerate(wire.batches) if k in lost]
+    everything = arrived + again.batches
+    for _, first, n, _ in again.batches:
+        received.add(first, first + n)
+    assert received.missing(count) == []
+    assert received.ranges == [(0, count)]
+    payloads = [p for _, _, _, p in sorted(everything, key=lambda batch: batch[1])]
+    rows = np.frombuffer(b"".join(payloads), ROW)
+    assert rows["number"].tolist() == list(range(count))
+
+
+@given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 8))), st.integers(0, 45))
+def test_what_was_received_is_known_in_as_few_ranges_as_can_be(
+    parts: list[tuple[int, int]], total: int
+) -> None:
+    received, numbers = Received(), set[int]()
+    for first, count in parts:
+        received.add(first, first + count)
+        numbers |= set(range(first, first + count))
+    assert {n for low, high in received.ranges for n in range(low, high)} == numbers
+    assert all(one[1] < other[0] for one, other in pairwise(received.ranges))
+    assert received.end == max(numbers, default=-1) + 1
+    missing = {n for low, high in received.missing(total) for n in range(low, high)}
+    assert missing == set(range(total)) - numbers
+
+
+def test_what_is_on_disk_is_kept_no_longer() -> None:
+    confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
+    buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed[-1])
+    for number in range(30):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+    buffer.notice(Notice(0, "info", "hello"))
+    confirmed.append({"one": [(0, 10), (12, 30)], NOTICES: [(0, 1)]})
+    buffer.flush()
+    again = Wire()
+    assert buffer.resend({"one": [(0, 30)], NOTICES: [(0, 1)]}, again) == 1
+    assert again.batches[0][1:3] == (10, 10)
+
+
+def test_what_was_lost_under_way_is_sent_again_while_the_run_goes_on() -> None:
+    confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire, 0, lambda: confirmed.pop() if confirmed else {})
+    for number in range(30 * 10):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+    sent = len(wire.batches)
+    confirmed.append({"one": [(0, 50)]})  # what is not there may be under way
+    buffer.flush()
+    assert len(wire.batches) == sent
+    for number in range(300, 310):
+        buffer.append(Record("one", row(number)))
+    buffer.flush()
+    sent = len(wire.batches)
+    confirmed.append({"one": [(0, 50), (250, 300)]})
+    for _ in range(10):
+        before = len(wire.batches)
+        buffer.flush()
+        assert len(wire.batches) - before <= 8
+    assert [first for _, first, _, _ in wire.batches[sent:]] == list(range(50, 250, 10))
+
+
+def test_of_a_long_run_nothing_is_kept_that_was_confirmed() -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire, 0, lambda: {"one": [(0, 10**9)]})
+    for number in range(20 * BATCH):
+        buffer.append(Record("one", row(number)))
+    buffer.flush()
+    assert buffer.resend({"one": [(0, 20 * BATCH)]}, Wire()) == 0
+
+
+def test_every_batch_that_overlaps_a_missing_range_is_sent_again() -> None:
+    buffer = TelemetryBuffer(TABLES, Wire())
+    for number in range(30):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+
+    def firsts(*ranges: tuple[int, int], table: str = "one") -> list[int]:
+        again = Wire()
+        buffer.resend({table: list(ranges)}, again)
+        return [first for _, first, _, _ in again.batches]
+
+    assert firsts((10, 20)) == [10]
+    assert firsts((9, 10)) == [0]
+    assert firsts((9, 11)) == [0, 10]
+    assert firsts((0, 1), (29, 30)) == [0, 20]
+    assert firsts((0, 30)) == [0, 10, 20]
+    assert firsts((30, 40)) == firsts() == firsts((0, 30), table="two") == []
+
+
+def test_notices_are_handed_over_at_once_and_numbered() -> None:
+    wire = Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    buffer.append(Record("one", row(0)))
+    for k in range(3):
+        buffer.notice(Notice(10 * k, "violation", f"line {k}"))
+    assert [(table, first, rows) for table, first, rows, _ in wire.batches] == [
+        (NOTICES, k, 1) for k in range(3)
+    ]
+    assert json.loads(wire.batches[1][3]) == {"t_ns": 10, "level": "violation", "text": "line 1"}
+    assert buffer.totals() == {"one": 0, "two": 0, NOTICES: 3}
+    again = Wire()
+    buffer.resend({NOTICES: [(1, 2)]}, again)
+    assert again.batches == [wire.batches[1]]
+    assert len({notices_of(role) for role in ("plant", "sensor", "netem")}) == 3
+
+
+def test_what_is_kept_is_bounded_and_the_oldest_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(telemetry, "_KEPT_BYTES", 25 * ROW.itemsize)
+    wire, again = Wire(), Wire()
+    buffer = TelemetryBuffer(TABLES, wire)
+    for number in range(40):
+        buffer.append(Record("one", row(number)))
+        if number % 10 == 9:
+            buffer.flush()
+    assert len(wire.batches) == 4  # published all the same
+    buffer.resend({"one": [(0, 40)]}, again)
+    assert [first for _, first, _, _ in again.batches] == [20, 30]
+
+
+def test_a_row_of_another_shape_is_refused() -> None:
+    buffer = TelemetryBuffer(TABLES, Wire())
+    with pytest.raises(ValueError, match="shape"):
+        buffer.append(Record("one", (0, np.zeros(3))))
