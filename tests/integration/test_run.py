@@ -304,7 +304,7 @@ def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -
     chunks = read(finished.run_dir / "recording.rrd")
     t_ns, drawn = series(chunks, blueprint.ERROR)
     order = np.argsort(t_ns)
-    np.testing.assert_allclose(drawn[order, 3], identity, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(drawn[order, 0], identity, rtol=1e-9, atol=1e-12)
     _, drawn = series(chunks, blueprint.SIZE_LOG10)
     if certified:  # there is none for a hold
         np.testing.assert_allclose(10 ** drawn[order, 1], certified[1], rtol=1e-9)

@@ -16,7 +16,7 @@ import noack
 
 _PACKAGES = ("noack", "numpy", "scipy", "numba", "llvmlite")
 _CODE = (noack, netem, cosim)
-_NO_CODE_OF_RUNS = ("campaign", "cli", "design", "paper", "report", "viewer")
+_NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
 
 @cache
@@ -51,7 +51,7 @@ def _code() -> str:
             name = path.relative_to(root)
             if package is not cosim or name.parts[0] not in _NO_CODE_OF_RUNS:
                 digest.update(path.read_bytes())
-    for module in ("draws.py", "sampled.py"):
+    for module in ("random_draws.py", "sampled_draws.py"):
         digest.update(Path(__file__).with_name(module).read_bytes())
     return digest.hexdigest()
 
