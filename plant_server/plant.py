@@ -5,7 +5,7 @@ t_{k−1}, measures, and latches the newest actuation received, which it then ho
 step is always one h long: a late step is a late step of the same length, and is caught up. What is
 held when no actuation has come for too long is the watchdog's to say (``watchdog.py``); what the
 system is, the scenario's (``systems/``), as is what disturbs it from then until t_{k+1}
-(``disturbance.py``), and what is measured of it (``measurement.py``). A
+(``disturbance_signal.py``), and what is measured of it (``measurement.py``). A
 system that fails has no state any more: x is NaN from then on, as in a plant that diverges, and a
 notice says why.
 """
