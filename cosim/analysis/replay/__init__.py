@@ -4,7 +4,8 @@ Every machine is fed its recorded inputs, in the order of the ``input`` column o
 and at their recorded ``now_ns``. Compared are
 
 * every row that it emits with the recorded row, byte for byte (``machine_replay.py``), and
-* every message that it emits with what the next process recorded as received (``message_comparison.py``).
+* every message that it emits with what the next process recorded as received
+  (``message_comparison.py``).
 
 What no output depends on cannot be compared: ``now_ns`` is checked only against the deadlines and
 against running backward.
