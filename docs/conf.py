@@ -2,6 +2,7 @@
 
 import sys
 from importlib.metadata import version as version_of
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
-    "sphinx-mathjax-offline",  # MathJax is served with the site, not from another host
     "reference_pages",
 ]
 myst_enable_extensions = ["dollarmath"]
@@ -31,7 +31,13 @@ autodoc_typehints = "description"
 
 html_theme = "furo"
 html_title = "noack"
-html_static_path = ["_static"]
+# MathJax is served with the site, not from another host. Only the package's files are used: its
+# Sphinx extension does not declare itself safe for parallel reading.
+_mathjax = find_spec("sphinx-mathjax-offline")
+assert _mathjax is not None
+assert _mathjax.submodule_search_locations is not None
+mathjax_path = "mathjax/tex-chtml.js"
+html_static_path = ["_static", str(Path(_mathjax.submodule_search_locations[0]) / "static")]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False

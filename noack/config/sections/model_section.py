@@ -62,7 +62,9 @@ class Model(Section):
         if not np.isfinite(_closed_loop(A, B, K)).all():
             raise ValueError(f"{key}: A + BK has infinite entries; check the units of A, B and K")
         if not self.allow_unstable and (why := instability(A, B, K)) is not None:
-            raise ValueError(f"{key}: {why}; if that is wanted, set model.allow_unstable = true")
+            raise ValueError(
+                f"{key}: {why}; to run the unstable loop anyway, set model.allow_unstable = true"
+            )
 
     def _check_named(self, name: str) -> None:
         if self.A is not None or self.B is not None:
