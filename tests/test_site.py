@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[1]
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "-j", "auto", "--quiet",
-         "-d", folder / "trees", ROOT / "docs", folder / "html"],
+        [sys.executable, "-m", "sphinx", "-b", "html", "-W", "--keep-going", "--quiet",
+         "--jobs", "auto", "-d", folder / "trees", ROOT / "docs", folder / "html"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
