@@ -181,6 +181,6 @@ def test_a_plants_step_is_held_against_its_period_and_a_linear_plants() -> None:
 def test_the_repositorys_files_are_copied_without_what_was_made_from_them(tmp_path: Path) -> None:
     startup.copy_repository(tmp_path)
     assert (tmp_path / "Makefile").is_file()
-    assert (tmp_path / "noack" / "wire.py").is_file()
+    assert (tmp_path / "noack" / "protocol" / "wire_format.py").is_file()
     assert not (tmp_path / ".git").exists()
     assert not list(tmp_path.rglob("*.pyc"))

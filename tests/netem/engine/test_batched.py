@@ -125,15 +125,15 @@ def handled(report: object) -> int:
 
 FIRST_START = """
 import socket
-from netem.engine import batched
+from netem.engine import batched_engine
 from netem.engine.relay_interface import LinkSpec
 from netem.engine.engine_choice import open_relay
 from noack.config.impairments import LinkSettings
-def checked(specs, bind=batched.open_links):
+def checked(specs, bind=batched_engine.open_links):
     # What came to an open port would wait until all is compiled.
-    assert specs[0].name == "none" or batched.functions().run_pump.signatures
+    assert specs[0].name == "none" or batched_engine.functions().run_pump.signatures
     return bind(specs)
-batched.open_links = checked
+batched_engine.open_links = checked
 server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 server.bind(("127.0.0.1", 0))
 server.setblocking(False)

@@ -72,7 +72,8 @@ def test_only_the_page_of_a_finished_run_moves_the_cursor(tmp_path: Path) -> Non
     path = tmp_path / "recording.rrd"
     path.write_bytes(b"RRF2")
     with RecordingServer(path, follow=False) as server:
-        page, script = server.start_page(), server.origin + "/re_viewer.js"
+        page = server.start_page()
+        script = page + "re_viewer.js"
         assert b"openAt" not in read(page)
         (tmp_path / "summary.json").write_text('{"sup_e_c_at_s": 4.244}')
         assert read(page).endswith(script_to_open_at(T_NS))
@@ -85,7 +86,9 @@ def read(url: str) -> bytes:
         return content
 
 
-def test_a_window_is_asked_until_it_has_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_is_asked_until_it_has_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: list[tuple[str, Any]] = []
 
     class Client:
@@ -102,11 +105,15 @@ def test_a_window_is_asked_until_it_has_the_recording(monkeypatch: pytest.Monkey
                 raise ConnectionError("no active recording to set the time for")
 
     monkeypatch.setattr(rerun.experimental, "ViewerClient", Client)
+    log = tmp_path / "log"
+    log.write_bytes(
+        b"Listening. Connect by running `rerun --connect rerun+http://127.0.0.1:1234/proxy`"
+    )
     with subprocess.Popen(["sleep", "600"]) as window:
-        move_window_to(T_NS, window, 1234)
+        move_window_to(T_NS, window, log.open("rb"))
         window.kill()
     wanted = ("t", {"duration": 4.244, "play_state": "paused"})
     connected = ("connect", "rerun+http://127.0.0.1:1234/proxy")
     assert asked == [connected, connected, wanted, connected, wanted]
-    move_window_to(T_NS, window, 1234)  # closed: nothing to ask
+    move_window_to(T_NS, window, log.open("rb"))  # closed: nothing to ask
     assert len(asked) == 5
