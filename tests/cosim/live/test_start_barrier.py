@@ -61,7 +61,7 @@ def test_when_another_has_come_in_its_stead_it_may_not(
     ask(plane, barrier, "admit", "two")
     assert ask(plane, barrier, "join", "two").error is None
     assert ask(plane, barrier, "join").error == (
-        "sensor cannot join: another sensor is in this run already"
+        "cannot join: another sensor is in this run already"
     )
 
 

@@ -108,7 +108,7 @@ def spoilt(record: RunRecord, seed: int) -> RunRecord:
 def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> None:
     seen: set[str] = set()
 
-    @settings(max_examples=40)
+    @settings(max_examples=120)
     @given(scenarios(make), st.integers(0, 2**32))
     def check(resolved: Scenario, seed: int) -> None:
         record = spoilt(simulate(resolved, hostile(seed)), seed)
