@@ -38,7 +38,7 @@ for mode in ("model", "zoh"):
                 )
             )
             steps = run.table("plant_step")
-            x = np.column_stack([steps[f"x_{i}"] for i in range(4)])
+            x = np.column_stack([steps[f"x_{i}"] for i in (1, 2, 3, 4)])
             norm = np.linalg.norm(x, axis=1)
             settled_s = steps["t_s"].to_numpy()[norm > 0.05 * norm[0]].max()
             rows.append((mode, loss_rate, run.events().num_rows, settled_s))

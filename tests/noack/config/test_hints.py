@@ -62,7 +62,8 @@ def test_hint_is_what_would_be_right(
     key = begin.removeprefix("--set ").partition(" = ")[0].removesuffix(".0")
     tomllib.loads(f"value = {right}")
     value = f'{{model="scripted",lost={right}}}' if key == "network.loss.lost" else right
-    load(path, [*before, f"{key.removesuffix('.lost')}={value}"])
+    setting = f"{key.removesuffix('.lost')}={value}"
+    load(path, [*before, "model.allow_unstable=true", setting])  # the hint is about the form only
 
 
 @pytest.mark.parametrize(

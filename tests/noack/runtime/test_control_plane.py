@@ -175,7 +175,7 @@ def test_no_zenoh_is_opened_but_with_a_secret() -> None:
     root = Path(noack.__file__).parents[1]
     rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
-    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["star.py"]
+    assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["zenoh_session.py"]
 
 
 def test_the_password_is_on_no_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
