@@ -15,7 +15,7 @@ from cosim.analysis.run_outcome import Outcome
 from cosim.analysis.run_summary import dumps, summarise
 from cosim.analysis.summary_check import can_be_shown
 from cosim.output.report.report_page import page
-from cosim.output.run_tables import print_outcome
+from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import changed_since, kind_of
 from cosim.record.run_directory import ENVIRONMENT_FILE, SUMMARY_FILE
 from cosim.record.run_record import RunRecord
