@@ -12,14 +12,14 @@ from netem.engine.compiled_rules import compile_rule, compiled_program, compiled
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import Verdict, dtype_of
-from noack.config.impairments import Bernoulli, LinkSettings, LossOf
+from netem.rule_records import PacketDecision, dtype_of
+from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
 from noack.protocol.record_tables import Fate
 
 LOSS = 0.5
 MANSD = 4
 SEED = 7
-_SETTINGS = LinkSettings(impairments=(LossOf(loss=Bernoulli(probability=LOSS)),), mansd=MANSD)
+_SETTINGS = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=LOSS)),), mansd=MANSD)
 
 Fates = npt.NDArray[np.uint8]
 Decide = Callable[[int], Fates]
@@ -87,7 +87,7 @@ def compiled(flows: int) -> Decide:
     def batch(count: int) -> tuple[npt.NDArray[Any], ...]:
         n = count * flows
         sizes_bytes, arrivals_ns = np.full(n, DATAGRAM_BYTES), np.zeros(n, np.int64)
-        verdicts = np.zeros(n, dtype_of(Verdict))
+        verdicts = np.zeros(n, dtype_of(PacketDecision))
         return np.tile(np.arange(flows), count), sizes_bytes, arrivals_ns, verdicts
 
     def decide(count: int) -> Fates:

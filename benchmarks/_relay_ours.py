@@ -28,7 +28,7 @@ class Ours:
     realtime: bool = False
     segment: bool = False
     engine: str | None = None
-    way_back: bool = False
+    reverse: bool = False
 
 
 class Totals(NamedTuple):
@@ -36,7 +36,7 @@ class Totals(NamedTuple):
 
     arrived: int
     forwarded: int
-    longest_drop_run: int
+    longest_loss_burst: int
     lost_in_kernel: int
 
 
@@ -45,7 +45,7 @@ def command_of(ours: Ours, to: int) -> list[str]:
     flags = {
         "--realtime": ours.realtime,
         "--segment": ours.segment,
-        "--one-way": not ours.way_back,
+        "--one-way": not ours.reverse,
     }
     engine = [] if ours.engine is None else ["--engine", ours.engine]
     return [
@@ -69,7 +69,7 @@ def totals_of(stdout: str) -> Totals:
         return Totals(
             arrived=forward["arrived"],
             forwarded=forward["forwarded"],
-            longest_drop_run=forward["longest_run"],
+            longest_loss_burst=forward["longest_loss_burst"],
             lost_in_kernel=forward["unintended"]["lost_in_kernel"],
         )
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -36,10 +36,10 @@ from cosim.simulation.batch.batch_interface import (
 )
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
-from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.config.sections.run_sections import Seeds
+from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Vector
 
 Mode = Literal["model", "zoh"]
@@ -63,7 +63,7 @@ _POLICIES: dict[str, dict[str, Any]] = {
     "relative": {"sigma": 0.2},
     "mixed": {"sigma": 0.1, "epsilon": 0.05},
     "lyapunov": {"rate_per_s": 0.3},
-    "dynamic": {"sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "reserve": 1.0},
+    "dynamic": {"sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5, "eta_0": 1.0},
     "quadratic": {
         "Q": np.diag([-0.04] * 4 + [1.0] * 4).tolist(), "epsilon": 0.0025, "period_s": 0.05
     },
@@ -89,7 +89,7 @@ def drawn(
         scenario = Scenario.model_validate_json(json.dumps(content))
 
     def draw(i: int) -> Scenario:
-        return resolve(scenario.model_copy(update={"seeds": Seeds(plant=i, loss=i)}))
+        return resolve(scenario.model_copy(update={"seeds": SeedsSection(plant=i, loss=i)}))
 
     resolved = [draw(i) for i in range(DRAWS)]
     loops = [loop_of(one) for one in resolved]
@@ -286,7 +286,7 @@ def simulated(
     """The first few draws by the exact simulator."""
     runs = []
     for (A, B, x0, _), delivered in zip(draws[:_SIMULATED], fates, strict=False):
-        loop = Loop(
+        loop = LoopMatrices(
             A[0], B[0], setting.K, setting.H, A[0], B[0], x0[0], setting.trigger.weight, (), ()
         )
         runs.append(simulate_continuous(

@@ -24,7 +24,7 @@ from benchmarks._report import Benchmark, Peer, Row, median, run, say
 from controller_node.controller import controller_of
 from cosim.cli import find_scenario
 from netem.link_machine import Datagram, update_link_of
-from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Propagator, Vector
@@ -57,7 +57,7 @@ class Inputs:
 
     def __init__(self) -> None:
         self.scenario: Scenario = resolve(load(find_scenario("lane_following"), ()))
-        self.loop: Loop = loop_of(self.scenario)
+        self.loop: LoopMatrices = loop_of(self.scenario)
         self.period_ns = self.scenario.plant_period_ns
         self.period_s = self.period_ns * 1e-9
         self.key = bytes(range(32))

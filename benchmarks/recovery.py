@@ -26,7 +26,7 @@ from cosim.live.launcher import Watcher, launch
 from cosim.record.run_record import RunRecord, load_record
 from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
-from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -120,7 +120,7 @@ def killed(role: str) -> tuple[float, float, float]:
     deliveries = fault.record[CONTROLLER_DELIVERY]
     fresh = deliveries["now_ns"] * 1e-9 >= acted_s
     if role == "sensor":
-        fresh &= deliveries["sequence"] >= INCARNATION
+        fresh &= deliveries["sequence"] >= GENERATION
     if not fresh.any():
         raise MeasurementError(f"{role}: no update was delivered afterwards")
     updated_s = float(deliveries["now_ns"][fresh][0]) * 1e-9

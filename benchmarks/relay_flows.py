@@ -35,7 +35,7 @@ WORDS = "loss 5% mansd 4 seed 7"
 COST_GOAL = Goal("<=", 1.3)
 KINDS = {
     "ours": Ours(WORDS),
-    "ours, with a way back": Ours(WORDS, way_back=True),
+    "ours, with a way back": Ours(WORDS, reverse=True),
 }
 _PACKETS = 10
 """Of each flow in a call."""

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from noack.config.parameter_changes import Change, Schedule
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.model_flow import ModelFlow
-from noack.protocol.machine_interface import BEGINNING, INCARNATION, Notice, Output, Record, Start
+from noack.protocol.machine_interface import BEGINNING, GENERATION, Notice, Output, Record, Start
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 
@@ -55,7 +55,7 @@ class Controller:
         safe_input: Vector | None = None,
         predictive: bool = False,
         setpoint: tuple[Vector, Vector] | None = None,
-        schedule: Schedule | None = None,
+        schedule: ChangeSchedule | None = None,
     ) -> None:
         steps_ns = (period_ns, phase_ns, period_ns - phase_ns)
         self._flow = ModelFlow(H, steps_ns, None if setpoint is None else setpoint[0])
@@ -86,7 +86,7 @@ class Controller:
         t_ns = self._phase_ns + self._step * self._period_ns
         return t_ns if t_ns <= self._horizon_ns else None
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Take a change; it is in force from the first tick on that is not before T.
 
         x_c follows another set-point from T itself on.
@@ -186,8 +186,8 @@ class Controller:
 
 def _between(newest: int, sequence: int) -> int:
     """How many updates the sensor has sent between two; before its restart nobody knows."""
-    again = sequence // INCARNATION != newest // INCARNATION
-    return sequence % INCARNATION if again else sequence - newest - 1
+    again = sequence // GENERATION != newest // GENERATION
+    return sequence % GENERATION if again else sequence - newest - 1
 
 
 def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
@@ -208,5 +208,5 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
         safe_input=None if safe_input is None else np.array(safe_input),
         predictive=resolved.is_predictive,
         setpoint=setpoint_of(resolved),
-        schedule=None if resolved.is_acknowledged else Schedule(resolved, setpoint_of),
+        schedule=None if resolved.is_acknowledged else ChangeSchedule(resolved, setpoint_of),
     )

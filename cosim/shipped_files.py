@@ -15,7 +15,7 @@ _SCHEMA = "#:schema"
 """The line that tells an editor where the schema lies, which is not beside a copy."""
 
 
-class Shipped(NamedTuple):
+class ShippedFile(NamedTuple):
     """A file that comes with noack."""
 
     name: str
@@ -53,10 +53,10 @@ def shipped_names(folder: str) -> list[str]:
     return sorted(file.stem for file in _place(folder).glob("*.toml"))
 
 
-def all_shipped(folder: str) -> list[Shipped]:
+def all_shipped(folder: str) -> list[ShippedFile]:
     """Return the scenarios or campaigns that come with noack, by name."""
     paths = (_path_of(name, folder) for name in shipped_names(folder))
-    return [Shipped(path.stem, toml_file.read(path)["description"], path) for path in paths]
+    return [ShippedFile(path.stem, toml_file.read(path)["description"], path) for path in paths]
 
 
 def text_of(name: str) -> str:

@@ -12,11 +12,11 @@ from noack.runtime.interrupt import quiet_interrupt
 
 with quiet_interrupt():
     from netem.duplex_link import network_of
-    from netem.run_relay import Relay
+    from netem.run_relay import RelayShell
     from noack.core.errors import ExitStatus, NoackError
     from noack.runtime.command_line import Parser, failed
     from noack.runtime.process_entry import add_options, join_run
-    from noack.runtime.process_life import Node
+    from noack.runtime.process_life import RunProcess
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
@@ -40,10 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
         return failed(str(error), error.exit_status, who="noack netem", as_json=as_json)
 
 
-def _in_a_run(node: Node) -> None:
+def _in_a_run(node: RunProcess) -> None:
     node.run(
         network_of(node.scenario, node.start),
-        lambda endpoint, addresses: Relay(
+        lambda endpoint, addresses: RelayShell(
             endpoint,
             addresses["controller"],
             addresses["sensor"],

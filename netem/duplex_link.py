@@ -7,7 +7,7 @@ random streams and guarantees are each one's own.
 from collections.abc import Sequence
 
 from netem.link_machine import Datagram, link_of, update_link_of
-from noack.config.parameter_changes import Unchangeable
+from noack.config.parameter_changes import FixedMachine
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import BEGINNING, Machine, Notice, Record, Start
 from noack.protocol.record_tables import ACKNOWLEDGEMENTS, UPDATES
@@ -16,7 +16,7 @@ ACKNOWLEDGEMENT_LINK = "acknowledgement"
 """Name of the link from controller to sensor; part of its random streams' names."""
 
 
-class Duplex(Unchangeable):
+class Duplex(FixedMachine):
     """The machine of a network with a way back.
 
     Args:
@@ -72,5 +72,5 @@ def network_of(
     forward = update_link_of(resolved, start) if forward is None else forward
     if not resolved.is_acknowledged:
         return forward
-    back = link_of(resolved.network.way_back.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start)
+    back = link_of(resolved.network.reverse.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start)
     return Duplex(forward, back, first_number=start.first_number)

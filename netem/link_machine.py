@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import Counters, Decision, FlowState, Memory, Verdict
+from netem.rule_records import Counters, FlowState, PacketDecision, RecordedDecision, StageMemory
 from netem.rules.link_rules import admit, leave
 from netem.rules.mansd import NEVER_NS
 from netem.rules.settings_change import carry
 from noack.config.impairments import LinkSettings
-from noack.config.parameter_changes import Change, Schedule
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
@@ -36,7 +36,7 @@ class Datagram(NamedTuple):
     data: bytes
 
 
-class _UnderWay(NamedTuple):
+class _InFlight(NamedTuple):
     """A datagram, or a copy, that is to leave; ties leave in the order in which they came."""
 
     release_ns: int
@@ -65,7 +65,7 @@ class Link:
         settings: LinkSettings,
         seed: int,
         *name: str,
-        decisions: Sequence[Sequence[Decision]] = (),
+        decisions: Sequence[Sequence[RecordedDecision]] = (),
         first_number: int = 0,
     ) -> None:
         self._first_delivered = settings.first_delivered
@@ -75,14 +75,14 @@ class Link:
         self._rows: dict[int, int] = {}
         self._free_rows: list[int] = []
         self._flows: list[FlowState] = []
-        self._memory: list[list[Memory]] = []
+        self._memory: list[list[StageMemory]] = []
         self._recent_ns: list[list[int]] = []
         self._state = empty_state(self._program)._replace(
             flows=self._flows, memory=self._memory, recent_ns=self._recent_ns
         )
-        self._verdict = Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0)
-        self._under_way: list[_UnderWay] = []
-        self._put_under_way = 0
+        self._verdict = PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._in_flight: list[_InFlight] = []
+        self._put_in_flight = 0
         self._inputs = self._first_number = first_number
 
     @property
@@ -91,14 +91,14 @@ class Link:
         return self._state.counters
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PacketDecision:
         """What was decided of the last datagram; overwritten by the next."""
         return self._verdict
 
     @property
-    def under_way(self) -> int:
+    def in_flight(self) -> int:
         """Datagrams, and copies, that are delayed now."""
-        return self._state.link.under_way
+        return self._state.link.in_flight
 
     @property
     def delays(self) -> bool:
@@ -133,18 +133,18 @@ class Link:
             counters=before.counters,
         )
         latest_ns = [NEVER_NS] * len(self._flows)
-        for leaving in self._under_way:
+        for leaving in self._in_flight:
             row = self._rows[leaving.datagram.flow]
             latest_ns[row] = max(latest_ns[row], leaving.release_ns)
         carry(old, before, self._program, self._state, latest_ns)
 
     def next_deadline_ns(self) -> int | None:
         """When the next datagram leaves."""
-        return self._under_way[0].release_ns if self._under_way else None
+        return self._in_flight[0].release_ns if self._in_flight else None
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Let the datagram out that is due."""
-        due = heapq.heappop(self._under_way)
+        due = heapq.heappop(self._in_flight)
         stale = self._leave(due)
         row = (
             self._inputs, self._first_number + due.packet, due.release_ns, now_ns,
@@ -179,7 +179,7 @@ class Link:
             )  # fmt: skip
         return (*outputs, record)
 
-    def decide(self, flow: int, size_bytes: int, now_ns: int) -> Verdict:
+    def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
         """Return what becomes of a flow's next datagram; the verdict is overwritten by the next."""
         row = self._rows.get(flow)
         if row is None:
@@ -201,20 +201,20 @@ class Link:
         """Send a datagram, or keep it until it is due."""
         if bit >= 0:
             message = message._replace(data=flipped(message.data, bit))
-        self._put_under_way += 1
-        leaving = _UnderWay(
-            release_ns, self._put_under_way, self._verdict.packet, copy, counts,
+        self._put_in_flight += 1
+        leaving = _InFlight(
+            release_ns, self._put_in_flight, self._verdict.packet, copy, counts,
             release_ns > now_ns, message,
         )  # fmt: skip
         # What was due before leaves before, even if nobody has come to let it out.
-        overdue = bool(self._under_way) and self._under_way[0].release_ns <= release_ns
+        overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
         if leaving.delayed or overdue:
-            heapq.heappush(self._under_way, leaving)
+            heapq.heappush(self._in_flight, leaving)
         else:
             self._leave(leaving)
             outputs.append(message)
 
-    def _leave(self, leaving: _UnderWay) -> bool:
+    def _leave(self, leaving: _InFlight) -> bool:
         return leave(
             self._state,
             self._rows[leaving.datagram.flow],
@@ -255,7 +255,7 @@ class RunLink(Link):
         settings: LinkSettings,
         seed: int,
         *name: str,
-        schedule: Schedule,
+        schedule: ChangeSchedule,
         first_number: int = 0,
     ) -> None:
         super().__init__(settings, seed, *name, first_number=first_number)
@@ -263,7 +263,7 @@ class RunLink(Link):
         self._schedule = schedule
         self._reached_ns = -1
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Take a change; it is in force from the first datagram on that comes not before T.
 
         A smaller cap is kept from that datagram on: if as many as it allows, or more, have just
@@ -304,7 +304,8 @@ def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> RunLink:
     settings, names = _at_the_start(resolved.network.link, UPDATE_LINK, start)
     return RunLink(
         settings, resolved.seeds.loss, *names,
-        schedule=Schedule(resolved, lambda one: one.network.link), first_number=start.first_number,
+        schedule=ChangeSchedule(resolved, lambda one: one.network.link),
+        first_number=start.first_number,
     )  # fmt: skip
 
 
@@ -324,5 +325,5 @@ def _at_the_start(
     """
     if not start.again:
         return settings, (name,)
-    again = f"again-{start.incarnation}"
+    again = f"again-{start.generation}"
     return settings.model_copy(update={"first_delivered": True}), (name, again)

@@ -21,24 +21,24 @@ from numpy.typing import NDArray
 
 from netem.rules.normal import score
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ _MOST_STATES = 256
 _LONGEST_PATTERN = 10_000_000
 
 
-class Prediction(NamedTuple):
+class LossPrediction(NamedTuple):
     """A loss rate, or why it cannot be told."""
 
     rate: float | None
@@ -65,40 +65,40 @@ def predicted_loss(settings: LinkSettings) -> float | None:
 
 
 @lru_cache(maxsize=64)
-def predict(settings: LinkSettings) -> Prediction:
+def predict(settings: LinkSettings) -> LossPrediction:
     """Predict the loss rate of a direction; its files are read already.
 
     What overflows a queue or is overtaken is not counted: it depends on when datagrams come.
     """
     impairments = settings.impairments
     if any(isinstance(one, Blackout) for one in impairments):
-        return Prediction(None, "what a blackout takes depends on when datagrams come")
+        return LossPrediction(None, "what a blackout takes depends on when datagrams come")
     try:
         parts = [part for one in impairments for part in _parts(one)]
         rate = _capped_rate(parts, settings.mansd)
     except _NotKnownError as error:
-        return Prediction(None, str(error))
+        return LossPrediction(None, str(error))
     notes = []
     if any(isinstance(one, Rate) for one in impairments):
         notes.append("as long as no queue overflows")
     if settings.mansd != 0 and _can_overtake(impairments):
         notes.append("not counting what is overtaken (stale)")
-    return Prediction(rate, "; ".join(notes))
+    return LossPrediction(rate, "; ".join(notes))
 
 
 def _can_overtake(impairments: Sequence[Impairment]) -> bool:
     """Whether a datagram may leave before one that came before it."""
-    delays, overtakes = False, False
+    delays, makes_stale = False, False
     for one in impairments:
         match one:
             case Rate():
-                delays, overtakes = True, False  # it serves in the order of arrival
+                delays, makes_stale = True, False  # it serves in the order of arrival
             case Delay():
                 varies = bool(one.jitter_s or one.samples_s or one.file)
-                delays, overtakes = delays or varies or one.delay_s > 0, overtakes or varies
+                delays, makes_stale = delays or varies or one.delay_s > 0, makes_stale or varies
             case Reorder():
-                overtakes = overtakes or (delays and one.probability > 0)
-    return overtakes
+                makes_stale = makes_stale or (delays and one.probability > 0)
+    return makes_stale
 
 
 class _NotKnownError(Exception):
@@ -149,18 +149,18 @@ def _parts(impairment: Impairment) -> Sequence[_Chain | _Pattern]:
 
 def _loss_parts(loss: Loss) -> Sequence[_Chain | _Pattern]:
     match loss:
-        case Lossless():
+        case NoLoss():
             return []
-        case Bernoulli():
+        case BernoulliLoss():
             return [_chance_chain(loss.probability, loss.correlation)]
-        case WorstCase():
+        case WorstCaseLoss():
             return [_Pattern(np.ones(1, bool))]
-        case GilbertElliott():
+        case GilbertElliottLoss():
             p, r = loss.transitions
             moves = np.array([[1 - p, p], [r, 1 - r]])
             does = np.array([loss.loss_in_good, loss.loss_in_bad])
             return [_Chain(np.array([1.0, 0.0]), moves, does)]
-        case FourState():
+        case FourStateLoss():
             moves = np.array([
                 [1 - loss.p13 - loss.p14, 0.0, loss.p13, loss.p14],
                 [0.0, 1 - loss.p23, loss.p23, 0.0],
@@ -169,16 +169,16 @@ def _loss_parts(loss: Loss) -> Sequence[_Chain | _Pattern]:
             ])  # fmt: skip
             does = np.array([0.0, 0.0, 1.0, 1.0])
             return [_Chain(np.eye(4)[0], np.maximum(moves, 0.0), does)]
-        case Periodic():
+        case PeriodicLoss():
             lost = np.arange(min(loss.burst, _LONGEST_PATTERN)) + loss.first
             return [_pattern(loss.period, lost % loss.period)]
-        case Scripted():
+        case ScriptedLoss():
             if not loss.repeat_every:
                 raise _NotKnownError(
                     "a script that is played once loses the same of a flow however long it is"
                 )
             return [_pattern(loss.repeat_every, np.array(loss.lost, dtype=np.int64))]
-        case Trace():
+        case TraceLoss():
             raise _NotKnownError(f"{loss.file} has not been read")
 
 

@@ -13,7 +13,7 @@ EVENT = np.dtype(
         ("mansd", "<i8"),  # the cap on successive losses, -1 none
         ("delay_ns", "<i8"),  # arrival: the delay decided, -1 never leaves; departure: the real one
         ("copy_delay_ns", "<i8"),  # arrival: the delay decided for its copy, -1 there is none
-        ("held_ns", "<i8"),  # arrival: held back by so much so that the cap holds
+        ("hold_back_ns", "<i8"),  # arrival: held back by so much so that the cap holds
         ("bit", "<i8"),  # the corrupted bit of the payload, -1 none
         ("copy_bit", "<i8"),  # arrival: the corrupted bit of its copy, -1 none
         ("offset", "<u8"),  # of the payload in the batch's data, if a tap wants data

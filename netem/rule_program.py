@@ -13,45 +13,45 @@ from typing import NamedTuple
 import numpy as np
 
 from netem.rule_records import (
-    Bottleneck,
-    Chain,
-    Chance,
+    BlackoutSettings,
+    ChanceSettings,
     Counters,
-    Darkness,
-    Decision,
+    DelaySettings,
     FlowState,
-    FourStateChain,
+    FourStateSettings,
+    GilbertElliottSettings,
     LinkState,
-    Memory,
     QueueState,
-    Script,
-    Stage,
-    Wait,
+    RateSettings,
+    RecordedDecision,
+    RuleStage,
+    ScriptSettings,
+    StageMemory,
 )
 from netem.rules import delay as shapes
 from netem.rules import link_rules as rules
-from netem.rules.link_rules import Program, State
+from netem.rules.link_rules import LinkMemory, LinkProgram
 from netem.rules.mansd import NEVER_NS
 from netem.rules.normal import score
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 from noack.core.clock import NS_PER_S
 from noack.core.random_streams import stream_key
@@ -69,9 +69,9 @@ def program_of(
     settings: LinkSettings,
     seed: int,
     *name: str,
-    decisions: Sequence[Sequence[Decision]] = (),
+    decisions: Sequence[Sequence[RecordedDecision]] = (),
     tracks: bool = False,
-) -> Program:
+) -> LinkProgram:
     """Return the program of one direction of a link.
 
     Args:
@@ -85,7 +85,7 @@ def program_of(
     for impairment in settings.impairments:
         builder.add(impairment)
     delays = any(isinstance(one, Delay | Rate) for one in settings.impairments)
-    return Program(
+    return LinkProgram(
         **builder.tables._asdict(),
         decisions=[decision for flow in decisions for decision in flow],
         decisions_begin=list(accumulate(map(len, decisions), initial=0)) if decisions else [],
@@ -111,9 +111,9 @@ def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     return builder.streams
 
 
-def empty_state(program: Program) -> State:
+def empty_state(program: LinkProgram) -> LinkMemory:
     """Return a state without flows."""
-    return State(
+    return LinkMemory(
         flows=[],
         memory=[],
         recent_ns=[],
@@ -129,25 +129,25 @@ def new_flow(number: int, first_delivered: bool) -> FlowState:
     return FlowState(number, 0, 0, int(first_delivered), NEVER_NS, 0.0, -1, 0, 0)
 
 
-def new_memory(program: Program) -> list[Memory]:
+def new_memory(program: LinkProgram) -> list[StageMemory]:
     """Return what the stages remember of a new flow."""
-    return [Memory(0, 0.0) for _ in program.stages]
+    return [StageMemory(0, 0.0) for _ in program.stages]
 
 
-def recent_width(program: Program) -> int:
+def recent_width(program: LinkProgram) -> int:
     """Length of a flow's ring of release times."""
     return program.mansd + 1 if program.tracks and program.mansd >= 0 else 1
 
 
 class _Tables(NamedTuple):
-    stages: list[Stage]
-    chances: list[Chance]
-    chains: list[Chain]
-    four_states: list[FourStateChain]
-    scripts: list[Script]
-    waits: list[Wait]
-    bottlenecks: list[Bottleneck]
-    darknesses: list[Darkness]
+    stages: list[RuleStage]
+    chances: list[ChanceSettings]
+    chains: list[GilbertElliottSettings]
+    four_states: list[FourStateSettings]
+    scripts: list[ScriptSettings]
+    waits: list[DelaySettings]
+    bottlenecks: list[RateSettings]
+    darknesses: list[BlackoutSettings]
     integers: list[int]
     reals: list[float]
 
@@ -179,7 +179,7 @@ class _Builder:
                 self._stage(rules.RATE, "rate", len(tables.bottlenecks))
                 begin = sum(bottleneck.queue for bottleneck in tables.bottlenecks)
                 tables.bottlenecks.append(
-                    Bottleneck(
+                    RateSettings(
                         impairment.rate_bps,
                         impairment.queue,
                         impairment.overhead_bytes,
@@ -192,55 +192,57 @@ class _Builder:
                 self._stage(rules.BLACKOUT, "blackout", len(tables.darknesses))
                 times_ns = [_ns(t_s) for interval in impairment.intervals_s for t_s in interval]
                 every_ns = 0 if impairment.every_s is None else _ns(impairment.every_s)
-                tables.darknesses.append(Darkness(*self._integers(times_ns), every_ns))
+                tables.darknesses.append(BlackoutSettings(*self._integers(times_ns), every_ns))
 
     def _add_loss(self, loss: Loss) -> None:
         tables = self.tables
         match loss:
-            case Lossless():
+            case NoLoss():
                 pass
-            case Bernoulli():
+            case BernoulliLoss():
                 self._add_chance(rules.BERNOULLI, loss, name="loss")
-            case GilbertElliott():
+            case GilbertElliottLoss():
                 self._stage(rules.GILBERT_ELLIOTT, "loss", len(tables.chains))
                 p, r = loss.transitions
                 share = p / (p + r) if p + r > 0 else 0.0
-                tables.chains.append(Chain(p, r, loss.loss_in_good, loss.loss_in_bad, share))
-            case FourState():
+                tables.chains.append(
+                    GilbertElliottSettings(p, r, loss.loss_in_good, loss.loss_in_bad, share)
+                )
+            case FourStateLoss():
                 self._stage(rules.FOUR_STATE, "loss", len(tables.four_states))
                 tables.four_states.append(
-                    FourStateChain(loss.p13, loss.p31, loss.p32, loss.p23, loss.p14)
+                    FourStateSettings(loss.p13, loss.p31, loss.p32, loss.p23, loss.p14)
                 )
-            case Periodic():
+            case PeriodicLoss():
                 self._stage(rules.SCRIPTED, "loss", len(tables.scripts))
-                tables.scripts.append(Script(loss.period, 0, 0, loss.burst, loss.first))
-            case Scripted():
+                tables.scripts.append(ScriptSettings(loss.period, 0, 0, loss.burst, loss.first))
+            case ScriptedLoss():
                 self._stage(rules.SCRIPTED, "loss", len(tables.scripts))
                 tables.scripts.append(
-                    Script(loss.repeat_every, *self._integers(loss.lost), burst=-1, first=0)
+                    ScriptSettings(loss.repeat_every, *self._integers(loss.lost), burst=-1, first=0)
                 )
-            case WorstCase():
+            case WorstCaseLoss():
                 self._stage(rules.WORST_CASE, "loss", 0)
-            case Trace():
+            case TraceLoss():
                 raise ValueError(f"{loss.file}: the trace has not been read")
 
     def _add_chance(
-        self, kind: int, impairment: Bernoulli | Duplicate | Corrupt | Reorder, gap: int = 1,
+        self, kind: int, impairment: BernoulliLoss | Duplicate | Corrupt | Reorder, gap: int = 1,
         name: str | None = None,
     ) -> None:  # fmt: skip
         self._stage(kind, name or impairment.model_dump()["kind"], len(self.tables.chances))
         p, correlation = impairment.probability, impairment.correlation
         threshold = -score(p) if 0 < p < 1 else math.copysign(math.inf, 0.5 - p)
         innovation = math.sqrt(1 - correlation**2)
-        self.tables.chances.append(Chance(p, threshold, correlation, innovation, gap))
+        self.tables.chances.append(ChanceSettings(p, threshold, correlation, innovation, gap))
 
-    def _wait(self, impairment: Delay) -> Wait:
+    def _wait(self, impairment: Delay) -> DelaySettings:
         if impairment.file is not None:
             raise ValueError(f"{impairment.file}: the delays have not been read")
         table_ns = sorted(t_s * NS_PER_S for t_s in impairment.samples_s or ())
         begin = len(self.tables.reals)
         self.tables.reals.extend(table_ns)
-        return Wait(
+        return DelaySettings(
             float(_ns(impairment.delay_s)),
             impairment.jitter_s * NS_PER_S,
             _SHAPES[impairment.distribution],
@@ -258,7 +260,7 @@ class _Builder:
         own = name if number == 1 else f"{name} {number}"
         self.streams.append(("netem", *self._name, own))
         key = stream_key(self._seed, *self.streams[-1])
-        self.tables.stages.append(Stage(kind, place, *key))
+        self.tables.stages.append(RuleStage(kind, place, *key))
 
     def _integers(self, numbers: Sequence[int]) -> tuple[int, int]:
         begin = len(self.tables.integers)

@@ -32,7 +32,7 @@ def array_of(record: type, rows: Sequence[Any]) -> NDArray[np.void]:
 
 
 @dataclass(slots=True)
-class Stage:
+class RuleStage:
     """One impairment of a link."""
 
     kind: int
@@ -45,7 +45,7 @@ class Stage:
 
 
 @dataclass(slots=True)
-class Chance:
+class ChanceSettings:
     """A probability, and how far successive datagrams share their fortune."""
 
     probability: float
@@ -59,7 +59,7 @@ class Chance:
 
 
 @dataclass(slots=True)
-class Chain:
+class GilbertElliottSettings:
     """A Gilbert–Elliott chain."""
 
     good_to_bad: float
@@ -71,7 +71,7 @@ class Chain:
 
 
 @dataclass(slots=True)
-class FourStateChain:
+class FourStateSettings:
     """A Markov chain of four states."""
 
     p13: float
@@ -82,7 +82,7 @@ class FourStateChain:
 
 
 @dataclass(slots=True)
-class Script:
+class ScriptSettings:
     """Which numbers of a flow are lost."""
 
     period: int
@@ -96,7 +96,7 @@ class Script:
 
 
 @dataclass(slots=True)
-class Wait:
+class DelaySettings:
     """A delay."""
 
     constant_ns: float
@@ -113,7 +113,7 @@ class Wait:
 
 
 @dataclass(slots=True)
-class Bottleneck:
+class RateSettings:
     """A rate limit and its queue."""
 
     rate_bps: int
@@ -126,7 +126,7 @@ class Bottleneck:
 
 
 @dataclass(slots=True)
-class Darkness:
+class BlackoutSettings:
     """Blackouts: intervals of time in a table."""
 
     begin: int
@@ -136,7 +136,7 @@ class Darkness:
 
 
 @dataclass(slots=True)
-class Decision:
+class RecordedDecision:
     """What once became of a datagram."""
 
     fate: int
@@ -148,7 +148,7 @@ class Decision:
 
 
 @dataclass(slots=True)
-class Memory:
+class StageMemory:
     """What a stage remembers of a flow."""
 
     phase: int
@@ -175,7 +175,7 @@ class FlowState:
     """Greatest number among the datagrams that have left intact."""
     since: int
     """Number of its first datagram under the settings that the link has now."""
-    longest_run: int
+    longest_loss_burst: int
     """Most successive datagrams since then that were not effectively delivered, as far as that is
     certain."""
 
@@ -196,12 +196,12 @@ class QueueState:
 class LinkState:
     """What a link remembers besides."""
 
-    under_way: int
+    in_flight: int
     """Datagrams, and copies, that are delayed."""
 
 
 @dataclass(slots=True)
-class Verdict:
+class PacketDecision:
     """What becomes of a datagram."""
 
     fate: int
@@ -218,9 +218,9 @@ class Verdict:
     """Which of its bits is flipped; −1 none."""
     copy_bit: int
     """Which of its copy's bits is flipped; −1 none."""
-    held_ns: int
+    hold_back_ns: int
     """By how much it is held back, as overtaking would break the guarantee."""
-    overtakes: int
+    makes_stale: int
     """How many datagrams it makes stale."""
 
 
@@ -243,9 +243,9 @@ class Counters:
     forwarded: int = 0
     """Datagrams and copies that have left."""
     forwarded_bytes: int = 0
-    overtaken: int = 0
+    delivered_out_of_order: int = 0
     """Left after a newer one of their flow: stale at the receiver."""
-    longest_run: int = 0
+    longest_loss_burst: int = 0
     """Most successive datagrams of a flow that were not effectively delivered, of those that came
     since the settings are in force."""
-    most_under_way: int = 0
+    most_in_flight: int = 0

@@ -11,7 +11,7 @@ from noack.runtime.address import Address
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, CountingSocket
 
 
-class Relay(CountingSocket[Datagram]):
+class RelayShell(CountingSocket[Datagram]):
     """The channel of a link.
 
     Args:

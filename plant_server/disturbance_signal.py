@@ -4,7 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from noack.config.disturbances import AnyDisturbance, Gaussian, Place, Sine, Step, Uniform
+from noack.config.disturbances import (
+    AnyDisturbance,
+    GaussianDisturbance,
+    Place,
+    SineDisturbance,
+    StepDisturbance,
+    UniformDisturbance,
+)
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, Vector
@@ -59,15 +66,15 @@ def _rows_of(settings: AnyDisturbance, seed: int, number: int, period_ns: int) -
 
     def rows(steps: range) -> Matrix:
         match settings:
-            case Uniform():
+            case UniformDisturbance():
                 unit = uniforms(seed, *name, rows=steps, width=len(size))
                 return np.asarray(size * (2.0 * unit - 1.0))
-            case Gaussian():
+            case GaussianDisturbance():
                 return np.asarray(size * normals(seed, *name, rows=steps, width=len(size)))
-            case Sine(hz=hz, phase_rad=phase_rad):
+            case SineDisturbance(hz=hz, phase_rad=phase_rad):
                 t_s = np.array(steps) * period_ns * 1e-9
                 return np.outer(np.sin(2 * np.pi * hz * t_s + phase_rad), size)
-            case Step(from_s=from_s, until_s=until_s):
+            case StepDisturbance(from_s=from_s, until_s=until_s):
                 t_ns = np.array(steps) * period_ns
                 there = t_ns >= round(from_s * NS_PER_S)
                 if until_s is not None:

@@ -10,7 +10,7 @@ _BLOCK = 256
 """Measurements whose noise is computed at once."""
 
 
-class Measuring:
+class MeasurementModel:
     """Measures, with noise.
 
     Args:
@@ -47,7 +47,7 @@ class Measuring:
         return noise
 
 
-def measuring_of(resolved: Scenario) -> Measuring | None:
+def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
     """Return how the plant of a resolved scenario is measured; None: x itself, and exactly."""
     settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
     if settings.selects_all(n) and not settings.is_noisy:
@@ -58,4 +58,4 @@ def measuring_of(resolved: Scenario) -> Measuring | None:
         for given in (settings.noise_std, settings.noise_bound)
     )
     C = None if settings.selects_all(n) else np.array(settings.C)
-    return Measuring(C, std, bound, resolved.seeds.noise)
+    return MeasurementModel(C, std, bound, resolved.seeds.noise)

@@ -21,10 +21,10 @@ from noack.protocol.machine_interface import FAILED, Notice, Output, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import Disturbance, disturbance_of
-from plant_server.measurement import Measuring, measuring_of
-from plant_server.system import System, SystemFailedError
+from plant_server.measurement import MeasurementModel, measurement_model_of
+from plant_server.system import PlantSystem, SystemFailedError
 from plant_server.systems.system_from_settings import system_of
-from plant_server.watchdog import Fallback, Prediction, Watchdog, hold, zero
+from plant_server.watchdog import Fallback, PredictedInput, Watchdog, hold, zero
 
 
 class Plant:
@@ -44,14 +44,14 @@ class Plant:
 
     def __init__(
         self,
-        system: System,
+        system: PlantSystem,
         watchdog: Watchdog,
         *,
         period_ns: int,
         horizon_ns: int,
         measure_every: int = 1,
         disturbance: Disturbance | None = None,
-        measuring: Measuring | None = None,
+        measuring: MeasurementModel | None = None,
         reports_inputs: bool = False,
     ) -> None:
         self._system = system
@@ -68,7 +68,7 @@ class Plant:
         self._failed = False
         self._x, self._z = system.x, system.z
         self.u = watchdog.newest.u
-        self._felt = self.u
+        self._applied_input = self.u
         """What the system is under: u, and what disturbs it."""
         self._held = [self.u] * measure_every
         """The inputs since the last measurement; before the first there were none."""
@@ -115,7 +115,7 @@ class Plant:
         if self._failed:
             return ()
         try:
-            self._system.advance(self._felt, t_ns - self._period_ns, self._period_ns)
+            self._system.advance(self._applied_input, t_ns - self._period_ns, self._period_ns)
             self._x, self._z = self._system.x, self._system.z
         except SystemFailedError as error:
             self._failed = True
@@ -126,11 +126,11 @@ class Plant:
     def _disturb(self, step: int) -> tuple[Vector, ...]:
         """Take what disturbs the system during a step; return what goes on record of it."""
         if self._disturbance is None:
-            self._felt = self.u
+            self._applied_input = self.u
             return ()
         d, w = self._disturbance(step)
         pushed = self.u + d if len(d) else self.u
-        self._felt = np.concatenate([pushed, w]) if len(w) else pushed
+        self._applied_input = np.concatenate([pushed, w]) if len(w) else pushed
         return d, w
 
     def _count(self) -> int:
@@ -147,7 +147,7 @@ def plant_of(resolved: Scenario) -> Plant:
         horizon_ns=resolved.horizon_ns,
         measure_every=resolved.plant.measure_every,
         disturbance=disturbance_of(resolved),
-        measuring=measuring_of(resolved),
+        measuring=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
     )
 
@@ -157,7 +157,7 @@ def _watchdog_of(resolved: Scenario) -> Watchdog:
     fallbacks: dict[str, tuple[Fallback, str]] = {
         "hold": (hold, "held"),
         "zero": (zero, "0"),
-        "model": (Prediction(loop.H, loop.K, resolved.plant_period_ns), "the model's"),
+        "model": (PredictedInput(loop.H, loop.K, resolved.plant_period_ns), "the model's"),
     }
     fallback, said = fallbacks[resolved.plant.watchdog.policy]
     return Watchdog(loop.m, resolved.actuation_timeout_ns, fallback, said)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import logm
 
 from noack.core.linear_systems import Matrix, Vector
-from plant_server.system import System
+from plant_server.system import PlantSystem
 
 _STEP_NS = 10_000_000
 _OFF = 1e-4
@@ -19,7 +19,7 @@ _MISSED = 0.05
 
 
 def linearise(
-    system_at: Callable[[Vector], System],
+    system_at: Callable[[Vector], PlantSystem],
     n: int,
     m: int,
     *,

@@ -10,7 +10,7 @@ class SystemFailedError(NoackError):
     """A system cannot go on; what it says is one line that names it."""
 
 
-class System(Protocol):
+class PlantSystem(Protocol):
     """A system that holds its own state.
 
     What it does is a function of its start and of the steps since: the same steps give the same

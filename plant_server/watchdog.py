@@ -52,7 +52,7 @@ def zero(newest: Actuation, t_ns: int) -> Vector:
     return np.zeros_like(newest.u)
 
 
-class Prediction:
+class PredictedInput:
     """The input that the controller's model asks for, from the last state of it that came.
 
     Args:

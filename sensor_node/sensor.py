@@ -6,7 +6,7 @@ whether or not the update survives the network: nothing is acknowledged.
 
 from collections.abc import Sequence
 
-from noack.config.parameter_changes import Change, Schedule
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -47,7 +47,7 @@ class Sensor:
         period_ns: int | None = None,
         first_number: int = 0,
         setpoint: Vector | None = None,
-        schedule: Schedule | None = None,
+        schedule: ChangeSchedule | None = None,
     ) -> None:
         self._flow = ModelFlow(H, () if period_ns is None else (period_ns,), setpoint)
         self._schedule = schedule
@@ -69,7 +69,7 @@ class Sensor:
         """Nothing is ever due."""
         return ()
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Take a change; it is in force from the first measurement on that is not before T.
 
         x_s follows another set-point from T itself on.
@@ -146,7 +146,7 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
         )
     return Sensor(
         loop.H, policy, x0, period_ns=period_ns, first_number=first, setpoint=loop.setpoint,
-        schedule=Schedule(resolved, _prepared),
+        schedule=ChangeSchedule(resolved, _prepared),
     )  # fmt: skip
 
 

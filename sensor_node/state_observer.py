@@ -17,8 +17,8 @@ from typing import Protocol
 
 import numpy as np
 
-from noack.config.observers import Kalman, Luenberger
-from noack.config.parameter_changes import Change, Changeable
+from noack.config.observers import KalmanSettings, LuenbergerSettings
+from noack.config.parameter_changes import ParameterChange, ReconfigurableMachine
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import EstimationModel, believed_model
@@ -28,7 +28,7 @@ from noack.protocol.record_tables import SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
 
 
-class Observer(Protocol):
+class StateObserver(Protocol):
     """Estimates a state, measurement by measurement."""
 
     x: Vector
@@ -102,7 +102,7 @@ class KalmanObserver:
         self.covariance = 0.5 * (P + P.T)
 
 
-class Following:
+class AppliedInputTracker:
     """An observer that follows the measurements through their times.
 
     Args:
@@ -114,7 +114,12 @@ class Following:
     """
 
     def __init__(
-        self, observer: Observer, inputs: int, outputs: int, period_ns: int, since_ns: int | None
+        self,
+        observer: StateObserver,
+        inputs: int,
+        outputs: int,
+        period_ns: int,
+        since_ns: int | None,
     ) -> None:
         self._observer = observer
         self._inputs = inputs
@@ -130,13 +135,13 @@ class Following:
     def take(self, t_ns: int, y: Vector, inputs: Vector) -> Vector:
         """Return x̂ at the time of a measurement, shape (n,)."""
         since_ns = t_ns if self._t_ns is None else self._t_ns
-        for u in self._felt((t_ns - since_ns) // self._period_ns, inputs):
+        for u in self._applied_input((t_ns - since_ns) // self._period_ns, inputs):
             self._observer.predict(u)
         self._observer.correct(y)
         self._t_ns = t_ns
         return self._observer.x
 
-    def _felt(self, steps: int, inputs: Vector) -> Iterable[Vector]:
+    def _applied_input(self, steps: int, inputs: Vector) -> Iterable[Vector]:
         """The inputs of the last steps, so far as known."""
         known = inputs.reshape(-1, self._inputs)
         for before in range(steps, 0, -1):
@@ -153,7 +158,11 @@ class ObservingSensor:
     """
 
     def __init__(
-        self, following: Following, sensor: Changeable[Message], *, again: bool = False
+        self,
+        following: AppliedInputTracker,
+        sensor: ReconfigurableMachine[Message],
+        *,
+        again: bool = False,
     ) -> None:
         self._following = following
         self._sensor = sensor
@@ -167,7 +176,7 @@ class ObservingSensor:
         """Nothing is ever due."""
         return self._sensor.on_timer(now_ns)
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Tell the sensor behind it; nothing that an observer knows can be changed."""
         return self._sensor.announce(change, now_ns)
 
@@ -190,7 +199,7 @@ class ObservingSensor:
         return outputs
 
 
-def observer_of(resolved: Scenario, *, known: bool) -> Following | None:
+def observer_of(resolved: Scenario, *, known: bool) -> AppliedInputTracker | None:
     """Return the observer of a resolved scenario; None if it has none.
 
     Args:
@@ -205,11 +214,11 @@ def observer_of(resolved: Scenario, *, known: bool) -> Following | None:
     x = loop.x0 if told else np.zeros(loop.n)
     if settings.initial_estimate is not None:
         x = np.array(settings.initial_estimate)
-    observer: Observer
+    observer: StateObserver
     match settings:
-        case Luenberger():
+        case LuenbergerSettings():
             observer = LuenbergerObserver(model, np.array(settings.gain), x)
-        case Kalman():
+        case KalmanSettings():
             observer = KalmanObserver(model, x, np.diag(np.square(settings.initial_std)))
     period_ns, since_ns = resolved.plant_period_ns, 0 if told else None
-    return Following(observer, loop.m, resolved.outputs, period_ns, since_ns)
+    return AppliedInputTracker(observer, loop.m, resolved.outputs, period_ns, since_ns)

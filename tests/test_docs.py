@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from typer.main import get_command
 
 from cosim.cli import app
-from cosim.studies.campaign.campaign_file import Axis, Campaign, Comparison, Figure, Metrics
+from cosim.studies.campaign.campaign_file import Axis, Campaign, Figure, Metrics, PairedComparison
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from cosim.studies.campaign.campaign_grid import grid
 from cosim.studies.campaign.metrics import METRICS
@@ -209,7 +209,7 @@ def documented_keys(text: str) -> set[str]:
 def test_every_key_of_a_campaign_is_documented_and_no_other() -> None:
     text = (ROOT / "docs/campaigns.md").read_text()
     text = text.partition("## The file")[2].partition("## Draws")[0]
-    sections = {"axes": Axis, "metrics": Metrics, "compare": Comparison}
+    sections = {"axes": Axis, "metrics": Metrics, "compare": PairedComparison}
     keys = set(Campaign.model_fields) - {"metrics", "compare"} | {"figures.kind", "figures.where"}
     keys |= {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}
     figures = {table.model_fields["kind"].default: table for table in choices(Figure)}

@@ -28,7 +28,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     tables,
 )
-from noack.protocol.topology import LEGS
+from noack.protocol.topology import ROUTES
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.trigger.decaying import DecayingTrigger
 from plant_server.plant import Plant
@@ -246,10 +246,10 @@ def test_nothing_flows_from_the_controller_to_the_sensor(case: Case) -> None:
 
 
 def test_only_the_plant_is_heard_by_the_sensor() -> None:
-    assert [role for role, leg in LEGS.items() if leg.to == "sensor"] == ["plant"]
-    assert LEGS["controller"].to == "plant"
+    assert [role for role, leg in ROUTES.items() if leg.to == "sensor"] == ["plant"]
+    assert ROUTES["controller"].to == "plant"
     for flow in (Flow.UPDATE, Flow.ACTUATION):
-        ear = Decoder(LEGS["sensor"].receives, 2, RUN, KEY)
+        ear = Decoder(ROUTES["sensor"].receives, 2, RUN, KEY)
         data = Encoder(RUN, KEY).encode(Message(flow, 0, 0, np.zeros(2)))
         assert ear.decode(data) is None
         assert ear.rejected[Rejection.FLOW] == 1
@@ -257,10 +257,10 @@ def test_only_the_plant_is_heard_by_the_sensor() -> None:
 
 def test_acknowledgements_are_no_leg_of_the_loop_and_are_heard_by_nobody_in_it() -> None:
     """Not even one of the run's own key: a decoder of the ordinary loop takes one flow."""
-    assert all(Flow.ACKNOWLEDGEMENT not in (leg.receives, leg.sends) for leg in LEGS.values())
+    assert all(Flow.ACKNOWLEDGEMENT not in (leg.receives, leg.sends) for leg in ROUTES.values())
     data = Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(0)))
     for role in ("plant", "sensor", "controller"):
-        ear = Decoder(LEGS[role].receives, 1, RUN, KEY)
+        ear = Decoder(ROUTES[role].receives, 1, RUN, KEY)
         assert ear.decode(data) is None
         assert ear.rejected[Rejection.LENGTH] == 1
 

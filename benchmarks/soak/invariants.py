@@ -78,9 +78,9 @@ class Invariants:
         return dict(self._counts)
 
     @property
-    def overtaken(self) -> int:
+    def delivered_out_of_order(self) -> int:
         """Updates that left the network after a newer one."""
-        return self._network.overtaken
+        return self._network.delivered_out_of_order
 
     def account(self) -> dict[str, object]:
         """What was looked at, for the soak's result."""
@@ -88,8 +88,8 @@ class Invariants:
             "rows": self.rows,
             "events": self._events,
             "deliveries": self._counts[CONTROLLER_DELIVERY],
-            "overtaken": self.overtaken,
-            "longest_drop_run": self._network.longest_run,
+            "delivered_out_of_order": self.delivered_out_of_order,
+            "longest_loss_burst": self._network.longest_loss_burst,
             "identity_residual_relative": self._worst_residual,
             "most_held": self._most_held,
             "broken": self.broken_count,
@@ -141,8 +141,8 @@ class Invariants:
             self._join(final=final)
         self._most_held = max(self._most_held, held)
         for leg in legs:
-            under_way = _UNDER_WAY if leg is self._actuations else 0
-            self._break(leg.end(under_way) if final else leg.judge())
+            in_flight = _UNDER_WAY if leg is self._actuations else 0
+            self._break(leg.end(in_flight) if final else leg.judge())
 
     def _judge_plant(self) -> None:
         if len(rows := self._take(PLANT_STEP)):

@@ -88,10 +88,10 @@ class Leg:
             yield f"{self._what}: {self.waiting} numbers wait for the other end"
             self._sent, self._arrived = self._sent[:0], self._arrived[:0]
 
-    def end(self, under_way: int) -> Iterator[str]:
+    def end(self, in_flight: int) -> Iterator[str]:
         """Yield what never came; what was sent last may be under way at the end."""
         yield from self.judge()
-        if len(self._sent) > under_way:
+        if len(self._sent) > in_flight:
             yield f"{self._what} {self._sent[0]} and {len(self._sent) - 1} more never came"
         if len(self._arrived):
             yield f"{self._what} {self._arrived[0]} came, but was not sent"

@@ -117,16 +117,16 @@ class Network:
 
     def __init__(self, mansd: int) -> None:
         self._mansd = mansd
-        self._under_way: dict[int, int] = {}
+        self._in_flight: dict[int, int] = {}
         self._packets = 0
-        self.longest_run = 0
-        self.overtaken = 0
+        self.longest_loss_burst = 0
+        self.delivered_out_of_order = 0
         """Updates that left after a newer one; the controller takes them for old ones."""
 
     @property
     def waiting(self) -> int:
         """Updates that have not left yet."""
-        return len(self._under_way)
+        return len(self._in_flight)
 
     def take(self, packets: Rows, releases: Rows) -> tuple[list[int], list[int], list[str]]:
         """Take rows of the network's tables that follow one another in the order of inputs.
@@ -138,7 +138,7 @@ class Network:
         wrong = [] if len(updates) == len(packets) else ["netem_packet: something is no update"]
         lost = ~effective(updates["fate"])
         longest = int(updates["drop_run"][lost].max(initial=0))
-        self.longest_run = max(self.longest_run, longest)
+        self.longest_loss_burst = max(self.longest_loss_burst, longest)
         if longest > self._mansd:
             wrong.append(f"netem_packet: {longest} dropouts in a row, at most {self._mansd} agreed")
         places = self._packets + np.arange(len(packets))
@@ -150,13 +150,13 @@ class Network:
             if row["release_ns"] <= row["now_ns"]:
                 left.append((int(row["input"]), sequence))
             else:
-                self._under_way[int(row["sequence"])] = sequence
+                self._in_flight[int(row["sequence"])] = sequence
         for row in releases:
-            sequence = self._under_way.pop(int(row["sequence"]), None)
+            sequence = self._in_flight.pop(int(row["sequence"]), None)
             if sequence is None:
                 wrong.append(f"netem_release: packet {row['sequence']} was not under way")
             elif row["stale"]:
-                self.overtaken += 1
+                self.delivered_out_of_order += 1
             else:
                 left.append((int(row["input"]), sequence))
         return sequences.tolist(), [sequence for _, sequence in sorted(left)], wrong

@@ -101,7 +101,7 @@ class Result:
     def as_json(self) -> dict[str, Any]:
         """Everything, for ``--json``."""
         kept = (
-            "exit", "events", "deliveries", "drops", "longest_drop_run", "missing_samples",
+            "exit", "events", "deliveries", "drops", "longest_loss_burst", "missing_samples",
             "lost_outside_netem", "replay", "lateness_us", "reached_s", "horizon_s", "speed",
         )  # fmt: skip
         return {
@@ -162,7 +162,7 @@ def _lines(result: Result) -> list[str]:
     peaks = ", ".join(f"{role} {kib / 1024:,.0f}" for role, kib in result.end_peak_kib.items())
     return [
         f"checked on the way: {sum(rows.values()):,} rows, {account['events']:,} events, "
-        f"{account['deliveries']:,} deliveries; longest drop run {account['longest_drop_run']}; "
+        f"{account['deliveries']:,} deliveries; longest drop run {account['longest_loss_burst']}; "
         f"(I1) to {account['identity_residual_relative']:.1e} of ‖x_s‖; at most "
         f"{account['most_held']:,} rows held; {account['broken']} broken",
         f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: "

@@ -218,12 +218,17 @@ class _Soak:
         except (OSError, ValueError) as error:
             faults.append(f"no summary: {error}; exit status {status}")
             return {}
-        faults += ended_badly(summary, status, self._invariants.rows, self._invariants.overtaken)
+        faults += ended_badly(
+            summary, status, self._invariants.rows, self._invariants.delivered_out_of_order
+        )
         return summary
 
 
 def ended_badly(
-    summary: Mapping[str, Any], status: int, rows: Mapping[str, int], overtaken: int = 0
+    summary: Mapping[str, Any],
+    status: int,
+    rows: Mapping[str, int],
+    delivered_out_of_order: int = 0,
 ) -> list[str]:
     """What a run's summary says that it must not say, in words.
 
@@ -231,7 +236,7 @@ def ended_badly(
         summary: of the run.
         status: exit status of ``noack run``.
         rows: how many were seen on the way, by table.
-        overtaken: updates that left the network after a newer one.
+        delivered_out_of_order: updates that left the network after a newer one.
     """
     faults = []
     if status or summary["exit"]["status"]:
@@ -240,7 +245,10 @@ def ended_badly(
         ("missing_samples", 0),
         ("lost_outside_netem", 0),
         ("assumption_violations", []),
-        ("rejected_datagrams", {"controller": {"stale": overtaken}} if overtaken else {}),
+        (
+            "rejected_datagrams",
+            {"controller": {"stale": delivered_out_of_order}} if delivered_out_of_order else {},
+        ),
     ):
         if summary[key] != right:
             faults.append(f"{key}: {summary[key]}")

@@ -47,7 +47,7 @@ _STAGES = ("sampling", "delay", "held actuation", "unexplained")
 
 
 @dataclass(frozen=True)
-class Difference:
+class SignalDifference:
     """A difference of two runs in x over all measurements."""
 
     rms: float
@@ -59,11 +59,11 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Stage:
+class FidelityStage:
     """What one effect adds to the difference between the ideal loop and the live run."""
 
     name: str
-    difference: Difference
+    difference: SignalDifference
     """To the stage before."""
     share: float
     """Of the whole difference D, ⟨d, D⟩/⟨D, D⟩; the shares add up to 1, one may be negative."""
@@ -87,9 +87,9 @@ class Fidelity:
     state_names: tuple[str, ...]
     rms_live: float
     """Root mean square of ‖x‖ in the live run, for scale."""
-    total: Difference
+    total: SignalDifference
     """Live run minus the ideal loop."""
-    stages: tuple[Stage, ...]
+    stages: tuple[FidelityStage, ...]
     explained_relative: float
     """RMS of what remains unexplained over the RMS of the whole difference."""
     events_ideal: int
@@ -152,14 +152,14 @@ def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
     if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
         return nothing | {"reason": "the run is long; `noack fidelity` compares it"}
     try:
-        return fidelity_of(record, _EVENTS_AT_THE_END).compact()
+        return compute_fidelity(record, _EVENTS_AT_THE_END).compact()
     except NoackError as error:
         return nothing | {"reason": str(error)}
     except Exception as error:  # whatever it is, the run itself went as it went
         return nothing | {"reason": repr(error)}
 
 
-def fidelity_of(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
+def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
     """Compare a live run with the ideal loop, effect by effect.
 
     Args:
@@ -208,7 +208,7 @@ def fidelity_of(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
         rms_live=_difference(live.x).rms,
         total=total,
         stages=tuple(
-            Stage(
+            FidelityStage(
                 name,
                 _difference(states[i + 1] - states[i]),
                 _share(states[i + 1] - states[i], whole),
@@ -256,9 +256,9 @@ def is_against(share: float) -> bool:
     return round(100 * share, 1) < 0
 
 
-def _difference(x: Matrix) -> Difference:
+def _difference(x: Matrix) -> SignalDifference:
     norms = np.linalg.norm(x, axis=1)
-    return Difference(
+    return SignalDifference(
         rms=float(np.sqrt(np.mean(norms**2))),
         max=float(norms.max()),
         rms_by_state=tuple(np.sqrt(np.mean(x**2, axis=0)).tolist()),

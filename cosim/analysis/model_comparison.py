@@ -10,7 +10,7 @@ from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
 from plant_server.plant_linearisation import linearise
-from plant_server.system import System
+from plant_server.system import PlantSystem
 from plant_server.systems.system_from_settings import system_of
 
 Linearisation = dict[str, Any]
@@ -27,7 +27,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
         return None
     loop, plant = loop_of(resolved), resolved.plant
 
-    def system_at(x0: Vector) -> System:
+    def system_at(x0: Vector) -> PlantSystem:
         started = plant.model_copy(update={"initial_state": tuple(x0.tolist())})
         return system_of(resolved.model_copy(update={"plant": started}))
 

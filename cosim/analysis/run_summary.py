@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.align import Joined, identity_residual, join_all
+from cosim.record.align import AlignedRun, identity_residual, join_all
 from cosim.record.divergence import Divergence, divergence
 from cosim.record.estimation_error import disturbance_summary, estimation_summary, true_states
-from cosim.record.packet_outcomes import Crossing, crossing
+from cosim.record.packet_outcomes import PacketOutcome, crossing
 from cosim.record.recorded_changes import NEVER_NS, changes_of
 from cosim.record.run_record import Life, Rows, RunRecord
 from netem.loss_prediction import predicted_loss
@@ -20,7 +20,7 @@ from noack.config.runtime_parameters import text_of
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus
 from noack.core.linear_systems import row_norms
-from noack.protocol.machine_interface import FAILED, INCARNATION, RESTART
+from noack.protocol.machine_interface import FAILED, GENERATION, RESTART
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -90,8 +90,9 @@ def _summarise(
         "loss_expected": None if scenario.changes else predicted_loss(scenario.network.link),
         "drops_by_cause": _causes(crossed),
         "forced_deliveries": int((crossed.rows["fate"] == Fate.FORCED).sum()),
-        "longest_drop_run": max(
-            crossed.longest_run(), int(record[CONTROLLER_DELIVERY]["dropouts"].max(initial=0))
+        "longest_loss_burst": max(
+            crossed.longest_loss_burst(),
+            int(record[CONTROLLER_DELIVERY]["dropouts"].max(initial=0)),
         ),
         "assumption_violations": _violations(record),
         "assumptions": [assumption._asdict() for assumption in assumptions(scenario)],
@@ -136,7 +137,7 @@ def _summarise(
     return finite
 
 
-def _true_e_c(record: RunRecord, joined: Joined) -> NDArray[np.float64]:
+def _true_e_c(record: RunRecord, joined: AlignedRun) -> NDArray[np.float64]:
     """‖x_c − x‖_W against the plant's own state, from the controller's first update on."""
     e_c = joined.x_c - true_states(record[PLANT_STEP], joined.t_ns)
     if record.loop.weight is not None:
@@ -169,7 +170,7 @@ def _acknowledgements(record: RunRecord) -> dict[str, int]:
     return {
         "sent": len(record[CONTROLLER_DELIVERY]),
         "lost": int(crossed.lost.sum()),
-        "longest_loss_run": crossed.longest_run(),
+        "longest_loss_run": crossed.longest_loss_burst(),
         "received": len(record[SENSOR_ACKNOWLEDGEMENT]),
     }
 
@@ -185,8 +186,10 @@ def _finite(value: Any) -> Any:
 
 def _rejected(channel: Mapping[str, Any]) -> dict[str, int]:
     """What a process rejected, by reason, of all that it hears."""
-    heard = Counter(channel.get("rejected") or {})
-    return dict(heard + Counter((channel.get("acknowledgements") or {}).get("rejected") or {}))
+    parse_message = Counter(channel.get("rejected") or {})
+    return dict(
+        parse_message + Counter((channel.get("acknowledgements") or {}).get("rejected") or {})
+    )
 
 
 def _why_failed(
@@ -252,12 +255,12 @@ def _changes(record: RunRecord) -> list[dict[str, Any]]:
     ]
 
 
-def _causes(crossed: Crossing) -> dict[str, int]:
+def _causes(crossed: PacketOutcome) -> dict[str, int]:
     """How many updates were lost by what."""
     fates = crossed.rows["fate"]
     causes = {
         fate.name.lower(): int((fates == fate).sum()) for fate in Fate if not fate.effective
-    } | {"overtaken": int((effective(fates) & crossed.lost).sum())}
+    } | {"delivered_out_of_order": int((effective(fates) & crossed.lost).sum())}
     return {cause: n for cause, n in causes.items() if n}
 
 
@@ -283,8 +286,8 @@ def _missing(record: RunRecord) -> Counter[str]:
                 continue
             # The process died without a report: its inputs are numbered, so gaps still show.
             inputs = np.concatenate([rows["input"] for rows in life.rows.values()])
-            for of in np.unique(inputs // INCARNATION):
-                numbers = inputs[inputs // INCARNATION == of] % INCARNATION
+            for of in np.unique(inputs // GENERATION):
+                numbers = inputs[inputs // GENERATION == of] % GENERATION
                 missing[role] += int(numbers.max()) + 1 - len(numbers)
     return missing
 
@@ -300,7 +303,7 @@ def _restarts(record: RunRecord) -> list[dict[str, Any]]:
                 for number, notice in enumerate(notices, 1)
             ]
             continue
-        acted_s = {life.incarnation: _acted_s(life) for life in record.lives(role)}
+        acted_s = {life.generation: _acted_s(life) for life in record.lives(role)}
         # Each says it once; if one's word is lost, it is that of one that did not live long.
         said = dict(enumerate(notices, max(max(acted_s) - len(notices), 0) + 1))
         last_s = acted_s.pop(0)[-1]
@@ -313,11 +316,11 @@ def _restarts(record: RunRecord) -> list[dict[str, Any]]:
 
 
 def _restart(
-    process: str, incarnation: int, last_s: float | None, first_s: float | None, what: str | None
+    process: str, generation: int, last_s: float | None, first_s: float | None, what: str | None
 ) -> dict[str, Any]:
     return {
         "process": process,
-        "incarnation": incarnation,
+        "generation": generation,
         "last_s": last_s,
         "first_s": first_s,
         "what": what,

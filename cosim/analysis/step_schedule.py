@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.condition_reader import observe
+from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.record.recorded_changes import changes_of
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.continuous.network_fates import network_fates
-from cosim.simulation.continuous.plant_grid_loop import NO_ACTUATION, Schedule
+from cosim.simulation.continuous.plant_grid_loop import NO_ACTUATION, StepSchedule
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.protocol.record_tables import (
@@ -33,7 +33,7 @@ class IncomparableError(CallerError):
 class LiveRun(NamedTuple):
     """A live run on the plant's grid, up to its last measurement."""
 
-    schedule: Schedule
+    schedule: StepSchedule
     x: Matrix
     """The plant's state at the measurements, (k, n)."""
     event_s: Vector
@@ -79,7 +79,7 @@ def live_run(record: RunRecord) -> LiveRun:
     measured[sensor["t_ns"] // period_ns] = True
     ticks, taken = _ticks(record[CONTROLLER_STEP], record[CONTROLLER_DELIVERY])
     latched = _latched(steps["actuation"], ticks)
-    seen = observe(record)
+    seen = read_conditions(record)
     if len(seen.watchdog.t_s) or len(seen.safe_input.t_s):
         raise IncomparableError(
             "for a time the input was the watchdog's, or a safe one, which no ideal loop has"
@@ -89,7 +89,7 @@ def live_run(record: RunRecord) -> LiveRun:
     acts_at_tick = np.searchsorted(ticks.newest, numbers)
     acts_at_step = np.searchsorted(latched.newest, numbers)
     act_ns = np.append(ticks.model_ns, _NEVER_NS)[acts_at_tick]
-    schedule = Schedule(
+    schedule = StepSchedule(
         period_ns=period_ns,
         measured=measured,
         delivered=_fates(taken, len(events), network_fates(record.scenario)),

@@ -175,7 +175,7 @@ class _Shown(_Part):
     drops_by_cause: Counts | None = None
     loss_expected: float | None = None
     forced_deliveries: Number
-    longest_drop_run: Number
+    longest_loss_burst: Number
     assumption_violations: list[_Violation]
     assumptions: list[_Assumption]
     missing_samples: Number

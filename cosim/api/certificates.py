@@ -7,10 +7,10 @@ from cosim.output.row_display import Rows, as_html, as_text
 from noack.config.scenario import Scenario
 
 if TYPE_CHECKING:
-    from cosim.output.certificate_report import Limits, Study
+    from cosim.output.certificate_report import NetworkLimits, Study
     from noack.core.linear_systems import Matrix
     from noack.theory.paper_bounds import Theorem2
-    from noack.theory.scenario_certificates import Certificate
+    from noack.theory.scenario_certificates import ScenarioCertificate
 
 
 class Certificates:
@@ -32,27 +32,27 @@ class Certificates:
         return self._study.resolved
 
     @property
-    def paper(self) -> "Certificate":
+    def paper(self) -> "ScenarioCertificate":
         """Under the paper's conditions: nothing is sampled, delayed or held."""
         return self._study.certificate("paper")
 
     @property
-    def schedule(self) -> "Certificate":
+    def schedule(self) -> "ScenarioCertificate":
         """Under the scenario's own schedule, late by what it allows."""
         return self._study.certificate("schedule")
 
     @property
-    def paper_box(self) -> "Certificate | None":
+    def paper_box(self) -> "ScenarioCertificate | None":
         """Of every plant of the box, under the paper's conditions; None if there is no box."""
         return self._study.box_certificate("paper")
 
     @property
-    def schedule_box(self) -> "Certificate | None":
+    def schedule_box(self) -> "ScenarioCertificate | None":
         """Of every plant of the box, under the scenario's schedule; None if there is no box."""
         return self._study.box_certificate("schedule")
 
     @property
-    def limits(self) -> "Limits":
+    def limits(self) -> "NetworkLimits":
         """How far the schedule could go, one thing at a time; of the scenario's plant, in s.
 
         Found when it is first asked for, in a second or so.

@@ -18,8 +18,8 @@ from noack.protocol.record_tables import (
 )
 
 _NOT_THERE = "none"
-_OVERTAKEN = "overtaken"
-_UNDER_WAY = "under_way"
+_OVERTAKEN = "delivered_out_of_order"
+_UNDER_WAY = "in_flight"
 
 
 def with_seconds(table: pa.Table) -> pa.Table:
@@ -52,7 +52,7 @@ def events(record: RunRecord) -> pa.Table:
     fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
     # Delivered, as far as the emulator could know, but not in the end.
     fates[effective(crossed.rows["fate"]) & crossed.lost] = _OVERTAKEN
-    fates[crossed.under_way] = _UNDER_WAY
+    fates[crossed.in_flight] = _UNDER_WAY
     known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))
     columns = {
         "event": sent["event"],

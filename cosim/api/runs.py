@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cosim.analysis.replay import Replay
     from cosim.analysis.run_outcome import Outcome
     from cosim.record.run_record import RunRecord
-    from cosim.studies.comparison.run_comparison import Comparison
+    from cosim.studies.comparison.run_comparison import RunComparison
 
 Folder = str | PathLike[str]
 
@@ -42,10 +42,10 @@ class Run:
     """The run directory; ``docs/record.md`` says what is in it."""
 
     def __init__(
-        self, directory: Path, conclude: "Callable[[], Outcome]", temporary: Path | None = None
+        self, directory: Path, finalize: "Callable[[], Outcome]", temporary: Path | None = None
     ) -> None:
         self.directory = directory
-        self._conclude = conclude
+        self._conclude = finalize
         if temporary is not None:
             weakref.finalize(self, shutil.rmtree, temporary, ignore_errors=True)
 
@@ -126,7 +126,7 @@ class Run:
         Returns:
             ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s`` since the one before, NaN of
             the first; ``fate`` in the network: delivered, forced (by the bound on successive
-            drops), dropped, corrupted, overflowed, blacked_out, overtaken, under_way at the end, or
+            drops), dropped, corrupted, overflowed, blacked_out, overtaken, in_flight at the end, or
             none, if it did not get there; ``received``, whether the controller took it.
         """
         from cosim.api.data_frames import events
@@ -156,9 +156,9 @@ class Run:
         Raises:
             NoackError: it cannot be written.
         """
-        from cosim.live.finalize import report_anew
+        from cosim.live.finalize import rewrite_report
 
-        return report_anew(self.directory)
+        return rewrite_report(self.directory)
 
     def replay(self) -> "Replay":
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
@@ -179,9 +179,9 @@ class Run:
         Raises:
             NoackError: there is no ideal loop to compare it with, or the record has holes.
         """
-        from cosim.analysis.fidelity import fidelity_of
+        from cosim.analysis.fidelity import compute_fidelity
 
-        return fidelity_of(self._record)
+        return compute_fidelity(self._record)
 
     @cached_property
     def _outcome(self) -> "Outcome":
@@ -208,7 +208,7 @@ class Run:
         yield (
             "events",
             f"{found['events']}; {found['deliveries']} received, {found['drops']} lost, "
-            f"at most {found['longest_drop_run']} in a row",
+            f"at most {found['longest_loss_burst']} in a row",
         )
         norms = (found["initial_state_norm"], found["final_state_norm"])
         yield "‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)
@@ -234,13 +234,13 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     Raises:
         NoackError: the scenario is wrong, or the run directory cannot be written.
     """
-    from cosim.live.finalize import conclude
+    from cosim.live.finalize import finalize
     from cosim.live.simulated_run import simulate_run
 
     loaded = load(scenario)
     with _folder(runs) as (folder, temporary):
         ending = simulate_run(loaded, folder, view=temporary is None)
-        made = Run(ending.run_dir, lambda: conclude(ending, report=False), temporary)
+        made = Run(ending.run_dir, lambda: finalize(ending, report=False), temporary)
     if temporary is None:
         made.summary  # noqa: B018  # it belongs into the run directory
     return made
@@ -262,7 +262,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         NoackError: the scenario is wrong; the run could not begin, e.g. as a port is taken; or this
             is not the main thread, which signals go to.
     """
-    from cosim.live.finalize import conclude
+    from cosim.live.finalize import finalize
     from cosim.live.launcher import launch
     from cosim.live.progress import PatientConsole, progress_line
 
@@ -275,7 +275,7 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
         console = PatientConsole(stderr=True, quiet=not progress)
         with progress_line(console, loaded) as watcher:
             ending = launch(loaded, folder, watcher=watcher)
-        outcome = conclude(ending, report=False)
+        outcome = finalize(ending, report=False)
         return Run(ending.run_dir, lambda: outcome, temporary)
 
 
@@ -298,7 +298,7 @@ def open_run(directory: Folder = "runs/latest") -> Run:
     return Run(outcome.run_dir, lambda: outcome)
 
 
-def compare(*runs: Run | Folder) -> "Comparison":
+def compare(*runs: Run | Folder) -> "RunComparison":
     """Put two or more runs beside each other; :meth:`Run.fidelity` is against the ideal loop.
 
     Args:

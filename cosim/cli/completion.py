@@ -38,7 +38,7 @@ def settings(incomplete: str) -> list[str]:
     return _beginning(incomplete, [f"{key}=" for key in keys(Scenario)])
 
 
-def knobs(incomplete: str) -> list[str]:
+def runtime_parameters(incomplete: str) -> list[str]:
     """Short names of what can be changed while a run goes on."""
     return _beginning(incomplete, list(SHORT))
 

@@ -77,7 +77,7 @@ def design(
     """Choose α, β and the norm for the fewest transmissions that meet your limits."""
     from cosim.live.progress import work_bar
     from cosim.studies.design import design_page as pages
-    from cosim.studies.design.candidate_measures import Limits
+    from cosim.studies.design.candidate_measures import DesignLimits
     from cosim.studies.design.design_run import design as designed
     from cosim.studies.design.loop_families import families_of
 
@@ -91,7 +91,7 @@ def design(
             raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
     if under not in ("paper", "schedule"):
         raise CallerError(f'--under: paper or schedule, not "{under}"')
-    limits = Limits(settling, quantile, settle, _bounds(bound or []), under == "schedule")
+    limits = DesignLimits(settling, quantile, settle, _bounds(bound or []), under == "schedule")
     if out is not None and not out.parent.is_dir():
         raise CallerError(f"--out {out}: there is no folder {out.parent}")
     n, m = loaded.model.dimensions

@@ -47,14 +47,14 @@ def doctor(
     extras: each is good, limited or bad, with what would be better.
     """
     from cosim.doctor.doctor_table import document, print_findings
-    from cosim.doctor.findings import Verdict, judge, worst
-    from cosim.doctor.machine_facts import wanted_of
+    from cosim.doctor.findings import FindingStatus, judge, worst
+    from cosim.doctor.machine_facts import requirements_of
     from cosim.doctor.machine_measures import measure
     from cosim.live.progress import PatientConsole
     from noack.config.resolution import resolve
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
-    wanted = wanted_of(resolved)
+    wanted = requirements_of(resolved)
     with PatientConsole(stderr=True).status("measuring"):
         machine = measure(resolved, wanted, runs, seconds)
     findings = judge(machine, wanted)
@@ -62,4 +62,4 @@ def doctor(
         print_json(document(machine, wanted, findings))
     else:
         print_findings(Console(), wanted, findings)
-    return ExitStatus.FAILED if worst(findings) is Verdict.BAD else ExitStatus.OK
+    return ExitStatus.FAILED if worst(findings) is FindingStatus.BAD else ExitStatus.OK

@@ -17,7 +17,7 @@ from cosim.cli.command import (
     find_scenario,
     print_json,
 )
-from cosim.shipped_files import KINDS, Shipped, all_shipped, text_of
+from cosim.shipped_files import KINDS, ShippedFile, all_shipped, text_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.config.scenario_file import json_schema, load
@@ -60,7 +60,7 @@ def scenarios(
     return ExitStatus.OK
 
 
-def _print_shipped(console: Console, some: Sequence[Shipped]) -> None:
+def _print_shipped(console: Console, some: Sequence[ShippedFile]) -> None:
     """A line each where a program reads, wrapped beside their names where a person does."""
     width = max(len(one.name) for one in some)
     if not console.is_terminal:

@@ -17,7 +17,7 @@ from cosim.cli.command import (
     command,
     find_scenario,
 )
-from cosim.cli.run_commands import conclude_run, run_processes
+from cosim.cli.run_commands import finalize_run, run_processes
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario_file import load
 from noack.protocol.topology import RECORDER
@@ -39,7 +39,7 @@ def record(
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
     loaded = load(find_scenario(scenario), settings or ())
-    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    end = partial(finalize_run, report=report, verbose=verbose, json=json)
     return run_processes(loaded, runs, (RECORDER,), session, live=live, end=end)
 
 

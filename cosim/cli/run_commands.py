@@ -32,7 +32,7 @@ from noack.core.errors import ExitStatus
 from noack.protocol.topology import ROLES
 
 if TYPE_CHECKING:
-    from cosim.record.run_ending import Ending
+    from cosim.record.run_ending import RunEnding
 
 
 @command(RUNS, [
@@ -51,7 +51,7 @@ def run(
 ) -> int:
     """Run a scenario: start all processes, watch them, record everything."""
     loaded = load(find_scenario(scenario), settings or ())
-    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    end = partial(finalize_run, report=report, verbose=verbose, json=json)
     return run_processes(loaded, runs, ROLES, None, live=live, end=end)
 
 
@@ -72,11 +72,11 @@ def demo(
     """Run the paper's lane-following example in real time."""
     mode = ['mode="zoh"'] if zoh else []
     loaded = load(find_scenario("lane_following"), [*mode, *(settings or ())])
-    end = partial(conclude_run, report=report, verbose=verbose, json=json)
+    end = partial(finalize_run, report=report, verbose=verbose, json=json)
     return run_processes(loaded, runs, ROLES, None, live=live, end=end)
 
 
-class Trigger(StrEnum):
+class TriggerMode(StrEnum):
     """When a simulated sensor looks at the threshold."""
 
     SAMPLED = "sampled"
@@ -92,9 +92,9 @@ def simulate(
     scenario: ScenarioArgument,
     settings: SetOption = None,
     trigger: Annotated[
-        Trigger,
+        TriggerMode,
         typer.Option(help="sampled: at each measurement, as a live run; continuous: at all times."),
-    ] = Trigger.SAMPLED,
+    ] = TriggerMode.SAMPLED,
     runs: RunsOption = DEFAULT_RUNS,
     report: ReportOption = True,
     verbose: VerboseOption = False,
@@ -102,7 +102,7 @@ def simulate(
 ) -> int:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late."""
     loaded = load(find_scenario(scenario), settings or ())
-    if trigger is Trigger.CONTINUOUS:
+    if trigger is TriggerMode.CONTINUOUS:
         return _simulate_continuously(loaded, json=json)
     from cosim.live.progress import PatientConsole, simulation_bar
     from cosim.live.simulated_run import simulate_run
@@ -110,7 +110,7 @@ def simulate(
     _warn_of_violations(loaded)
     with simulation_bar(PatientConsole(stderr=True), loaded.horizon_s) as progress:
         ending = simulate_run(loaded, runs, progress=progress)
-    return conclude_run(ending, report=report, verbose=verbose, json=json)
+    return finalize_run(ending, report=report, verbose=verbose, json=json)
 
 
 @command(RUNS, [
@@ -203,14 +203,14 @@ def fidelity(
     json: JsonOption = False,
 ) -> int:
     """Compare a run with the ideal loop in continuous time, effect by effect."""
-    from cosim.analysis.fidelity import fidelity_of
+    from cosim.analysis.fidelity import compute_fidelity
     from cosim.live.progress import PatientConsole
     from cosim.output.fidelity_table import print_fidelity
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
-        found = fidelity_of(load_record(path))
+        found = compute_fidelity(load_record(path))
     if json:
         print_json(found.as_json())
     else:
@@ -228,9 +228,9 @@ def report(
     json: JsonOption = False,
 ) -> int:
     """Write a run's report anew, one page with all figures, and print where it is."""
-    from cosim.live.finalize import report_anew
+    from cosim.live.finalize import rewrite_report
 
-    path = report_anew(chosen_run(run_dir, runs))
+    path = rewrite_report(chosen_run(run_dir, runs))
     if json:
         print_json({"report": str(path)})
     else:
@@ -245,7 +245,7 @@ def run_processes(
     session: str | None,
     *,
     live: bool,
-    end: Callable[["Ending"], int],
+    end: Callable[["RunEnding"], int],
 ) -> int:
     """Run a scenario with the processes ``spawn``; the others join by ``session``.
 
@@ -291,22 +291,22 @@ def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
 
 def _warn_of_violations(scenario: Scenario) -> None:
     from noack.config.resolution import resolve
-    from noack.theory.assumptions import Verdict, assumptions
+    from noack.theory.assumptions import AssumptionStatus, assumptions
 
     for assumption in assumptions(resolve(scenario)):
-        if assumption.verdict == Verdict.VIOLATED and assumption.source == "Theorem 2":
+        if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
             print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
 
 
-def conclude_run(ending: "Ending", *, report: bool, verbose: bool, json: bool) -> int:
+def finalize_run(ending: "RunEnding", *, report: bool, verbose: bool, json: bool) -> int:
     """Finish a run's record, print its verdict, and return its exit status."""
-    from cosim.live.finalize import conclude
+    from cosim.live.finalize import finalize
     from cosim.live.progress import PatientConsole
     from cosim.output.run_verdict import print_outcome
 
     # Of a run of an hour this takes minutes.
     with PatientConsole(stderr=True).status("replaying the run and judging its claims"):
-        outcome = conclude(ending, report=report)
+        outcome = finalize(ending, report=report)
     if json:
         print_json(outcome.summary)
     else:

@@ -32,7 +32,7 @@ def set_(
             metavar="[KEY VALUE]...",
             help="What to change, as in the scenario or short, e.g. loss.p 0.9 mansd 2; "
             "nothing shows what can be changed.",
-            autocompletion=completion.knobs,
+            autocompletion=completion.runtime_parameters,
         ),
     ] = None,
     session: Annotated[str | None, SESSION] = None,
@@ -89,7 +89,7 @@ def _show(console: Console, answer: dict[str, Any]) -> None:
     table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
     for heading in ("key", "short", "value"):
         table.add_column(heading)
-    for key, value in answer["knobs"].items():
+    for key, value in answer["runtime_parameters"].items():
         shown = text_of({"": value}).removeprefix(" = ")
         table.add_row(key, short.get(key, ""), escape(shown))
     console.print(table)

@@ -8,18 +8,24 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cosim.doctor.findings import Finding, Verdict, worst
-from cosim.doctor.machine_facts import Machine, Wanted
+from cosim.doctor.findings import FindingStatus, MachineFinding, worst
+from cosim.doctor.machine_facts import MachineFacts, RunRequirements
 
-_COLOURS = {Verdict.GOOD: "green", Verdict.LIMITED: "yellow", Verdict.BAD: "bold red"}
+_COLOURS = {
+    FindingStatus.GOOD: "green",
+    FindingStatus.LIMITED: "yellow",
+    FindingStatus.BAD: "bold red",
+}
 _IN_SHORT = {
-    Verdict.GOOD: "grants all that there is to ask for",
-    Verdict.LIMITED: "is fit for runs, within limits",
-    Verdict.BAD: "cannot run it",
+    FindingStatus.GOOD: "grants all that there is to ask for",
+    FindingStatus.LIMITED: "is fit for runs, within limits",
+    FindingStatus.BAD: "cannot run it",
 }
 
 
-def document(machine: Machine, wanted: Wanted, findings: Sequence[Finding]) -> dict[str, Any]:
+def document(
+    machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> dict[str, Any]:
     """As one document: ``verdict``, ``findings``, and the numbers behind them."""
     return {
         "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
@@ -32,7 +38,9 @@ def document(machine: Machine, wanted: Wanted, findings: Sequence[Finding]) -> d
     }
 
 
-def print_findings(console: Console, wanted: Wanted, findings: Sequence[Finding]) -> None:
+def print_findings(
+    console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]
+) -> None:
     """Print a line for each finding, and below it what it means and what would be better."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
@@ -41,7 +49,7 @@ def print_findings(console: Console, wanted: Wanted, findings: Sequence[Finding]
     for one in findings:
         said = Text(one.found)
         if one.means:
-            said.append(f"\n{one.means}", "" if one.verdict is not Verdict.GOOD else "dim")
+            said.append(f"\n{one.means}", "" if one.verdict is not FindingStatus.GOOD else "dim")
         if one.remedy:
             said.append(f"\n→ {one.remedy}", "cyan")
         table.add_row(Text(one.verdict, _COLOURS[one.verdict]), Text(one.what), said)

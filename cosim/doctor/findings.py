@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
-from cosim.doctor.machine_facts import Lateness, Machine, Wanted
+from cosim.doctor.machine_facts import Lateness, MachineFacts, RunRequirements
 
 LOOP_PROCESSES = 5
 """Of a run, with the recorder."""
@@ -31,7 +31,7 @@ _REMEDIES = {
 }
 
 
-class Verdict(StrEnum):
+class FindingStatus(StrEnum):
     """What something means for a run."""
 
     GOOD = "good"
@@ -41,18 +41,18 @@ class Verdict(StrEnum):
     """No run is possible."""
 
 
-class Finding(NamedTuple):
+class MachineFinding(NamedTuple):
     """One thing that was looked at."""
 
     what: str
-    verdict: Verdict
+    verdict: FindingStatus
     found: str
     means: str
     """For a run; empty if there is nothing to say."""
     remedy: str = ""
 
 
-def judge(machine: Machine, wanted: Wanted) -> list[Finding]:
+def judge(machine: MachineFacts, wanted: RunRequirements) -> list[MachineFinding]:
     """Return what a machine means for a scenario's runs, one finding for each thing measured."""
     return [
         _cores(machine),
@@ -75,65 +75,71 @@ def judge(machine: Machine, wanted: Wanted) -> list[Finding]:
     ]  # fmt: skip
 
 
-def worst(findings: Sequence[Finding]) -> Verdict:
+def worst(findings: Sequence[MachineFinding]) -> FindingStatus:
     """Return the verdict on the machine as a whole."""
-    order = list(Verdict)
+    order = list(FindingStatus)
     return max((one.verdict for one in findings), key=order.index)
 
 
-def _cores(machine: Machine) -> Finding:
+def _cores(machine: MachineFacts) -> MachineFinding:
     known = [f"{machine.cores} of {machine.cores_online} usable"]
     if machine.load is not None:
         known.append(f"load {machine.load:.1f}")
     if machine.governor is not None:
         known.append(f"governor {machine.governor}")
-    means, remedy, verdict = "", "", Verdict.GOOD
+    means, remedy, verdict = "", "", FindingStatus.GOOD
     if machine.cores < 2:
-        verdict = Verdict.LIMITED
+        verdict = FindingStatus.LIMITED
         means = f"the {LOOP_PROCESSES} processes of a run stand in each other's way"
         remedy = "give this program two cores or more"
     elif machine.load is not None and machine.load > machine.cores:
-        verdict = Verdict.LIMITED
+        verdict = FindingStatus.LIMITED
         means = "others want the cores, too: what is measured below is of a busy machine"
         remedy = "run it again when the machine is idle"
     elif machine.governor == "powersave":
-        verdict = Verdict.LIMITED
+        verdict = FindingStatus.LIMITED
         means = "cores are slow when they wake up"
         remedy = "`sudo cpupower frequency-set --governor performance`"
-    return Finding("cores", verdict, ", ".join(known), means, remedy)
+    return MachineFinding("cores", verdict, ", ".join(known), means, remedy)
 
 
-def _settings(machine: Machine, wanted: Wanted) -> Iterator[Finding]:
+def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
     granted = [said for name, said in _SETTINGS.items() if machine.granted.get(name) == "granted"]
     what = "real-time settings"
     if granted:
-        yield Finding(what, Verdict.GOOD, f"granted: {', '.join(granted)}", "")
+        yield MachineFinding(what, FindingStatus.GOOD, f"granted: {', '.join(granted)}", "")
     for name, said in _SETTINGS.items():
         answer = machine.granted.get(name, "not known")
         if not answer.startswith("refused"):
             continue
         if wanted.realtime:
-            means, verdict = "a run goes on without it, and says so", Verdict.LIMITED
+            means, verdict = "a run goes on without it, and says so", FindingStatus.LIMITED
         else:
-            means, verdict = f"{wanted.name} does not ask for it", Verdict.GOOD
-        yield Finding(what, verdict, f"{said} {answer}", means, _REMEDIES.get(name, ""))
+            means, verdict = f"{wanted.name} does not ask for it", FindingStatus.GOOD
+        yield MachineFinding(what, verdict, f"{said} {answer}", means, _REMEDIES.get(name, ""))
 
 
-def _timer(machine: Machine) -> Finding:
+def _timer(machine: MachineFacts) -> MachineFinding:
     slack = machine.timer_slack_ns
     known = [f"resolution {_time(machine.timer_resolution_ns * 1e-3)}"]
     if slack is not None:
         known.append(f"slack {_time(slack * 1e-3)} unless asked for less")
     if machine.timer_resolution_ns >= _SLOW_TIMER_NS:
         means = "steps cannot be told apart that are nearer"
-        return Finding("timers", Verdict.LIMITED, ", ".join(known), means, "lower plant.rate_hz")
-    return Finding("timers", Verdict.GOOD, ", ".join(known), "")
+        return MachineFinding(
+            "timers", FindingStatus.LIMITED, ", ".join(known), means, "lower plant.rate_hz"
+        )
+    return MachineFinding("timers", FindingStatus.GOOD, ", ".join(known), "")
 
 
-def _wake_ups(what: str, found: Lateness | str, wanted: Wanted, *, in_force: bool) -> Finding:
+def _wake_ups(
+    what: str, found: Lateness | str, wanted: RunRequirements, *, in_force: bool
+) -> MachineFinding:
     """Judge how late a loop was that had nothing to do, against what certificates allow."""
     if isinstance(found, str):
-        return Finding(what, Verdict.LIMITED, found, "how late a run will be is not known")
+        return MachineFinding(
+            what, FindingStatus.LIMITED, found, "how late a run will be is not known"
+        )
     late = (
         f"{_time(found.p50_us)} late in the median, {_time(found.p99_us)} p99, "
         f"{_time(found.max_us)} at the most, of {found.wakes:,} at {wanted.rate_hz:g} Hz"
@@ -142,7 +148,9 @@ def _wake_ups(what: str, found: Lateness | str, wanted: Wanted, *, in_force: boo
     if not found.beyond:
         near = found.max_us * 1e3 > wanted.allowance_ns / 2
         means = f"all within {allowed}" + (", some by less than a half of it" if near else "")
-        return Finding(what, Verdict.GOOD, late, f"{means}; a longer run may meet a later one")
+        return MachineFinding(
+            what, FindingStatus.GOOD, late, f"{means}; a longer run may meet a later one"
+        )
     share = 100 * found.beyond / found.wakes
     first_s = found.wakes / found.beyond / wanted.rate_hz
     means = (
@@ -150,105 +158,121 @@ def _wake_ups(what: str, found: Lateness | str, wanted: Wanted, *, in_force: boo
         f"them every {first_s:.2g} s, of its {wanted.duration_s:g} s"
     )
     if not in_force:
-        return Finding(what, Verdict.GOOD, late, f"{means}; but runs ask for real-time settings")
+        return MachineFinding(
+            what, FindingStatus.GOOD, late, f"{means}; but runs ask for real-time settings"
+        )
     remedy = "allow for more by certificate.late_periods, lower speed or rates, or get SCHED_FIFO"
-    return Finding(what, Verdict.LIMITED, late, means, remedy)
+    return MachineFinding(what, FindingStatus.LIMITED, late, means, remedy)
 
 
-def _loopback(machine: Machine) -> Finding:
+def _loopback(machine: MachineFacts) -> MachineFinding:
     what, found = "UDP on the loopback", machine.round_trips
     if isinstance(found, str):
         means = "processes of a run cannot hear each other"
         remedy = "`sudo ip link set lo up`; let no firewall drop what goes to 127.0.0.1"
-        return Finding(what, Verdict.BAD, found, means, remedy)
+        return MachineFinding(what, FindingStatus.BAD, found, means, remedy)
     text = f"there and back in {_time(found.p50_us)}, {_time(found.p99_us)} p99"
     if found.lost:
         means = "a loss that nobody ordered breaks the bound on successive drops"
         lost = f"{text}; {found.lost} of {found.sent} lost"
-        return Finding(what, Verdict.LIMITED, lost, means, "find who drops it: a firewall, tc")
-    return Finding(what, Verdict.GOOD, text, "")
+        return MachineFinding(
+            what, FindingStatus.LIMITED, lost, means, "find who drops it: a firewall, tc"
+        )
+    return MachineFinding(what, FindingStatus.GOOD, text, "")
 
 
-def _buffer(machine: Machine, wanted: Wanted) -> Finding:
+def _buffer(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
     what, found = "receive buffer", machine.buffer
     if isinstance(found, str):
-        return Finding(what, Verdict.BAD, found, "no process of a run can receive")
+        return MachineFinding(what, FindingStatus.BAD, found, "no process of a run can receive")
     text = f"holds {found.datagrams:,} datagrams ({found.granted_bytes // 1024:,} KiB)"
     if found.most_bytes is not None:
         text += f"; net.core.rmem_max is {found.most_bytes:,}"
     lasts_s = found.datagrams / wanted.rate_hz
     means = f"a process may be held up for {lasts_s:.2g} s before one is lost that nobody ordered"
     if found.datagrams >= PLENTY_OF_DATAGRAMS:
-        return Finding(what, Verdict.GOOD, text, means)
-    return Finding(what, Verdict.LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`")
+        return MachineFinding(what, FindingStatus.GOOD, text, means)
+    return MachineFinding(
+        what, FindingStatus.LIMITED, text, means, "`sudo sysctl net.core.rmem_max=4194304`"
+    )
 
 
-def _ports(machine: Machine, wanted: Wanted) -> Iterator[Finding]:
+def _ports(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
     what = f"ports of {wanted.name}"
     for line in machine.ports_taken:
         means = f"{wanted.name} cannot run with the ports that it names"
-        yield Finding(what, Verdict.BAD, line, means, "end who has them, or `--set ports={}`")
+        yield MachineFinding(
+            what, FindingStatus.BAD, line, means, "end who has them, or `--set ports={}`"
+        )
     if not machine.ports_taken:
         numbers = ", ".join(str(port) for port in wanted.ports.values())
-        yield Finding(what, Verdict.GOOD, f"{numbers} free" if numbers else "any will do", "")
+        yield MachineFinding(
+            what, FindingStatus.GOOD, f"{numbers} free" if numbers else "any will do", ""
+        )
 
 
-def _control(machine: Machine) -> Finding:
+def _control(machine: MachineFacts) -> MachineFinding:
     what, found = "control plane", machine.control
     if isinstance(found, str):
         means = "the processes of a run cannot meet"
         remedy = "let programs of this user connect over TCP to 127.0.0.1"
-        return Finding(what, Verdict.BAD, found, means, remedy)
+        return MachineFinding(what, FindingStatus.BAD, found, means, remedy)
     text = f"zenoh over TCP on the loopback answers in {_time(found * 1e6)}"
-    return Finding(what, Verdict.GOOD, text, "")
+    return MachineFinding(what, FindingStatus.GOOD, text, "")
 
 
-def _disk(machine: Machine, wanted: Wanted) -> Finding:
+def _disk(machine: MachineFacts, wanted: RunRequirements) -> MachineFinding:
     what, found = "disk", machine.disk
     remedy = "name another place by --runs"
     if isinstance(found, str):
-        return Finding(what, Verdict.BAD, found, "nothing can be recorded", remedy)
+        return MachineFinding(what, FindingStatus.BAD, found, "nothing can be recorded", remedy)
     text = (
         f"{found.folder}: {_bytes(found.free_bytes)} free, {_bytes(found.write_bytes_per_s)} a "
         "second written"
     )
     needs = f"{wanted.name} takes {_bytes(found.needed_bytes)}, and what its events take"
     if found.free_bytes < found.needed_bytes:
-        return Finding(what, Verdict.BAD, text, needs, f"{remedy}, or shorten horizon_s")
+        return MachineFinding(
+            what, FindingStatus.BAD, text, needs, f"{remedy}, or shorten horizon_s"
+        )
     if found.write_bytes_per_s < LEAST_WRITE_BYTES_PER_S:
-        return Finding(what, Verdict.LIMITED, text, f"{needs}; a run's end takes long", remedy)
-    return Finding(what, Verdict.GOOD, text, needs)
+        return MachineFinding(
+            what, FindingStatus.LIMITED, text, f"{needs}; a run's end takes long", remedy
+        )
+    return MachineFinding(what, FindingStatus.GOOD, text, needs)
 
 
-def _runtime_folder(machine: Machine) -> Finding:
+def _runtime_folder(machine: MachineFacts) -> MachineFinding:
     what, said = "runtime folder", machine.runtime_folder
     if said is None:
-        return Finding(what, Verdict.GOOD, "yours, and closed to others", "")
+        return MachineFinding(what, FindingStatus.GOOD, "yours, and closed to others", "")
     means = "`noack record` cannot open a run for other terminals, `noack set` finds none"
-    return Finding(what, Verdict.LIMITED, said, means, "set XDG_RUNTIME_DIR to a folder of yours")
+    return MachineFinding(
+        what, FindingStatus.LIMITED, said, means, "set XDG_RUNTIME_DIR to a folder of yours"
+    )
 
 
-def _cache(machine: Machine) -> Finding:
+def _cache(machine: MachineFacts) -> MachineFinding:
     what = "compiled code"
     if machine.cache:
-        return Finding(what, Verdict.GOOD, "is kept in your cache", "")
+        return MachineFinding(what, FindingStatus.GOOD, "is kept in your cache", "")
     means = "campaigns, netem on its own, and vehicles with tyres compile anew each time"
     remedy = "set XDG_CACHE_HOME to a folder that you can write to, and nobody else"
-    return Finding(what, Verdict.LIMITED, "cannot be kept", means, remedy)
+    return MachineFinding(what, FindingStatus.LIMITED, "cannot be kept", means, remedy)
 
 
-def _viewer(machine: Machine) -> Finding:
+def _viewer(machine: MachineFacts) -> MachineFinding:
     what = "viewer"
     if machine.viewer is None:
         means = "no recording is written or shown"
         remedy = "`pip install --force-reinstall noack`"
-        return Finding(what, Verdict.BAD, "rerun cannot be imported", means, remedy)
+        return MachineFinding(what, FindingStatus.BAD, "rerun cannot be imported", means, remedy)
     text = f"rerun {machine.viewer}"
     if machine.display:
-        return Finding(what, Verdict.GOOD, f"{text}, and a display", "")
+        return MachineFinding(what, FindingStatus.GOOD, f"{text}, and a display", "")
     means = "`noack view` and --live show a page on this machine, in no window"
     remedy = "to look from another one, forward its port: `ssh -L PORT:127.0.0.1:PORT`"
-    return Finding(what, Verdict.LIMITED, f"{text}, no display", means, remedy)
+    return MachineFinding(what, FindingStatus.LIMITED, f"{text}, no display", means, remedy)
 
 
 _OF_EXTRAS = {
@@ -258,23 +282,25 @@ _OF_EXTRAS = {
 }
 
 
-def _extras(machine: Machine) -> Iterator[Finding]:
+def _extras(machine: MachineFacts) -> Iterator[MachineFinding]:
     for name, there in machine.extras.items():
         what, of = f"extra: {name}", _OF_EXTRAS[name]
         if there:
-            yield Finding(what, Verdict.GOOD, "installed", f"{of}")
+            yield MachineFinding(what, FindingStatus.GOOD, "installed", f"{of}")
         else:
             remedy = f"`pip install 'noack[{name}]'`"
-            yield Finding(what, Verdict.LIMITED, "not installed", f"no {of}", remedy)
+            yield MachineFinding(what, FindingStatus.LIMITED, "not installed", f"no {of}", remedy)
 
 
-def _versions(machine: Machine) -> Finding:
+def _versions(machine: MachineFacts) -> MachineFinding:
     known = [f"{name} {version}" for name, version in machine.versions.items() if version]
     missing = [name for name, version in machine.versions.items() if not version]
     if not missing:
-        return Finding("versions", Verdict.GOOD, ", ".join(known), "")
+        return MachineFinding("versions", FindingStatus.GOOD, ", ".join(known), "")
     means = f"{', '.join(missing)}: not installed as a package, so that runs do not say which it is"
-    return Finding("versions", Verdict.LIMITED, ", ".join(known), means, "`pip install noack`")
+    return MachineFinding(
+        "versions", FindingStatus.LIMITED, ", ".join(known), means, "`pip install noack`"
+    )
 
 
 def _time(value_us: float) -> str:

@@ -8,7 +8,7 @@ from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 
 
-class Wanted(NamedTuple):
+class RunRequirements(NamedTuple):
     """What a scenario asks of the machine; times are wall time."""
 
     name: str
@@ -30,12 +30,12 @@ class Wanted(NamedTuple):
         return NS_PER_S / self.period_ns
 
 
-def wanted_of(resolved: Scenario) -> Wanted:
+def requirements_of(resolved: Scenario) -> RunRequirements:
     """Return what a resolved scenario asks of the machine that it runs on."""
     period_ns = round(resolved.plant_period_ns / resolved.speed)
     settings = resolved.realtime
     ports = {name: port for name, port in resolved.ports.model_dump().items() if port}
-    return Wanted(
+    return RunRequirements(
         name=resolved.name,
         duration_s=resolved.horizon_s / resolved.speed,
         period_ns=period_ns,
@@ -88,7 +88,7 @@ class Disk(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Machine:
+class MachineFacts:
     """Everything that was measured. What failed is the line that says why."""
 
     cores: int

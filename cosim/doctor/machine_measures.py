@@ -21,7 +21,14 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from cosim.doctor.machine_facts import Buffer, Disk, Lateness, Machine, RoundTrips, Wanted
+from cosim.doctor.machine_facts import (
+    Buffer,
+    Disk,
+    Lateness,
+    MachineFacts,
+    RoundTrips,
+    RunRequirements,
+)
 from cosim.live.disk_space import needed_bytes
 from cosim.output.viewer.live_viewer import has_display
 from cosim.record.environment import environment
@@ -33,7 +40,7 @@ from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.code_cache import cache_folder
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
-from noack.runtime.zenoh_session import Secret, answer_to, cause_of, open_star
+from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session
 
 T = TypeVar("T")
 
@@ -49,7 +56,9 @@ _ANSWER_S = 2.0
 _PR_GET_TIMERSLACK = 30
 
 
-def measure(resolved: Scenario, wanted: Wanted, runs: Path, duration_s: float) -> Machine:
+def measure(
+    resolved: Scenario, wanted: RunRequirements, runs: Path, duration_s: float
+) -> MachineFacts:
     """Measure this machine for a scenario.
 
     Args:
@@ -60,7 +69,7 @@ def measure(resolved: Scenario, wanted: Wanted, runs: Path, duration_s: float) -
     """
     plain, realtime, granted = _wake_ups(wanted, duration_s)
     about = environment("live")
-    return Machine(
+    return MachineFacts(
         cores=about["cores"],
         cores_online=os.cpu_count() or 1,
         load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
@@ -100,7 +109,7 @@ def _probe(*arguments: object) -> list[str]:
 
 
 def _wake_ups(
-    wanted: Wanted, duration_s: float
+    wanted: RunRequirements, duration_s: float
 ) -> tuple[Lateness | str, Lateness | str, dict[str, str]]:
     command = _probe("wake", wanted.period_ns, duration_s, wanted.fifo_priority, wanted.spin_us)
     try:
@@ -178,7 +187,7 @@ def _buffer() -> Buffer:
     return Buffer(held, granted, int(most) if most else None)
 
 
-def _ports_taken(wanted: Wanted) -> Iterable[str]:
+def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
     for name, port in wanted.ports.items():
         try:
             if name in LOOP_ROLES:
@@ -191,12 +200,12 @@ def _ports_taken(wanted: Wanted) -> Iterable[str]:
 
 def _control() -> float:
     """Ask a question over a star as the control plane is; return how long the answer took."""
-    secret = Secret("doctor", secrets.token_hex(16))
+    secret = SessionSecret("doctor", secrets.token_hex(16))
     endpoint, key = f"tcp/{LOOPBACK}:{free_tcp_port()}", "noack/doctor"
-    centre = open_star(endpoint, secret, listen=True)
+    centre = open_session(endpoint, secret, listen=True)
     try:
         with centre.declare_queryable(key, FifoChannel(4)) as answering:
-            other = open_star(endpoint, secret, listen=False)
+            other = open_session(endpoint, secret, listen=False)
             try:
                 ended = threading.Event()
                 thread = threading.Thread(target=_answer, args=(answering, key, ended))

@@ -13,13 +13,24 @@ from typing import Any
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from noack.config.parameter_changes import Change, Schedule, knobs_of, scheduled
+from noack.config.parameter_changes import (
+    ChangeSchedule,
+    ParameterChange,
+    current_parameters,
+    scheduled,
+)
 from noack.config.scenario import MOST_CHANGES
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES, ROLES
-from noack.runtime.control_messages import Asked, Hello, Knock, Progress, heard
-from noack.runtime.control_plane import Plane
+from noack.runtime.control_messages import (
+    AdmissionRequest,
+    ChangeRequest,
+    JoinRequest,
+    RunProgress,
+    parse_message,
+)
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.process_life import HORIZON
 
@@ -44,7 +55,7 @@ class _Member:
     """A process that was admitted."""
 
     instance: str
-    incarnation: int
+    generation: int
     address: tuple[str, int] | None = None
     query: zenoh.Query | None = None
     """What it waits at the barrier with."""
@@ -75,7 +86,7 @@ class Coordinator:
     """
 
     def __init__(self, ticket: Ticket) -> None:
-        self.plane = Plane(ticket, COORDINATOR, listen=True)
+        self.plane = ControlPlane(ticket, COORDINATOR, listen=True)
         session, key = self.plane.session, self.plane.key
         self._knocks = session.declare_queryable(key("admit", "*"), FifoChannel(64))
         self._joins = session.declare_queryable(key("join", "*"), FifoChannel(64))
@@ -84,9 +95,9 @@ class Coordinator:
         )
         self._leaves = session.declare_subscriber(key("left", "*", "*"), RingChannel(256))
         self._progress = session.declare_subscriber(key("progress"), RingChannel(1))
-        self._questions = session.declare_queryable(key("knobs"), FifoChannel(64))
+        self._questions = session.declare_queryable(key("runtime_parameters"), FifoChannel(64))
         self._scenario, self._run_dir = ticket.scenario, ticket.run_dir
-        self._schedule = Schedule(ticket.scenario)
+        self._schedule = ChangeSchedule(ticket.scenario)
         self._changes: list[dict[str, Any]] = []
         for change in scheduled(ticket.scenario):
             self._take_change(change, 0, "the scenario says so")
@@ -136,7 +147,9 @@ class Coordinator:
             self._answer(query, self._join)
         while (query := self._questions.try_recv()) is not None:
             try:
-                self.plane.answer(query, self._answer_to(heard(Asked, _payload(query))))
+                self.plane.answer(
+                    query, self._answer_to(parse_message(ChangeRequest, _payload(query)))
+                )
             except (CallerError, PeerError) as error:
                 self.plane.refuse(query, str(error))
         if self._clock is None and self._stopped is None and not self.missing():
@@ -185,11 +198,11 @@ class Coordinator:
         words = self._last_words.get(role)
         return None if words == HORIZON else words
 
-    def incarnation(self, role: str) -> int | None:
+    def generation(self, role: str) -> int | None:
         """Number of the process of a role that is in the loop now; None while none is."""
         member = self._members.get(role)
         here = member is not None and member.present and not self.finished(role)
-        return member.incarnation if member is not None and here else None
+        return member.generation if member is not None and here else None
 
     def expect(self, role: str, after: str, *, dead: bool) -> None:
         """Let another process take the place of one that is gone.
@@ -210,7 +223,7 @@ class Coordinator:
         if sample is None:
             return None
         try:
-            return heard(Progress, sample.payload.to_bytes())
+            return parse_message(RunProgress, sample.payload.to_bytes())
         except PeerError:  # whoever says so is not the recorder
             return None
 
@@ -233,7 +246,7 @@ class Coordinator:
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
             if t_ns >= self._scenario.horizon_ns:
                 raise CallerError(f"the run ends at {self._scenario.horizon_s:g} s, before that")
-            change = Change(len(self._changes), t_ns, settings)
+            change = ParameterChange(len(self._changes), t_ns, settings)
             said_at = datetime.now(UTC).isoformat(timespec="milliseconds")
             self.plane.announce(self._take_change(change, now_ns, said_at))
             from_s = t_ns / NS_PER_S
@@ -242,10 +255,10 @@ class Coordinator:
             "run_dir": self._run_dir,
             "t_s": now_ns / NS_PER_S,
             "from_s": from_s,
-            "knobs": knobs_of(self._schedule.last),
+            "runtime_parameters": current_parameters(self._schedule.last),
         }
 
-    def _take_change(self, change: Change, said_ns: int, said_at: str) -> dict[str, Any]:
+    def _take_change(self, change: ParameterChange, said_ns: int, said_at: str) -> dict[str, Any]:
         """Keep a change, as everybody is told of it.
 
         Raises:
@@ -283,7 +296,7 @@ class Coordinator:
         Raises:
             PeerError: it cannot join.
         """
-        instance = heard(Knock, _payload(query))["instance"]
+        instance = parse_message(AdmissionRequest, _payload(query))["instance"]
         before = self._members.get(role)
         if role not in ROLES:
             raise PeerError("a run has no such process")
@@ -292,17 +305,17 @@ class Coordinator:
         if self._clock is None:
             self._candidates[role, instance] = _Member(instance, 0)
             admission: dict[str, Any] = {
-                "incarnation": 0, "admitted_ns": 0, "from_ns": 0, "address": None, "after": None,
+                "generation": 0, "admitted_ns": 0, "from_ns": 0, "address": None, "after": None,
             }  # fmt: skip
         else:
             if before is None or role not in self._before:
                 raise PeerError("the run has begun without it")
             now_ns = self._clock.now_ns()
             delay_ns = int(_RESTART_DELAY_S * NS_PER_S * self._speed)
-            candidate = _Member(instance, before.incarnation + 1, before.address)
+            candidate = _Member(instance, before.generation + 1, before.address)
             self._candidates[role, instance] = candidate
             admission = {
-                "incarnation": candidate.incarnation,
+                "generation": candidate.generation,
                 "admitted_ns": now_ns,
                 "from_ns": now_ns + delay_ns,
                 "address": before.address,
@@ -316,7 +329,7 @@ class Coordinator:
         Raises:
             PeerError: it cannot join.
         """
-        hello = heard(Hello, _payload(query))
+        hello = parse_message(JoinRequest, _payload(query))
         member = self._entrant(role, hello["instance"])
         if (hello["address"] is None) == (role in LOOP_ROLES):
             raise PeerError("no address, or one too many")
@@ -338,7 +351,7 @@ class Coordinator:
             return before
         if before is not None and not self.finished(role):
             raise PeerError(f"another {role} is in this run already")
-        late = before is not None and candidate and candidate.incarnation <= before.incarnation
+        late = before is not None and candidate and candidate.generation <= before.generation
         if candidate is None or (late and self._clock is not None):
             raise PeerError("it was not admitted")
         return candidate

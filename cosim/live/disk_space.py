@@ -38,7 +38,7 @@ def needed_bytes(resolved: Scenario) -> int:
     return _UNTIL_THE_END * spool_bytes(resolved)
 
 
-def require_room(resolved: Scenario, runs: Path) -> None:
+def require_disk_space(resolved: Scenario, runs: Path) -> None:
     """Check that a run's record fits on the disk; warn if it may not.
 
     Args:

@@ -26,13 +26,13 @@ from cosim.record.run_directory import (
     concluded,
     read_object,
 )
-from cosim.record.run_ending import Ending
+from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
 
 
 @np.errstate(all="ignore")
-def conclude(ending: Ending, *, report: bool = True) -> Outcome:
+def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
     """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
     run_dir = ending.run_dir
     with _told_with(ending), concluded(run_dir):
@@ -63,7 +63,7 @@ def conclude(ending: Ending, *, report: bool = True) -> Outcome:
 
 
 @contextmanager
-def _told_with(ending: Ending) -> Iterator[None]:
+def _told_with(ending: RunEnding) -> Iterator[None]:
     """Let an error that keeps the record from being finished say how the run ended, too."""
     try:
         yield
@@ -123,9 +123,9 @@ def _end(summary: Summary) -> dict[str, Any]:
 def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
     """Runs of losses that neither the network nor the controller knows of, as somebody was away."""
     longest = int(claims.conditions["dropouts"] or 0)
-    if not summary["lost_outside_netem"] or longest <= summary["longest_drop_run"]:
+    if not summary["lost_outside_netem"] or longest <= summary["longest_loss_burst"]:
         return {}
-    found: Summary = {"longest_drop_run": longest}
+    found: Summary = {"longest_loss_burst": longest}
     if (beyond := claims.beyond_mansd) is not None and not summary["assumption_violations"]:
         at_s, what = beyond
         found["assumption_violations"] = [
@@ -146,22 +146,22 @@ def reopen(run_dir: Path) -> Outcome:
     ending = _ending(run_dir, summary)
     # It is of an earlier version or damaged; or a process woke up after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
-        return conclude(ending)
+        return finalize(ending)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
 
-def _ending(run_dir: Path, summary: Summary) -> Ending:
+def _ending(run_dir: Path, summary: Summary) -> RunEnding:
     """How a run ended, as its summary has it, or else as its launcher stored it."""
     for said in (summary, read_object(run_dir / ENDING_FILE)):
         with suppress(LookupError, TypeError, ValueError):
             status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
-            return Ending(run_dir, 0, status, reason, said["startup_s"])
+            return RunEnding(run_dir, 0, status, reason, said["startup_s"])
         summary.clear()  # without an end, nothing of it can be trusted
-    return Ending(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
+    return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 @np.errstate(all="ignore")
-def report_anew(run_dir: Path) -> Path:
+def rewrite_report(run_dir: Path) -> Path:
     """Write the report of an earlier run anew, and return its path.
 
     Raises:

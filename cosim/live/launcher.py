@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from cosim.live.coordinator import Coordinator
-from cosim.live.disk_space import require_room
+from cosim.live.disk_space import require_disk_space
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
-from cosim.record.run_directory import new_run_dir, point_to_latest, under_way, write_scenario
-from cosim.record.run_ending import Ending, EndingFile
+from cosim.record.run_directory import in_flight, new_run_dir, point_to_latest, write_scenario
+from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError, ExitStatus, MachineError, NeverStartedError
@@ -72,8 +72,8 @@ def launch(
     session: str | None = None,
     live: bool = False,
     watcher: Watcher | None = None,
-) -> Ending:
-    """Run a scenario; :func:`cosim.live.finalize.conclude` makes its record whole.
+) -> RunEnding:
+    """Run a scenario; :func:`cosim.live.finalize.finalize` makes its record whole.
 
     Args:
         scenario: as loaded; it is resolved here.
@@ -88,7 +88,7 @@ def launch(
     """
     began_ns = time.monotonic_ns()
     resolved = resolve(scenario)
-    require_room(resolved, runs)
+    require_disk_space(resolved, runs)
     control = resolved.ports.control
     if control:
         require_free_tcp_port(control, "ports.control")
@@ -101,7 +101,7 @@ def launch(
     ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
     run = _Run(ticket, run_dir, spawn, watcher or Watcher())
     with Signals().handled() as signals, contextlib.ExitStack() as stack:
-        stack.enter_context(under_way(run_dir))
+        stack.enter_context(in_flight(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         coordinator = Coordinator(ticket)
         stack.callback(coordinator.close)
@@ -114,7 +114,7 @@ def launch(
             raise NeverStartedError(f"{reason} (logs in {run_dir / 'logs'})", status)
         startup_s = (coordinator.epoch_ns - began_ns) * 1e-9
         ending.store(status, reason, startup_s)
-    return Ending(run_dir, ticket.run_id, status, reason, startup_s)
+    return RunEnding(run_dir, ticket.run_id, status, reason, startup_s)
 
 
 def _publish(stack: contextlib.ExitStack, ticket: Ticket, session: str | None) -> None:
@@ -279,7 +279,7 @@ class _Run:
     def _trouble(self, coordinator: Coordinator) -> tuple[ExitStatus, str] | None:
         """Why the run must end; None if it need not. Who died may be followed by another."""
         for role, lost in list(self._lost.items()):
-            if coordinator.incarnation(role) is not None:
+            if coordinator.generation(role) is not None:
                 del self._lost[role]
                 self._tell(self._watcher.back, role, coordinator.now_ns() * 1e-9)
             elif (again := self._exited(role, coordinator)) is not None:

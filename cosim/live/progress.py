@@ -163,6 +163,6 @@ def account_line(account: Mapping[str, Any], horizon_s: float) -> str:
     norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.3g}"
     return (
         f"{account['t_s']:.1f}/{horizon_s:g} s  events {account['events']}  "
-        f"delivered {account['deliveries']}  longest drop run {account['longest_drop_run']}  "
+        f"delivered {account['deliveries']}  longest drop run {account['longest_loss_burst']}  "
         f"‖x‖ {norm}"
     )

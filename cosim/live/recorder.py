@@ -13,21 +13,21 @@ import numpy as np
 import zenoh
 from zenoh.handlers import FifoChannel, RingChannel
 
-from cosim.analysis.claims.assumption_monitor import Guard
-from cosim.analysis.claims.observed_conditions import Departure
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.recording import RunView, ViewError
 from cosim.output.viewer.run_view import open_view, write_view
 from cosim.output.viewer.table_feed import ViewFeed
-from cosim.record.run_directory import SPOOL, under_way
+from cosim.record.run_directory import SPOOL, in_flight
 from cosim.record.run_record import RunRecord, finish_record, report_of, updates_in, write_reports
-from noack.config.parameter_changes import Change, said_of
-from noack.config.resolution import Loop, loop_of, tables_of
+from noack.config.parameter_changes import ParameterChange, said_of
+from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.errors import ExitStatus, MachineError, PeerError
-from noack.protocol.machine_interface import BEGINNING, INCARNATION, RESTART, Notice, Start
+from noack.protocol.machine_interface import BEGINNING, GENERATION, RESTART, Notice, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     NETEM_PACKET,
@@ -37,12 +37,12 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_messages import LogLine, heard
-from noack.runtime.control_plane import Plane
+from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.process_entry import run_process
-from noack.runtime.process_life import LAUNCHER_GONE, Node
+from noack.runtime.process_life import LAUNCHER_GONE, RunProcess
 from noack.runtime.spool import SpoolWriter, read_chunks
-from noack.runtime.telemetry import NOTICES, Received, first_row, notice_number, notices_of
+from noack.runtime.telemetry import NOTICES, ReceivedRows, first_row, notice_number, notices_of
 
 _POLL_S = 0.02
 _SHOW_S = 0.1
@@ -70,13 +70,13 @@ class Recorder:
         self,
         scenario: Scenario,
         run_dir: Path,
-        plane: Plane,
+        plane: ControlPlane,
         view: RunView | None,
         live: str | None = None,
         *,
         start: Start = BEGINNING,
     ) -> None:
-        self._loop: Loop = loop_of(scenario)
+        self._loop: LoopMatrices = loop_of(scenario)
         self._types = tables_of(scenario)
         self._run_dir = run_dir
         self._plane = plane
@@ -86,7 +86,7 @@ class Recorder:
         self._feed = None if view is None else ViewFeed(scenario, view)
         self.lost: MachineError | None = None
         """Why what was recorded is not all on disk; known at the end."""
-        self._guard = Guard(scenario)
+        self._monitor = AssumptionMonitor(scenario)
         self._told_blind = self._judges_no_more = False
         session, key = plane.session, plane.key
         self._batches = session.declare_subscriber(
@@ -96,18 +96,18 @@ class Recorder:
         self._lives = session.liveliness().declare_subscriber(
             key("alive", "*", "*"), RingChannel(256), history=True
         )
-        self._got: defaultdict[tuple[str, str, int], Received] = defaultdict(Received)
+        self._got: defaultdict[tuple[str, str, int], ReceivedRows] = defaultdict(ReceivedRows)
         self._reports: dict[str, dict[str, Any]] = {}
         self._alive: dict[str, set[str]] = {}
         self._out_of_order = self._again = start.again
         self._began_s = time.monotonic()
         self._junk = 0
         self._account: dict[str, Any] = {
-            "t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None,
+            "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None,
             "live": live, "void": [], "changes": [],
         }  # fmt: skip
         if start.again:
-            self._guard.give_up("the recorder was started anew")
+            self._monitor.give_up("the recorder was started anew")
             self._take_over()
 
     @property
@@ -140,7 +140,7 @@ class Recorder:
 
     def show(self) -> None:
         """Bring the view and the coordinator up to date."""
-        self._judge(self._guard.advance)
+        self._judge(self._monitor.advance)
         self._give_account()
         if self._feed is not None:
             try:
@@ -155,7 +155,7 @@ class Recorder:
         """Take a line of its own for the run's log."""
         self._spool.append(notices_of(RECORDER), 0, json.dumps(notice._asdict()).encode())
 
-    def change(self, change: Change, said: Mapping[str, Any]) -> None:
+    def change(self, change: ParameterChange, said: Mapping[str, Any]) -> None:
         """Take a change of the run's settings, and who said so when."""
         notice = said_of(
             change, f"; asked for at {said['said_ns'] / NS_PER_S:.3f} s, {said['said_at']}"
@@ -163,7 +163,7 @@ class Recorder:
         self.note(notice)
         self._account["changes"].append(notice.text)
         if not is_of_loss_alone(change.settings):
-            self._guard.end_at(change.t_ns / NS_PER_S)
+            self._monitor.end_at(change.t_ns / NS_PER_S)
         if self._feed is not None:
             self._feed.log(notice._asdict())
 
@@ -175,15 +175,15 @@ class Recorder:
         """
         self._spool.require_present()
         newest: dict[str, int] = {}
-        for role, _, incarnation in self._got:
-            newest[role] = max(newest.get(role, 0), incarnation)
-        for role, incarnation in newest.items():  # a process hears the last word only
+        for role, _, generation in self._got:
+            newest[role] = max(newest.get(role, 0), generation)
+        for role, generation in newest.items():  # a process hears the last word only
             rows = {
                 table: received.ranges
                 for (of, table, number), received in self._got.items()
-                if (of, number) == (role, incarnation)
+                if (of, number) == (role, generation)
             }
-            self._plane.say_kept(role, {"incarnation": incarnation, "rows": rows})
+            self._plane.acknowledge_rows(role, {"generation": generation, "rows": rows})
 
     def finish(self) -> RunRecord:
         """Write the record; complete the view.
@@ -191,7 +191,7 @@ class Recorder:
         Raises:
             MachineError: the record cannot be written; what was spooled is kept.
         """
-        self._judge(self._guard.end)
+        self._judge(self._monitor.end)
         self._give_account()
         try:
             self._spool.require_present()
@@ -227,7 +227,7 @@ class Recorder:
                 print_to_stderr(f"noack recorder: ignored what is no telemetry: {error}")
             self._junk += 1
 
-    def _keep(self, role: str, table: str, incarnation: int, first: int, payload: bytes) -> None:
+    def _keep(self, role: str, table: str, generation: int, first: int, payload: bytes) -> None:
         """Keep a batch, and show it.
 
         Raises:
@@ -235,27 +235,27 @@ class Recorder:
             ValueError: its rows are not whole.
         """
         if table == NOTICES and role in LOOP_ROLES:
-            notice = heard(LogLine, payload)
-            self._spool.append(notices_of(role), notice_number(incarnation, first), payload)
-            self._got[role, table, incarnation].add(first, first + 1)
+            notice = parse_message(LogLine, payload)
+            self._spool.append(notices_of(role), notice_number(generation, first), payload)
+            self._got[role, table, generation].add(first, first + 1)
             if self._feed is not None:
                 self._feed.log(notice | {"process": role})
             return
         if table not in self._types or OWNER[table] != role:
             raise PeerError(f"{role} has no table {table}")
         rows = np.frombuffer(payload, self._types[table])
-        if not len(rows) or int(rows["input"][0]) // INCARNATION != incarnation:
+        if not len(rows) or int(rows["input"][0]) // GENERATION != generation:
             raise PeerError("a batch without rows, or with those of another process")
         self._spool.append(table, first, payload)
-        got = self._got[role, table, incarnation]
+        got = self._got[role, table, generation]
         follows = first == got.end
         got.add(first, first + len(rows))
         if not follows:
             self._out_of_order = True
-            self._guard.give_up("telemetry is missing, or came out of turn")
+            self._monitor.give_up("telemetry is missing, or came out of turn")
         else:
             self._count(table, rows)
-            self._guard.take(table, rows)
+            self._monitor.take(table, rows)
             if self._feed is not None:
                 self._feed.add(table, rows)
 
@@ -274,7 +274,7 @@ class Recorder:
             rows = updates_in(rows)[0]
             self._see_run(rows["drop_run"][~effective(rows["fate"])])
 
-    def _judge(self, guard: Callable[[], list[Departure]]) -> None:
+    def _judge(self, guard: Callable[[], list[AssumptionViolation]]) -> None:
         """Say that claims are void, in the record, the view and the account."""
         if self._judges_no_more:
             return
@@ -282,7 +282,7 @@ class Recorder:
             departures = guard()
         except Exception as error:  # whatever it is, what is recorded is recorded
             departures = []
-            self._guard.give_up(repr(error))
+            self._monitor.give_up(repr(error))
         for one in departures:
             text = f"claims that this touches are void from {one.t_s:.3f} s on: {one.text}"
             notice = Notice(round(one.t_s * NS_PER_S), "void", text)
@@ -290,14 +290,14 @@ class Recorder:
             self._account["void"].append(text)
             if self._feed is not None:
                 self._feed.log(notice._asdict())
-        if self._guard.blind is not None and not self._told_blind:
+        if self._monitor.blind is not None and not self._told_blind:
             self._told_blind = True
-            text = f"whether claims are void is told after the run only: {self._guard.blind}"
+            text = f"whether claims are void is told after the run only: {self._monitor.blind}"
             self._account["void"].append(text)
 
     def _see_run(self, lost: np.ndarray[Any, np.dtype[np.int64]]) -> None:
         longest = int(lost.max(initial=0))
-        self._account["longest_drop_run"] = max(self._account["longest_drop_run"], longest)
+        self._account["longest_loss_burst"] = max(self._account["longest_loss_burst"], longest)
 
     def _goodbye(self, query: zenoh.Query) -> None:
         role = str(query.key_expr).rpartition("/")[2]
@@ -318,7 +318,7 @@ class Recorder:
             raise PeerError(f"{role} has nothing to report")
         payload = b"" if query.payload is None else query.payload.to_bytes()
         report = report_of(role, payload, self._types)
-        return {"incarnation": 0, "instance": ""} | report | {"process": role}
+        return {"generation": 0, "instance": ""} | report | {"process": role}
 
     def _await_rows(self, report: dict[str, Any]) -> None:
         deadline_s = time.monotonic() + 0.3
@@ -330,9 +330,9 @@ class Recorder:
                 self._take(sample)
 
     def _missing(self, report: dict[str, Any]) -> dict[str, list[tuple[int, int]]]:
-        role, incarnation = report["process"], report["incarnation"]
+        role, generation = report["process"], report["generation"]
         missing = {
-            table: self._got[role, table, incarnation].missing(total)
+            table: self._got[role, table, generation].missing(total)
             for table, total in report["rows"].items()
             if table == NOTICES or OWNER.get(table) == role
         }
@@ -344,13 +344,13 @@ class Recorder:
             for first, data in read_chunks(self._run_dir / SPOOL, table):
                 if len(data) and len(data) % dtype.itemsize == 0:
                     rows = np.frombuffer(data, dtype)
-                    incarnation = int(rows["input"][0]) // INCARNATION
-                    self._got[OWNER[table], table, incarnation].add(first, first + len(rows))
+                    generation = int(rows["input"][0]) // GENERATION
+                    self._got[OWNER[table], table, generation].add(first, first + len(rows))
                     self._count(table, rows)
         for role in LOOP_ROLES:
             for number, _ in read_chunks(self._run_dir / SPOOL, notices_of(role)):
-                incarnation, first = divmod(number, INCARNATION)
-                self._got[role, NOTICES, incarnation].add(first, first + 1)
+                generation, first = divmod(number, GENERATION)
+                self._got[role, NOTICES, generation].add(first, first + 1)
 
     def _give_up_view(self, error: ViewError) -> None:
         print_to_stderr(f"noack recorder: {error}; the numeric record goes on")
@@ -363,14 +363,14 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     arguments = sys.argv[1:] if arguments is None else arguments
     live = "--live" in arguments
 
-    def body(node: Node) -> None:
+    def body(node: RunProcess) -> None:
         _record(node, live=live)
 
     return run_process(RECORDER, body)
 
 
-def _record(node: Node, *, live: bool) -> None:
-    with under_way(Path(node.ticket.run_dir)), ExitStack() as stack:
+def _record(node: RunProcess, *, live: bool) -> None:
+    with in_flight(Path(node.ticket.run_dir)), ExitStack() as stack:
         live_view = None
         if live and not node.start.again:
             live_view = LiveView()
@@ -378,7 +378,7 @@ def _record(node: Node, *, live: bool) -> None:
         _record_run(node, live_view)
 
 
-def _record_run(node: Node, live_view: LiveView | None) -> None:
+def _record_run(node: RunProcess, live_view: LiveView | None) -> None:
     run_dir = Path(node.ticket.run_dir)
     view = None
     if not node.start.again:  # else the recording is written anew in the end

@@ -9,12 +9,12 @@ from typing import Protocol
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     REPORTS_FILE,
+    in_flight,
     new_run_dir,
     point_to_latest,
-    under_way,
     write_scenario,
 )
-from cosim.record.run_ending import Ending, EndingFile
+from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
 from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
@@ -38,8 +38,8 @@ def simulate_run(
     progress: Progress | None = None,
     *,
     view: bool = True,
-) -> Ending:
-    """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.conclude` ends it.
+) -> RunEnding:
+    """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.finalize` ends it.
 
     A run that is broken off leaves nothing behind: it can be repeated.
 
@@ -58,7 +58,7 @@ def simulate_run(
     run_dir = new_run_dir(runs, resolved.name)
     run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
     try:
-        with under_way(run_dir), EndingFile(run_dir) as ending:
+        with in_flight(run_dir), EndingFile(run_dir) as ending:
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)
@@ -76,4 +76,4 @@ def simulate_run(
             raise MachineError(f"{run_dir}: cannot be written: {why(error)}") from None
         raise
     point_to_latest(run_dir)
-    return Ending(run_dir, run_id, ExitStatus.OK, HORIZON)
+    return RunEnding(run_dir, run_id, ExitStatus.OK, HORIZON)

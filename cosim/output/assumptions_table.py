@@ -7,14 +7,14 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from noack.theory.assumptions import Verdict
+from noack.theory.assumptions import AssumptionStatus
 
 _COLOURS: dict[str, str] = {
-    Verdict.HOLDS: "green",
-    Verdict.VIOLATED: "bold yellow",
-    Verdict.IDEALISED: "dim",
-    Verdict.NOT_NEEDED: "dim",
-    Verdict.PRESUPPOSED: "cyan",
+    AssumptionStatus.HOLDS: "green",
+    AssumptionStatus.VIOLATED: "bold yellow",
+    AssumptionStatus.IDEALISED: "dim",
+    AssumptionStatus.NOT_NEEDED: "dim",
+    AssumptionStatus.PRESUPPOSED: "cyan",
 }
 
 

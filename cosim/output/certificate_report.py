@@ -16,11 +16,18 @@ from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
 from noack.theory.assumptions import assumptions
-from noack.theory.certificate import Conditions
+from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import BOX, Certificate, Scope, box, outside_box, own_plant
+from noack.theory.scenario_certificates import (
+    BOX,
+    CertificateScope,
+    ScenarioCertificate,
+    box,
+    outside_box,
+    own_plant,
+)
 from noack.theory.weight import choose_weight
 
 IDEAL = "paper"
@@ -32,7 +39,7 @@ MOST_LATE = 1000
 _MOST_S = 10.0
 
 
-class Limits(NamedTuple):
+class NetworkLimits(NamedTuple):
     """How far the schedule could go before a certificate is lost, one thing at a time."""
 
     sampling_s: float
@@ -54,22 +61,22 @@ class Study:
     """
 
     resolved: Scenario
-    certificates: Sequence[tuple[str, Certificate]]
-    scopes: Sequence[Scope]
-    scheduled: Conditions
+    certificates: Sequence[tuple[str, ScenarioCertificate]]
+    scopes: Sequence[CertificateScope]
+    scheduled: NetworkConditions
     theorem_2: Theorem2 | None
     weight: Matrix | None
 
     @cached_property
-    def limits(self) -> dict[str, Limits]:
+    def limits(self) -> dict[str, NetworkLimits]:
         """By scope; found when first asked for, by a hundred certificates."""
         return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
 
-    def certificate(self, under: str) -> Certificate:
+    def certificate(self, under: str) -> ScenarioCertificate:
         """The certificate of the scenario's own plant, under IDEAL or SCHEDULE."""
         return next(one for key, one in self.certificates if key == under)
 
-    def box_certificate(self, under: str) -> Certificate | None:
+    def box_certificate(self, under: str) -> ScenarioCertificate | None:
         """The certificate of the scenario's uncertainty box; None if it has none."""
         of_box = (one for key, one in self.certificates if key == under and one.scope == BOX)
         return next(of_box, None)
@@ -169,8 +176,8 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
     return Study(resolved, certificates, scopes, scheduled, theorem, weight)
 
 
-def _limits(scope: Scope, scheduled: Conditions) -> Limits:
-    return Limits(
+def _limits(scope: CertificateScope, scheduled: NetworkConditions) -> NetworkLimits:
+    return NetworkLimits(
         scope.largest(
             scheduled, lambda c, value: c._replace(sampling_s=value, spacing_s=value), _MOST_S
         ),
@@ -249,7 +256,7 @@ def _print_constants(console: Console, found: Study) -> None:
             )
 
 
-def whose(certificate: Certificate) -> str:
+def whose(certificate: ScenarioCertificate) -> str:
     """Of which plants a certificate is, in a word."""
     return "box" if certificate.scope == BOX else "plant"
 
@@ -258,7 +265,7 @@ def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
     """Yield what a person is told: label, the value of each certificate, and of Theorem 2."""
     theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
 
-    def row(value: Callable[[Certificate], float | None]) -> list[str]:
+    def row(value: Callable[[ScenarioCertificate], float | None]) -> list[str]:
         return [_number(value(c)) if c.constants else "void" for c in all_certificates]
 
     def constant(name: str) -> list[str]:

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.fidelity import Difference, Fidelity, is_against, percent
+from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against, percent
 
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
@@ -75,7 +75,7 @@ def _by_state(fidelity: Fidelity) -> Table:
     return table
 
 
-def _sizes(difference: Difference) -> tuple[str, str]:
+def _sizes(difference: SignalDifference) -> tuple[str, str]:
     return f"{difference.rms:.2e}", f"{difference.max:.2e}"
 
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from cosim.analysis.run_summary import Summary
 from cosim.output.run_tables import away, changes_in
-from noack.theory.assumptions import Verdict
+from noack.theory.assumptions import AssumptionStatus
 
 _MOST = 5
 _MOST_GROWTH, _MOST_LATE = 10.0, 0.01
@@ -34,7 +34,7 @@ def remarks(summary: Summary) -> Iterator[Remark]:
 
 def _warnings(summary: Summary) -> Iterator[str]:
     for one in summary["assumptions"]:
-        if one["verdict"] == Verdict.VIOLATED:
+        if one["verdict"] == AssumptionStatus.VIOLATED:
             yield f"assumption violated: {one['what']} ({one['source']}): {one['why']}"
     late = summary["lateness_us"].get("plant")
     if late and late["late_steps"] > _MOST_LATE * late["steps"]:

@@ -88,7 +88,9 @@ def _lost(summary: Summary) -> tuple[str, str]:
 
 
 def _longest_burst(summary: Summary) -> tuple[str, str]:
-    return f"longest loss burst (cap M − 1 = {summary['mansd']})", str(summary["longest_drop_run"])
+    return f"longest loss burst (cap M − 1 = {summary['mansd']})", str(
+        summary["longest_loss_burst"]
+    )
 
 
 def _forced(summary: Summary) -> tuple[str, str]:

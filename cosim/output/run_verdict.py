@@ -24,7 +24,7 @@ _CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
 """What may become of a claim that did not hold, and how it looks; the worst first."""
 
 
-class Line(NamedTuple):
+class VerdictLine(NamedTuple):
     """A line of the verdict."""
 
     text: str
@@ -32,20 +32,22 @@ class Line(NamedTuple):
     """A style of rich."""
 
 
-def verdict(summary: Summary) -> tuple[Line, Line, Line]:
+def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
     """How far the run came, its transmissions against the ideal loop's, its claims."""
-    return _ending(summary), Line(_transmissions(summary), NEUTRAL), _claims(summary)
+    return _ending(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
 
 
-def _ending(summary: Summary) -> Line:
+def _ending(summary: Summary) -> VerdictLine:
     end, reached = summary["exit"], f"{summary['reached_s']:g} s"
     if end["status"] == ExitStatus.OK:
-        return Line(
+        return VerdictLine(
             f"completed {reached}" + ("" if end["reason"] == HORIZON else f": {end['reason']}"),
             GOOD,
         )
     style = BAD if end["status"] == ExitStatus.FAILED else DOUBTFUL
-    return Line(f"not completed: {end['reason']} ({reached} of {summary['horizon_s']:g} s)", style)
+    return VerdictLine(
+        f"not completed: {end['reason']} ({reached} of {summary['horizon_s']:g} s)", style
+    )
 
 
 def _transmissions(summary: Summary) -> str:
@@ -54,18 +56,18 @@ def _transmissions(summary: Summary) -> str:
     return f"{summary['events']} transmissions{beside}, {summary['deliveries']} delivered"
 
 
-def _claims(summary: Summary) -> Line:
+def _claims(summary: Summary) -> VerdictLine:
     """How many claims held; the others by what became of them, with the first reason."""
     claims = summary.get("claims") or []
     if not claims:
-        return Line("claims: none", NEUTRAL)
+        return VerdictLine("claims: none", NEUTRAL)
     counts = Counter(claim["verdict"] for claim in claims)
     parts, style = [f"claims: {counts['held']} of {len(claims)} held"], GOOD
     for name, colour in _CLAIMS.items():
         if counts[name]:
             style = colour if style == GOOD else style
             parts.append(f"{counts[name]} {name}{_reason(claims, name)}")
-    return Line(", ".join(parts), style)
+    return VerdictLine(", ".join(parts), style)
 
 
 def _reason(claims: list[dict[str, str]], name: str) -> str:

@@ -18,24 +18,24 @@ from numpy.typing import NDArray
 
 from cosim.record.recorded_changes import model_flow_of
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.resolution import Loop, loop_of
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import row_norms
 from noack.core.model_flow import ModelFlow
-from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
     NO_SEQUENCE,
     SENSOR_MEASUREMENT,
 )
-from noack.theory.identities import MissedJumps
+from noack.theory.identities import ModelDifference
 
 Times = NDArray[np.int64]
 Reals = NDArray[np.float64]
 
 
-class Joined(NamedTuple):
+class AlignedRun(NamedTuple):
     """Samples on the measurement grid; k samples, n states."""
 
     t_ns: Times
@@ -55,7 +55,7 @@ class Joined(NamedTuple):
     received: NDArray[np.int64]
     """(k,) sequence number of the controller's newest update at t, −1 for none."""
     sensor: NDArray[np.int64]
-    """(k,) incarnation of the sensor."""
+    """(k,) generation of the sensor."""
 
     def since_delivery(self, scenario: Scenario) -> NDArray[np.bool_]:
         """Where the controller's error is on record, from its first update on, (k,)."""
@@ -70,7 +70,7 @@ class ControllerTrack(NamedTuple):
     model_ns: Times
     x_c: Reals
     received: NDArray[np.int64]
-    incarnation: int = 0
+    generation: int = 0
     """Of the controller that was in the last of them."""
 
     def since(self, index: int) -> "ControllerTrack":
@@ -80,13 +80,13 @@ class ControllerTrack(NamedTuple):
         )
 
 
-def in_common(scenario: Scenario, joined: Joined) -> NDArray[np.bool_]:
+def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
     """Where x_c is on record, and sensor and controller have something in common, (k,).
 
     What that was is lost with the sensor, until an update of the one in its place is delivered.
     """
     known = scenario.network.initial_sync == "known_state"
-    first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * INCARNATION)
+    first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * GENERATION)
     return np.asarray(~np.isnan(joined.x_c).any(axis=1) & (joined.received >= first))
 
 
@@ -105,7 +105,7 @@ def controller_track(before: ControllerTrack, steps: Rows, deliveries: Rows) -> 
     newest = np.concatenate([np.full(len(steps), NO_SEQUENCE), deliveries["sequence"]])[order]
     model_ns = np.concatenate([steps["model_t_ns"], deliveries["model_t_ns"]])[order]
     x_c = np.concatenate([steps["x_c"], deliveries["x_c"]])[order]
-    lives = inputs[order] // INCARNATION
+    lives = inputs[order] // GENERATION
     track = before
     for life in np.unique(lives):
         which = lives == life
@@ -117,7 +117,7 @@ def _continued(
     track: ControllerTrack, life: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
 ) -> ControllerTrack:
     """Continue a track by states of one controller."""
-    if life != track.incarnation:  # from where the one before left off, there is none
+    if life != track.generation:  # from where the one before left off, there is none
         track = ControllerTrack(
             np.append(track.model_ns, track.model_ns[-1] + 1),
             np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
@@ -136,14 +136,14 @@ def _continued(
 
 @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
 def join(
-    loop: Loop,
+    loop: LoopMatrices,
     measurements: Rows,
     track: ControllerTrack,
     until_ns: int,
     *,
     flow: ModelFlow | None = None,
     acknowledged: bool = False,
-) -> Joined:
+) -> AlignedRun:
     """Join measurements with the controller's track.
 
     Args:
@@ -163,7 +163,7 @@ def join(
     e_c = x_c - measurements["x"]
     if loop.weight is not None:
         e_c = e_c @ loop.weight.T
-    return Joined(
+    return AlignedRun(
         t_ns,
         measurements["x"],
         x_s,
@@ -172,7 +172,7 @@ def join(
         _threshold(measurements),
         row_norms(e_c),
         received,
-        measurements["input"] // INCARNATION,
+        measurements["input"] // GENERATION,
     )
 
 
@@ -209,7 +209,7 @@ def _at(
     return x_c, received
 
 
-def join_all(record: RunRecord) -> Joined:
+def join_all(record: RunRecord) -> AlignedRun:
     """Join a whole run."""
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
@@ -231,9 +231,9 @@ class IdentityResidual:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
-        self._missed = MissedJumps(loop_of(scenario).H)
+        self._missed = ModelDifference(loop_of(scenario).H)
 
-    def of(self, measurements: Rows, joined: Joined) -> Reals:
+    def of(self, measurements: Rows, joined: AlignedRun) -> Reals:
         """Largest entry of |x_c − x_s − Σ e^{H(t−t_k)} e_s(t_k⁻)| at each measurement, (k,).
 
         Args:
@@ -253,7 +253,7 @@ class IdentityResidual:
         return residual
 
 
-def identity_residual(record: RunRecord, joined: Joined) -> Reals:
+def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
     """(I1)'s residual over a whole run, (k,); see :class:`IdentityResidual`.
 
     Zero to rounding on every run, whatever was lost. NaN where x_c is not recorded, and as long as

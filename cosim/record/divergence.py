@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.disturbances import Step
+from noack.config.disturbances import StepDisturbance
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
-from noack.config.triggers import AnyTrigger, Deadline, Dwell
+from noack.config.triggers import AnyTrigger, DeadlineSettings, DwellSettings
 from noack.core.linear_systems import Matrix, Vector, row_norms
 
 GROWTH = 1000.0
@@ -74,7 +74,7 @@ def _scale(scenario: Scenario) -> float:
     loop = loop_of(scenario)
     carried = 0.0
     for one in scenario.plant.disturbances:
-        if isinstance(one, Step):
+        if isinstance(one, StepDisturbance):
             push = loop.B @ np.array(one.amplitude) if one.at == "input" else one.amplitude
             until_s = min(one.until_s or scenario.horizon_s, scenario.horizon_s)
             carried += float(np.linalg.norm(push)) * max(until_s - one.from_s, 0.0)
@@ -86,6 +86,6 @@ def _scale(scenario: Scenario) -> float:
 
 
 def _threshold(trigger: AnyTrigger) -> float:
-    if isinstance(trigger, Deadline | Dwell):
+    if isinstance(trigger, DeadlineSettings | DwellSettings):
         return _threshold(trigger.rule)
     return max(float(getattr(trigger, key, 0.0)) for key in _THRESHOLDS)

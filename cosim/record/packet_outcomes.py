@@ -16,7 +16,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.wire_format import Flow
 
 
-class Crossing(NamedTuple):
+class PacketOutcome(NamedTuple):
     """What became of k updates on their way through the network emulator."""
 
     rows: Rows
@@ -25,15 +25,15 @@ class Crossing(NamedTuple):
     event_ns: NDArray[np.int64]
     lost: NDArray[np.bool_]
     """Dropped, corrupted, or overtaken by a newer one."""
-    under_way: NDArray[np.bool_]
+    in_flight: NDArray[np.bool_]
     """Had not left when the run ended."""
 
     @property
     def left(self) -> NDArray[np.bool_]:
         """Left intact, and before every newer one."""
-        return ~self.lost & ~self.under_way
+        return ~self.lost & ~self.in_flight
 
-    def longest_run(self) -> int:
+    def longest_loss_burst(self) -> int:
         """Most successive updates that were lost."""
         longest = run = 0
         for lost in self.lost.tolist():
@@ -42,7 +42,7 @@ class Crossing(NamedTuple):
         return longest
 
 
-def crossing(record: RunRecord, flow: Flow = Flow.UPDATE) -> Crossing:
+def crossing(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Say what became of the updates, or acknowledgements, that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
@@ -56,5 +56,5 @@ def crossing(record: RunRecord, flow: Flow = Flow.UPDATE) -> Crossing:
     effectively = effective(rows["fate"])
     stale = np.isin(numbers, left[releases["stale"] != 0])
     delayed = np.where(which == 1, rows["copy_ns"], rows["release_ns"]) > rows["now_ns"]
-    under_way = effectively & delayed & ~np.isin(numbers, left)
-    return Crossing(rows, sequence, event_ns, ~effectively | stale, under_way)
+    in_flight = effectively & delayed & ~np.isin(numbers, left)
+    return PacketOutcome(rows, sequence, event_ns, ~effectively | stale, in_flight)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.record.run_record import Rows, RunRecord
-from noack.config.parameter_changes import Change, Schedule, settings_of
+from noack.config.parameter_changes import ChangeSchedule, ParameterChange, settings_of
 from noack.config.resolution import loop_of
 from noack.config.runtime_parameters import is_of_loss_alone
 from noack.config.scenario import Scenario
@@ -19,10 +19,10 @@ from noack.protocol.topology import CHANGEABLE
 NEVER_NS = 2**63 - 1
 
 
-class Made(NamedTuple):
+class RecordedChange(NamedTuple):
     """A change of a run, and what became of it."""
 
-    change: Change
+    change: ParameterChange
     since_ns: Mapping[str, int]
     """From when on it was in force, by process; one that never heard of it is not there."""
     scenario: Scenario
@@ -49,25 +49,25 @@ class Made(NamedTuple):
         return not is_of_loss_alone(self.change.settings)
 
 
-def changes_of(record: RunRecord) -> list[Made]:
+def changes_of(record: RunRecord) -> list[RecordedChange]:
     """The changes of a run, in the order in which they came into force.
 
     What a damaged record says of changes that its scenario could not have is left out.
     """
     since: dict[int, dict[str, int]] = {}
-    found: dict[int, Change] = {}
+    found: dict[int, ParameterChange] = {}
     for table in SETTINGS:
         for change, since_ns in _told(record[table]):
             found.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
-    made: list[Made] = []
+    made: list[RecordedChange] = []
     scenario = record.scenario
-    schedule = Schedule(scenario)
+    schedule = ChangeSchedule(scenario)
     for number, change in sorted(found.items(), key=lambda one: (one[1].t_ns, one[0])):
         if _add(schedule, change, change.t_ns):
             taken = schedule.take(change.t_ns)
             assert taken is not None
-            made.append(Made(change, since[number], taken.scenario))
+            made.append(RecordedChange(change, since[number], taken.scenario))
     return made
 
 
@@ -78,7 +78,7 @@ def model_flow(scenario: Scenario, told: Rows) -> ModelFlow:
         scenario: the resolved scenario.
         told: rows of ``controller_setting``.
     """
-    loop, schedule = loop_of(scenario), Schedule(scenario)
+    loop, schedule = loop_of(scenario), ChangeSchedule(scenario)
     flow, known = ModelFlow(loop.H, (), loop.setpoint), set()
     for change, since_ns in _told(told):
         if change.number not in known:  # one that is started anew is told once more
@@ -104,7 +104,7 @@ def model_flow_of(record: RunRecord) -> ModelFlow:
     return model_flow(record.scenario, record[CONTROLLER_SETTING])
 
 
-def _told(rows: Rows) -> list[tuple[Change, int]]:
+def _told(rows: Rows) -> list[tuple[ParameterChange, int]]:
     found = []
     for row in rows[np.argsort(rows["input"], kind="stable")]:
         try:
@@ -112,12 +112,15 @@ def _told(rows: Rows) -> list[tuple[Change, int]]:
         except ValueError:
             continue
         found.append(
-            (Change(int(row["sequence"]), int(row["t_ns"]), settings), int(row["since_ns"]))
+            (
+                ParameterChange(int(row["sequence"]), int(row["t_ns"]), settings),
+                int(row["since_ns"]),
+            )
         )
     return found
 
 
-def _add(schedule: Schedule, change: Change, since_ns: int) -> bool:
+def _add(schedule: ChangeSchedule, change: ParameterChange, since_ns: int) -> bool:
     try:
         schedule.announce("", change, 0, 0, since_ns - 1)
     except CallerError:

@@ -12,7 +12,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-from noack.config.plant_systems import Fmu, Python
+from noack.config.plant_systems import FmuSettings, PythonSettings
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
 from noack.config.system_files import unchanged
@@ -77,7 +77,7 @@ def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
         OSError: the directory cannot be written.
     """
     system, here = resolved.plant.system, resolved
-    if isinstance(system, Fmu | Python) and system.file is not None:
+    if isinstance(system, FmuSettings | PythonSettings) and system.file is not None:
         file = unchanged(system)
         kept = run_dir / PLANT / file.name
         kept.parent.mkdir()
@@ -153,7 +153,7 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
 
 
 @contextmanager
-def under_way(run_dir: Path) -> Iterator[None]:
+def in_flight(run_dir: Path) -> Iterator[None]:
     """Mark a run as under way; the launcher and the recorder do, each for as long as it lives.
 
     Raises:

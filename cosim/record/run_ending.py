@@ -18,7 +18,7 @@ _ROOM_BYTES = 4096
 
 
 @dataclass(frozen=True)
-class Ending:
+class RunEnding:
     """How a run ended."""
 
     run_dir: Path

@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
 from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, read_object
-from noack.config.resolution import Loop, loop_of, tables_of
+from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
 from noack.core.errors import CallerError, MachineError, PeerError, one_line, why
-from noack.protocol.machine_interface import INCARNATION, RESTART
+from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import OWNER, entry_names
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import VERSION, Flow, read_header
-from noack.runtime.control_messages import LogLine, Report, heard
+from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
 from noack.runtime.spool import read_chunks
 from noack.runtime.telemetry import notices_of
 
@@ -62,7 +62,7 @@ class RunRecord:
         earlier: Sequence[dict[str, Any]] = (),
     ) -> None:
         self.scenario = scenario
-        self.loop: Loop = loop_of(scenario)
+        self.loop: LoopMatrices = loop_of(scenario)
         self.notices = notices
         self.reports = reports
         self.earlier = earlier
@@ -81,14 +81,12 @@ class RunRecord:
     def lives(self, role: str) -> list["Life"]:
         """What there is of each process that had a role in the run, one after the other."""
         owned, newest = self.owned_by(role), self.reports.get(role)
-        reports = {} if newest is None else {newest.get("incarnation", 0): newest}
-        reports |= {
-            one.get("incarnation", 0): one for one in self.earlier if one["process"] == role
-        }
+        reports = {} if newest is None else {newest.get("generation", 0): newest}
+        reports |= {one.get("generation", 0): one for one in self.earlier if one["process"] == role}
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
-        begun = incarnations(owned) if again else [0]
+        begun = generations(owned) if again else [0]
         which = {  # a number out of its turn is of the process before
-            table: np.searchsorted(begun, rows["input"] // INCARNATION, side="right") - 1
+            table: np.searchsorted(begun, rows["input"] // GENERATION, side="right") - 1
             for table, rows in owned.items()
         }
         return [
@@ -108,7 +106,7 @@ class RunRecord:
 class Life(NamedTuple):
     """What there is of one process of a run."""
 
-    incarnation: int
+    generation: int
     rows: Mapping[str, Rows]
     """By table."""
     report: Mapping[str, Any] | None
@@ -122,11 +120,11 @@ class Life(NamedTuple):
         now_ns = np.concatenate([rows["now_ns"] for rows in self.rows.values()])
         order = np.argsort(inputs, kind="stable")
         inputs, now_ns = inputs[order], now_ns[order]
-        holes = np.flatnonzero(np.diff(inputs, prepend=self.incarnation * INCARNATION - 1) > 1)
+        holes = np.flatnonzero(np.diff(inputs, prepend=self.generation * GENERATION - 1) > 1)
         return None if not len(holes) else int(now_ns[max(holes[0] - 1, 0)])
 
 
-def incarnations(owned: Mapping[str, Rows]) -> list[int]:
+def generations(owned: Mapping[str, Rows]) -> list[int]:
     """The processes of a role that have left rows: every one's first input has a number of its own.
 
     If that is missing, what a later one left shows that there were others before it.
@@ -135,8 +133,8 @@ def incarnations(owned: Mapping[str, Rows]) -> list[int]:
         owned: the rows of the role's tables.
     """
     inputs = np.concatenate([rows["input"] for rows in owned.values()])
-    first = inputs[(inputs % INCARNATION == 0) & (inputs > 0)] // INCARNATION
-    of = np.unique(inputs // INCARNATION)
+    first = inputs[(inputs % GENERATION == 0) & (inputs > 0)] // GENERATION
+    of = np.unique(inputs // GENERATION)
     return [0, *of[(of > 0) & (of <= first.max(initial=0))].tolist()]
 
 
@@ -260,7 +258,7 @@ def _notices(folder: Path, spool: Path) -> list[dict[str, Any]]:
     for role in (*LOOP_ROLES, RECORDER):
         for _, data in read_chunks(spool, notices_of(role)):
             try:
-                notice = heard(LogLine, data) | {"process": role}
+                notice = parse_message(LogLine, data) | {"process": role}
             except PeerError:  # damaged
                 continue
             if notice not in notices:
@@ -272,7 +270,7 @@ def _read_notices(folder: Path) -> list[dict[str, Any]]:
     path = folder / _NOTICES_FILE
     try:
         lines = path.read_bytes().splitlines() if path.is_file() else []
-        return [heard(_Notice, line) for line in lines]
+        return [parse_message(_Notice, line) for line in lines]
     except (OSError, PeerError) as error:
         raise CallerError(f"{path}: cannot be read: {error}") from None
 
@@ -288,7 +286,7 @@ def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, 
     Raises:
         PeerError: it is no report, or does not account for every table of the process.
     """
-    report = heard(Report, said)
+    report = parse_message(ProcessReport, said)
     if not report["rows"].keys() >= {table for table in tables if OWNER[table] == role}:
         raise PeerError("the report does not say how many rows there are")
     return report
@@ -300,7 +298,7 @@ def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
     Raises:
         MachineError: they cannot be written.
     """
-    in_order = sorted(reports, key=lambda report: int(report["incarnation"]))
+    in_order = sorted(reports, key=lambda report: int(report["generation"]))
     newest = {report["process"]: report for report in in_order}
     earlier = [report for report in in_order if report is not newest[report["process"]]]
     content = newest | ({_EARLIER: earlier} if earlier else {})
@@ -330,14 +328,14 @@ def _reports(
                 continue
             report = report_of(role, json.dumps(entry), rows)
             owned = {table: rows[table] for table in rows if OWNER[table] == role}
-            if report.get("incarnation", 0) < incarnations(owned)[-1] or role in reports:
+            if report.get("generation", 0) < generations(owned)[-1] or role in reports:
                 earlier.append(report | {"process": role})
             else:
                 reports[role] = report
     return reports, earlier
 
 
-def _to_parquet(rows: Rows, path: Path, loop: Loop) -> None:
+def _to_parquet(rows: Rows, path: Path, loop: LoopMatrices) -> None:
     columns: dict[str, Any] = {}
     for name in rows.dtype.names or ():
         column = rows[name]

@@ -17,7 +17,12 @@ from controller_node.controller import controller_of
 from cosim.record.run_record import Rows, RunRecord
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram
-from noack.config.parameter_changes import Change, Changeable, said_of, scheduled
+from noack.config.parameter_changes import (
+    ParameterChange,
+    ReconfigurableMachine,
+    said_of,
+    scheduled,
+)
 from noack.config.resolution import tables_of
 from noack.config.scenario import Scenario
 from noack.protocol.machine_interface import Machine, Notice, Record
@@ -30,7 +35,7 @@ from noack.protocol.record_tables import (
     UPDATES,
     Fate,
 )
-from noack.protocol.topology import ACKNOWLEDGES_TO, CHANGEABLE, LEGS, LOOP_ROLES, RECORDER
+from noack.protocol.topology import ACKNOWLEDGES_TO, CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
 from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message
 from noack.runtime.process_life import HORIZON
 from plant_server.plant import plant_of
@@ -67,15 +72,15 @@ class DecidedLink:
         self._packets = 0
         self._newest = -1
         self._drop_run = 0
-        self._under_way: list[tuple[int, int, Datagram]] = []
+        self._in_flight: list[tuple[int, int, Datagram]] = []
 
     def next_deadline_ns(self) -> int | None:
         """When the next datagram arrives."""
-        return self._under_way[0][0] if self._under_way else None
+        return self._in_flight[0][0] if self._in_flight else None
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Let a datagram out."""
-        release_ns, packet, datagram = heapq.heappop(self._under_way)
+        release_ns, packet, datagram = heapq.heappop(self._in_flight)
         stale = packet < self._newest
         self._newest = max(self._newest, packet)
         row = (self._inputs, packet, release_ns, now_ns, datagram.flow, 0, int(stale))
@@ -101,7 +106,7 @@ class DecidedLink:
             self._newest = max(self._newest, packet)
             return (message, record)
         if delay_ns is not None:
-            heapq.heappush(self._under_way, (release_ns, packet, message))
+            heapq.heappush(self._in_flight, (release_ns, packet, message))
         return (record,)
 
 
@@ -131,7 +136,7 @@ class Shuttle:
         self._encoder = Encoder(RUN_ID, _KEY)
         self.decoders = {
             role: Decoder(leg.receives, entries(leg.receives), RUN_ID, _KEY)
-            for role, leg in LEGS.items()
+            for role, leg in ROUTES.items()
             if role != "netem"  # which reads no payload
         }
         self.acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, RUN_ID, _KEY)
@@ -152,10 +157,10 @@ class Shuttle:
                 continue
             yield self._now_ns
 
-    def announce(self, changes: Sequence[Change]) -> None:
+    def announce(self, changes: Sequence[ParameterChange]) -> None:
         """Tell every machine that can be changed of changes to come."""
         for role in CHANGEABLE:
-            machine: Changeable[Any] = self.machines[role]  # type: ignore[assignment]
+            machine: ReconfigurableMachine[Any] = self.machines[role]  # type: ignore[assignment]
             for change in changes:
                 self._emit(role, machine.announce(change, self._now_ns))
 
@@ -190,7 +195,7 @@ class Shuttle:
                 forwarded = isinstance(output, Datagram)
                 data = output.data if forwarded else self._encoder.encode(output)
                 answers = output.flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
-                to = ACKNOWLEDGES_TO[role] if answers and self._acknowledged else LEGS[role].to
+                to = ACKNOWLEDGES_TO[role] if answers and self._acknowledged else ROUTES[role].to
                 self._sent.append((role, to, data))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.capture.capture_writer import CaptureWriter
-from netem.capture.pcapng import Interface
+from netem.capture.pcapng import PcapngInterface
 from netem.engine.relay_interface import LinkSpec
 from noack.runtime.address import text_of
 
@@ -41,10 +41,10 @@ class CaptureTap:
         self._writer.miss(missed)
 
 
-def interfaces_of(specs: Sequence[LinkSpec]) -> list[Interface]:
+def interfaces_of(specs: Sequence[LinkSpec]) -> list[PcapngInterface]:
     """Return a capture's interfaces: for each link the clients' side, then the server's."""
     return [
-        Interface(f"{spec.name} {side}", text_of(address))
+        PcapngInterface(f"{spec.name} {side}", text_of(address))
         for spec in specs
         for side, address in (("client", spec.listen), ("server", spec.to))
     ]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import SNAP_BYTES, Interface, Section
+from netem.capture.pcapng import SNAP_BYTES, PcapngInterface, PcapngSection
 from noack.core.errors import CallerError
 
 _STDOUT = 1
@@ -48,7 +48,7 @@ class CaptureWriter:
     def __init__(
         self,
         path: str | Path,
-        interfaces: Sequence[Interface],
+        interfaces: Sequence[PcapngInterface],
         *,
         snap_bytes: int = SNAP_BYTES,
         batches: int = 64,
@@ -56,7 +56,7 @@ class CaptureWriter:
     ) -> None:
         self.error: str | None = None
         """Why the capture ended early, in one line; None as long as it has not."""
-        self._section = Section(interfaces, snap_bytes)
+        self._section = PcapngSection(interfaces, snap_bytes)
         self._path = "the standard output" if str(path) == "-" else str(path)
         self._file = _open(path)
         self._batches = batches

@@ -272,8 +272,8 @@ def _put_comment(out: Bytes, start: int, event: Any) -> int:
         goes_on = fate in (_DELIVERED, _FORCED, _CORRUPTED)
         if goes_on and event["delay_ns"] > 0:
             at = _put_ms(out, _put(out, at, _DELAYED), event["delay_ns"])
-        if goes_on and event["held_ns"] > 0:
-            at = _put_ms(out, _put(out, at, _HELD_BACK), event["held_ns"])
+        if goes_on and event["hold_back_ns"] > 0:
+            at = _put_ms(out, _put(out, at, _HELD_BACK), event["hold_back_ns"])
             at = _put(out, at, _FOR_THE_CAP)
     at = _put(out, at, _BACK if event["direction"] else _FORWARD)
     at = _put_number(out, at, event["flow"])

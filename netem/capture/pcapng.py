@@ -50,7 +50,7 @@ _START, _END, _RECEIVED, _DROPPED = 2, 3, 4, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Interface:
+class PcapngInterface:
     """One side of a link."""
 
     name: str
@@ -59,7 +59,7 @@ class Interface:
     """For people, for example its address."""
 
 
-class Section:
+class PcapngSection:
     """The blocks of one capture file, in their order: header, packets, ..., statistics.
 
     Making one compiles the code that formats packets, which takes some seconds the first time.
@@ -69,7 +69,7 @@ class Section:
         snap_bytes: payload bytes captured of each datagram.
     """
 
-    def __init__(self, interfaces: Sequence[Interface], snap_bytes: int = SNAP_BYTES) -> None:
+    def __init__(self, interfaces: Sequence[PcapngInterface], snap_bytes: int = SNAP_BYTES) -> None:
         self._interfaces = tuple(interfaces)
         self._snap_bytes = snap_bytes
         self._missing = np.zeros(len(interfaces), np.int64)

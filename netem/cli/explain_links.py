@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
-from netem.loss_prediction import Prediction, predict
+from netem.loss_prediction import LossPrediction, predict
 from netem.words.explanation import meaning_of, settings_meaning
 from netem.words.settings_to_words import impairment_text, text_of
 from netem.words.tc_command import tc_command
@@ -162,7 +162,7 @@ def _loss_line(settings: LinkSettings) -> str:
     return f"predicted loss in the long run: {_rate_text(prediction, without)}"
 
 
-def _rate_text(prediction: Prediction, without_cap: float | None) -> str:
+def _rate_text(prediction: LossPrediction, without_cap: float | None) -> str:
     if prediction.rate is None:
         return f"not known: {prediction.note}"
     text = f"{100 * prediction.rate:.4g}%"

@@ -71,11 +71,11 @@ def compile_all() -> None:
         say(f"nothing is compiled here: the batched engine {missing}")
         return
     began_s = time.monotonic()
-    from netem.capture.pcapng import Section
+    from netem.capture.pcapng import PcapngSection
     from netem.engine.batched_engine import load
 
     load()
-    Section(())
+    PcapngSection(())
     say(f"all is compiled ({time.monotonic() - began_s:.1f} s)")
 
 

@@ -8,9 +8,9 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.control.emulator_statistics import (
+    DelayQuantiles,
     DirectionStatistics,
     LinkStatistics,
-    Quantiles,
     Statistics,
     unintended,
 )
@@ -24,10 +24,10 @@ _CAUSES = {
     "blacked_out": "dropped in a blackout",
 }
 _COUNTS = {
-    "overtaken": "overtaken (stale)",
+    "delivered_out_of_order": "overtaken (stale)",
     "held_back": "held back, not to overtake too many",
     "duplicated": "sent twice",
-    "under_way": "still under way",
+    "in_flight": "still under way",
 }
 
 
@@ -94,7 +94,7 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
         full = forward["fates"]["overflowed"] or back["fates"]["overflowed"]
         what = "but for full queues" if full else "in the long run"
         yield _Row(f"  predicted {what}", _share(forward, "predicted"), _share(back, "predicted"))
-    if forward["overtaken"] or back["overtaken"]:
+    if forward["delivered_out_of_order"] or back["delivered_out_of_order"]:
         yield _Row("lost or stale", _share(forward, "realised"), _share(back, "realised"))
     yield _Row("delay: median, 99 % within", _times(forward["delay_ns"]), _times(back["delay_ns"]))
     late = (forward["lateness_ns"], back["lateness_ns"])
@@ -122,14 +122,14 @@ def _number(number: int) -> str:
 
 def _run(side: DirectionStatistics) -> str:
     cap = "" if side["mansd"] is None else f" of {side['mansd']:,} allowed"
-    return f"{side['longest_run']:,}{cap}"
+    return f"{side['longest_loss_burst']:,}{cap}"
 
 
 def _share(side: DirectionStatistics, which: Literal["lost", "predicted", "realised"]) -> str:
     return percent_text(side["loss"][which])
 
 
-def _times(times: Quantiles) -> str:
+def _times(times: DelayQuantiles) -> str:
     if times["p50"] is None:
         return NONE
     return f"{time_text(times['p50'])}, {time_text(times['p99'])}"

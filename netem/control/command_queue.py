@@ -26,7 +26,7 @@ _PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True)
-class InForce:
+class AppliedSettings:
     """What a direction of a link does, and since when."""
 
     settings: LinkSettings
@@ -49,13 +49,13 @@ class Snapshot(NamedTuple):
 
     engine: str
     links: Sequence[LinkReport]
-    in_force: Mapping[tuple[str, Direction], InForce]
+    in_force: Mapping[tuple[str, Direction], AppliedSettings]
     elapsed_ns: int
     """Since the relay began."""
     unix_ns: int
 
 
-class Errands:
+class CommandQueue:
     """Does in the relay's thread what other threads ask for.
 
     Args:
@@ -66,10 +66,10 @@ class Errands:
         self._relay = relay
         self._began_ns = time.monotonic_ns()
         self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
-        self._in_force: dict[tuple[str, Direction], InForce] = {}
+        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {}
         for spec in relay.specs:
-            self._in_force[spec.name, "forward"] = InForce(spec.forward, Counters())
-            self._in_force[spec.name, "back"] = InForce(spec.back, Counters())
+            self._in_force[spec.name, "forward"] = AppliedSettings(spec.forward, Counters())
+            self._in_force[spec.name, "back"] = AppliedSettings(spec.back, Counters())
         self._closed = False
         self._lock = Lock()
 
@@ -149,6 +149,8 @@ class Errands:
             (report,) = (one for one in self._relay.report() if one.name == link)
             for direction in directions:
                 changed = report.forward if direction == "forward" else report.back
-                self._in_force[link, direction] = InForce(settings, replace(changed.counters))
+                self._in_force[link, direction] = AppliedSettings(
+                    settings, replace(changed.counters)
+                )
 
         self.ask(do)

@@ -12,7 +12,7 @@ from netem.control.control_server import secret_of
 from netem.control.emulator_session import Session, running
 from netem.control.emulator_statistics import Statistics
 from noack.core.errors import PeerError
-from noack.runtime.zenoh_session import answer_to, cause_of, open_star
+from noack.runtime.zenoh_session import answer_to, cause_of, open_session
 
 _ANSWER_S = 10.0
 _SILENCE_S = 3.0
@@ -33,7 +33,7 @@ class Client:
         self._name = session.name
         self._token = session.token
         try:
-            self._session = open_star(session.endpoint, secret_of(self._token), listen=False)
+            self._session = open_session(session.endpoint, secret_of(self._token), listen=False)
         except zenoh.ZError as error:
             raise PeerError(
                 f"emulator {self._name!r} cannot be reached at {session.endpoint}: "

@@ -37,17 +37,17 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.command_queue import Errands, Snapshot
+from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.emulator_session import Session, published
 from netem.control.emulator_statistics import statistics
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.settings_to_words import text_of
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import Delay, LinkSettings, LossOf, Trace
+from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
-from noack.runtime.zenoh_session import Secret, cause_of, open_star
+from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
 _TOKEN_BYTES = 32
 _POLL_S = 0.02
@@ -57,12 +57,12 @@ _QUERIES = 64
 _PATIENCE_S = 10.0
 
 
-def secret_of(token: str) -> Secret:
+def secret_of(token: str) -> SessionSecret:
     """Return what zenoh asks for whoever connects."""
-    return Secret("netem", token)
+    return SessionSecret("netem", token)
 
 
-class Change(BaseModel):
+class SettingsChange(BaseModel):
     """What a query for ``change`` says."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
@@ -91,9 +91,9 @@ class ControlServer:
         MachineError: no port can be listened on.
     """
 
-    def __init__(self, name: str, errands: Errands) -> None:
+    def __init__(self, name: str, commands: CommandQueue) -> None:
         self._name = name
-        self._errands = errands
+        self._errands = commands
         self._token = secrets.token_hex(_TOKEN_BYTES)
         self._snapshots: deque[Snapshot] = deque(maxlen=2)
         self._stopping = threading.Event()
@@ -125,7 +125,7 @@ class ControlServer:
 
     def _open(self, endpoint: str) -> zenoh.Session:
         try:
-            return open_star(endpoint, secret_of(self._token), listen=True)
+            return open_session(endpoint, secret_of(self._token), listen=True)
         except zenoh.ZError as error:
             raise MachineError(f"cannot listen on {endpoint}: {cause_of(error)}") from None
 
@@ -197,7 +197,7 @@ class ControlServer:
 
     def _change(self, content: Mapping[str, Any]) -> object:
         try:
-            change = Change.model_validate_json(json.dumps(content))
+            change = SettingsChange.model_validate_json(json.dumps(content))
         except ValidationError as error:
             raise CallerError(brief(error)) from None
         settings = change.settings
@@ -228,7 +228,7 @@ def _settings(settings: LinkSettings) -> object:
 
 def _require_read(settings: LinkSettings) -> None:
     for impairment in settings.impairments:
-        if isinstance(impairment, LossOf) and isinstance(impairment.loss, Trace):
+        if isinstance(impairment, LossOf) and isinstance(impairment.loss, TraceLoss):
             file = impairment.loss.file
         elif isinstance(impairment, Delay) and impairment.file is not None:
             file = impairment.file

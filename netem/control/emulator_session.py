@@ -42,7 +42,7 @@ def published(session: Session) -> Iterator[Path]:
     require_name(session.name, "emulator")
     with ExitStack() as stack:
         try:
-            path = stack.enter_context(lock_file.held(_KIND, session.name, session._asdict()))
+            path = stack.enter_context(lock_file.lock_file(_KIND, session.name, session._asdict()))
         except FileExistsError:
             raise _in_use(session.name) from None
         yield path
@@ -59,7 +59,7 @@ def starting(name: str | None) -> Iterator[None]:
         if name is not None:
             require_name(name, "emulator")
             try:
-                stack.enter_context(lock_file.held(_STARTING, name, {}))
+                stack.enter_context(lock_file.lock_file(_STARTING, name, {}))
             except FileExistsError:
                 raise _in_use(name) from None
             if name in running():
@@ -88,7 +88,7 @@ def find(name: str | None) -> Session:
         PeerError: it is still starting, or its session file cannot be read.
     """
     files = _files()
-    begun = [file.path.stem for file in lock_file.running(_STARTING)]
+    begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
     if name not in files and (name in begun or (name is None and begun and not files)):
         raise PeerError(
             f"emulator {name or begun[0]!r} is starting; its first start compiles for some time, "
@@ -113,5 +113,5 @@ def find(name: str | None) -> Session:
         ) from None
 
 
-def _files() -> dict[str, lock_file.Held]:
-    return {file.path.stem: file for file in lock_file.running(_KIND)}
+def _files() -> dict[str, lock_file.LockFile]:
+    return {file.path.stem: file for file in lock_file.live_lock_files(_KIND)}

@@ -9,7 +9,7 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.command_queue import InForce, Snapshot
+from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.engine.histogram import coarse, quantile_ns
 from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkReport
 from netem.rule_records import Counters
@@ -20,7 +20,7 @@ from noack.runtime.address import text_of
 _WORDS_SHOWN = 200
 
 
-class Quantiles(TypedDict):
+class DelayQuantiles(TypedDict):
     """Of a time, in ns; null if there is none to speak of."""
 
     p50: int | None
@@ -29,7 +29,7 @@ class Quantiles(TypedDict):
     max: int | None
 
 
-class Loss(TypedDict):
+class LossStatistics(TypedDict):
     """Share of the datagrams that are not effectively delivered; null if not known."""
 
     realised: float | None
@@ -43,7 +43,7 @@ class Loss(TypedDict):
     """What is drawn in the long run; see :mod:`netem.loss_prediction`."""
 
 
-class Recent(TypedDict):
+class RecentRates(TypedDict):
     """What has happened since the document before."""
 
     seconds: float
@@ -54,17 +54,17 @@ class Recent(TypedDict):
     forwarded_bits_per_s: float
     loss: float | None
     """Share of what has arrived that is not effectively delivered."""
-    delay_ns: Quantiles
-    lateness_ns: Quantiles
+    delay_ns: DelayQuantiles
+    lateness_ns: DelayQuantiles
 
 
-class Flow(TypedDict):
+class FlowStatistics(TypedDict):
     """One flow of a direction."""
 
     flow: int
     client: str
     packets: int
-    longest_run: int
+    longest_loss_burst: int
 
 
 class DirectionStatistics(TypedDict):
@@ -73,8 +73,8 @@ class DirectionStatistics(TypedDict):
     words: str
     """Its settings in the words of ``tc netem``; long tables are cut."""
     arrived_before: int
-    """Datagrams that had come when these settings came into force; ``loss`` and ``longest_run``
-    count from there."""
+    """Datagrams that had come when these settings were applied; ``loss`` and
+    ``longest_loss_burst`` count from there."""
     arrived: int
     arrived_bytes: int
     forwarded: int
@@ -84,31 +84,31 @@ class DirectionStatistics(TypedDict):
     """How many datagrams had each fate: ``delivered``, ``dropped`` by a loss model, ``forced`` by
     the cap, ``corrupted``, ``overflowed``, ``blacked_out``."""
     duplicated: int
-    overtaken: int
+    delivered_out_of_order: int
     """Left after a newer one of their flow: stale at the receiver."""
     held_back: int
     """Not let overtake, as that would have broken the guarantee."""
-    longest_run: int
+    longest_loss_burst: int
     """Most successive datagrams of a flow that were not effectively delivered, of those that came
     since the settings are in force."""
     mansd: int | None
     """The cap on that; null if there is none."""
-    loss: Loss
+    loss: LossStatistics
     unintended: dict[str, int]
     """Unintended losses, by cause; any breaks the guarantee."""
-    under_way: int
+    in_flight: int
     """Datagrams that are delayed, or queue for a bottleneck, now."""
-    most_under_way: int
-    flows: list[Flow]
+    most_in_flight: int
+    flows: list[FlowStatistics]
     """Those that sent most of the clients that are there now, at most 16."""
-    delay_ns: Quantiles
+    delay_ns: DelayQuantiles
     """From arrival to departure."""
-    lateness_ns: Quantiles
+    lateness_ns: DelayQuantiles
     """From when a delayed datagram should have left until it did."""
     delay_histogram: list[list[int]]
     """Of each step that is not empty: its shortest time, in ns, and how many there are."""
     lateness_histogram: list[list[int]]
-    recent: Recent | None
+    recent: RecentRates | None
     """Null in the first document."""
 
 
@@ -186,7 +186,7 @@ def _link(
 
 def _direction(
     report: DirectionReport,
-    in_force: InForce,
+    in_force: AppliedSettings,
     before: DirectionReport | None,
     seconds: float,
 ) -> DirectionStatistics:
@@ -200,9 +200,9 @@ def _direction(
         "forwarded_bytes": counters.forwarded_bytes,
         "fates": {fate.name.lower(): getattr(counters, fate.name.lower()) for fate in Fate},
         "duplicated": counters.duplicated,
-        "overtaken": counters.overtaken,
+        "delivered_out_of_order": counters.delivered_out_of_order,
         "held_back": counters.held_back,
-        "longest_run": counters.longest_run,
+        "longest_loss_burst": counters.longest_loss_burst,
         "mansd": report.settings.mansd,
         "loss": {
             "realised": loss_share(counters, since),
@@ -211,8 +211,8 @@ def _direction(
             "predicted": in_force.predicted_loss,
         },
         "unintended": dict(report.unintended),
-        "under_way": report.under_way,
-        "most_under_way": counters.most_under_way,
+        "in_flight": report.in_flight,
+        "most_in_flight": counters.most_in_flight,
         "flows": [_flow(flow) for flow in report.flows],
         "delay_ns": quantiles(report.delays),
         "lateness_ns": quantiles(report.lateness),
@@ -222,7 +222,7 @@ def _direction(
     }
 
 
-def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> Recent:
+def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> RecentRates:
     new, old = after.counters, before.counters
     return {
         "seconds": seconds,
@@ -256,7 +256,7 @@ def loss_share(after: Counters, before: Counters) -> float | None:
 
 
 def _effective(counters: Counters) -> int:
-    return counters.delivered + counters.forced - counters.overtaken
+    return counters.delivered + counters.forced - counters.delivered_out_of_order
 
 
 def _share(after: Counters, before: Counters, *fates: str) -> float | None:
@@ -268,7 +268,7 @@ def _share(after: Counters, before: Counters, *fates: str) -> float | None:
     return lost / arrived
 
 
-def quantiles(counts: NDArray[np.int64]) -> Quantiles:
+def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
     """Return quantiles of a histogram of :mod:`netem.engine.histogram`."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
@@ -280,10 +280,10 @@ def quantiles(counts: NDArray[np.int64]) -> Quantiles:
     }
 
 
-def _flow(flow: FlowReport) -> Flow:
+def _flow(flow: FlowReport) -> FlowStatistics:
     return {
         "flow": flow.flow,
         "client": text_of(flow.client),
         "packets": flow.packets,
-        "longest_run": flow.longest_run,
+        "longest_loss_burst": flow.longest_loss_burst,
     }

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from netem.control.command_queue import Errands, Snapshot
+from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import statistics
 from netem.control.live_screen import Screen
@@ -72,11 +72,11 @@ def options_of(parsed: argparse.Namespace) -> Options:
     return Options(parsed.control, stats_s, Path(file) if file is not None else None, parsed.view)
 
 
-class Attached:
+class AttachedTaps:
     """What the relay's thread has to know of those at its side."""
 
-    def __init__(self, errands: Errands) -> None:
-        self._errands = errands
+    def __init__(self, commands: CommandQueue) -> None:
+        self._errands = commands
         self.left = False
         """Whether the person at the terminal wants to end."""
 
@@ -90,7 +90,7 @@ class Attached:
 
 
 @contextmanager
-def attached(relay: Relay, options: Options) -> Iterator[Attached]:
+def attached(relay: Relay, options: Options) -> Iterator[AttachedTaps]:
     """Watch a relay while the context lasts, in which it runs; it is closed after that.
 
     Enter before the relay's thread takes real-time settings, which new threads would inherit.
@@ -99,22 +99,22 @@ def attached(relay: Relay, options: Options) -> Iterator[Attached]:
         CallerError: an option is wrong.
         MachineError: the live control cannot be opened.
     """
-    errands = Errands(relay)
-    side = Attached(errands)
+    commands = CommandQueue(relay)
+    side = AttachedTaps(commands)
     with ExitStack() as stack:
         if options.stats_s is not None:
-            stack.enter_context(StatisticsLines(errands, options.stats_s, options.stats_file))
+            stack.enter_context(StatisticsLines(commands, options.stats_s, options.stats_file))
         if options.name is not None:
-            stack.enter_context(ControlServer(options.name, errands))
+            stack.enter_context(ControlServer(options.name, commands))
         if options.view:
-            stack.enter_context(_view(errands, side, options.name))
-        stack.callback(errands.close)
+            stack.enter_context(_view(commands, side, options.name))
+        stack.callback(commands.close)
         stack.enter_context(_short_turns())
         yield side
 
 
 @contextmanager
-def _view(errands: Errands, side: Attached, name: str | None) -> Iterator[None]:
+def _view(commands: CommandQueue, side: AttachedTaps, name: str | None) -> Iterator[None]:
     stopping = threading.Event()
     with Screen(f"noack netem {name}" if name is not None else "noack netem") as screen:
 
@@ -127,7 +127,7 @@ def _view(errands: Errands, side: Attached, name: str | None) -> Iterator[None]:
                     continue
                 due_s = max(due_s + _VIEW_S, time.monotonic())
                 with suppress(PeerError):
-                    snapshot = errands.snapshot()
+                    snapshot = commands.snapshot()
                     screen.show(statistics(snapshot, before))
                     before = snapshot
 

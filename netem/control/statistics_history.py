@@ -4,17 +4,17 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from netem.control.emulator_statistics import Recent, Statistics
+from netem.control.emulator_statistics import RecentRates, Statistics
 from netem.engine.relay_interface import DIRECTIONS, Direction
 
 SPAN_S = 60.0
 
 
-class Sample(NamedTuple):
+class StatisticsSample(NamedTuple):
     """What happened in one direction of a link until some time."""
 
     elapsed_s: float
-    recent: Recent
+    recent: RecentRates
 
 
 class History:
@@ -22,7 +22,9 @@ class History:
 
     def __init__(self) -> None:
         self.latest: Statistics | None = None
-        self._samples: defaultdict[tuple[str, Direction], deque[Sample]] = defaultdict(deque)
+        self._samples: defaultdict[tuple[str, Direction], deque[StatisticsSample]] = defaultdict(
+            deque
+        )
 
     def add(self, statistics: Statistics) -> None:
         """Take statistics that are newer than those before."""
@@ -33,12 +35,16 @@ class History:
                 recent = link[direction]["recent"]
                 samples = self._samples[link["name"], direction]
                 if recent is not None:
-                    samples.append(Sample(now_s, recent))
+                    samples.append(StatisticsSample(now_s, recent))
                 while samples and samples[0].elapsed_s <= now_s - SPAN_S:
                     samples.popleft()
 
     def series(
-        self, link: str, direction: Direction, value: Callable[[Recent], float | None], points: int
+        self,
+        link: str,
+        direction: Direction,
+        value: Callable[[RecentRates], float | None],
+        points: int,
     ) -> Sequence[float | None]:
         """Return the last minute of a value, (points,); the mean where several fall together.
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Self, TextIO
 
-from netem.control.command_queue import Errands, Snapshot
+from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.emulator_statistics import statistics
 from netem.standard_error import say
 from noack.core.errors import CallerError, PeerError
@@ -32,8 +32,8 @@ class StatisticsLines:
         CallerError: the file cannot be opened.
     """
 
-    def __init__(self, errands: Errands, period_s: float, path: Path | None) -> None:
-        self._errands = errands
+    def __init__(self, commands: CommandQueue, period_s: float, path: Path | None) -> None:
+        self._errands = commands
         self._period_s = period_s
         self._name = "the standard output" if path is None else str(path)
         try:

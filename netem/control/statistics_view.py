@@ -13,10 +13,10 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.control.emulator_statistics import (
+    DelayQuantiles,
     DirectionStatistics,
     LinkStatistics,
-    Quantiles,
-    Recent,
+    RecentRates,
     Statistics,
 )
 from netem.control.number_texts import (
@@ -146,12 +146,12 @@ def _cells(
         ("run", _run(of, width)),
         ("delay", _times(delay, width)),
         ("lateness", _times(late, width)),
-        ("under way", Text(f"{of['under_way']:,}  (most {of['most_under_way']:,})")),
+        ("under way", Text(f"{of['in_flight']:,}  (most {of['most_in_flight']:,})")),
     ]
 
 
 def _flow(
-    recent: Recent | None,
+    recent: RecentRates | None,
     datagrams: Literal["arrived_per_s", "forwarded_per_s"],
     bits: Literal["arrived_bits_per_s", "forwarded_bits_per_s"],
     width: int,
@@ -163,7 +163,7 @@ def _flow(
     return Text.assemble((rate, "bold"), " " * max(gap, 1), volume)
 
 
-def _times(times: Quantiles, width: int) -> Text:
+def _times(times: DelayQuantiles, width: int) -> Text:
     if times["p50"] is None:
         return Text(NONE)
     text = f"p50 {time_text(times['p50']):<9} p99 {time_text(times['p99'])}"
@@ -192,12 +192,12 @@ def _drawn(of: DirectionStatistics) -> Text:
 
 def _lost_text(of: DirectionStatistics) -> str:
     lost = [(fate.replace("_", " "), of["fates"][fate]) for fate in _LOST]
-    lost.append(("overtaken", of["overtaken"]))
+    lost.append(("delivered_out_of_order", of["delivered_out_of_order"]))
     return ", ".join(f"{number:,} {cause}" for cause, number in lost if number) or "0"
 
 
 def _run(of: DirectionStatistics, width: int) -> Text:
-    longest, cap, forced = of["longest_run"], of["mansd"], of["fates"]["forced"]
+    longest, cap, forced = of["longest_loss_burst"], of["mansd"], of["fates"]["forced"]
     end = Text(f"  {forced:,} forced", "magenta") if forced else Text()
     if cap is None:
         return Text(f"{longest:,} in a row, no cap").append_text(end)
@@ -258,7 +258,7 @@ def _table(history: History, statistics: Statistics, width: int, lines: int) -> 
             )
             cells.append(Text(sparkline(series, _top(series)), "green"))
         of = link[name]
-        beyond = of["mansd"] is not None and of["longest_run"] > of["mansd"]
+        beyond = of["mansd"] is not None and of["longest_loss_burst"] > of["mansd"]
         bad = beyond or any(of["unintended"].values())
         table.add_row(Text(names[row]), *cells, style="bold red" if bad else "")
     hidden = len(rows) - len(shown)
@@ -274,7 +274,10 @@ _CELLS: Sequence[tuple[str, Callable[[DirectionStatistics], str]]] = (
     ("out", lambda of: _per_s(of, "forwarded_per_s")),
     ("loss", lambda of: percent_text(of["loss"]["lost"])),
     ("predicted", lambda of: percent_text(of["loss"]["predicted"])),
-    ("run", lambda of: f"{of['longest_run']:,}/{NONE if of['mansd'] is None else of['mansd']}"),
+    (
+        "run",
+        lambda of: f"{of['longest_loss_burst']:,}/{NONE if of['mansd'] is None else of['mansd']}",
+    ),
     ("p99", lambda of: time_text((of["recent"] or of)["delay_ns"]["p99"])),
 )
 """A line's columns: heading and text."""
@@ -306,6 +309,6 @@ def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     parts.append(f"drawn {_drawn(of).plain}")
     parts.append(f"run {_run(of, 0).plain}")
     parts.append(f"delay p99 {time_text((recent or of)['delay_ns']['p99'])}")
-    parts.append(f"under way {of['under_way']:,}")
+    parts.append(f"under way {of['in_flight']:,}")
     parts += [f"UNINTENDED {n:,} {cause}" for cause, n in of["unintended"].items() if n]
     return "  ".join(parts)

@@ -5,21 +5,27 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from netem.engine.batched_directions import Way
+from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_pump import Functions
 from netem.engine.epoll_waiter import Epoll
 from netem.engine.link_listeners import OpenLink
 from netem.engine.pump_memory import PumpMemory
-from netem.engine.refused_clients import STOPPED_NS, Refusals
+from netem.engine.refused_clients import STOPPED_NS, RefusedClients
 from netem.engine.relay_interface import Address
-from netem.engine.relay_sockets import Endpoint, Place, has_data, return_path, stamp_arrivals
+from netem.engine.relay_sockets import (
+    Endpoint,
+    ListenAddress,
+    has_data,
+    return_path,
+    stamp_arrivals,
+)
 from netem.engine.socket_names import address_of_name, name_of
 from noack.runtime.udp_sockets import drops_of
 
 _LOOKED_AT = 256
 
 
-class Clients:
+class ClientTable:
     """All clients of a relay.
 
     Args:
@@ -33,7 +39,7 @@ class Clients:
     def __init__(
         self,
         links: Sequence[OpenLink],
-        ways: Sequence[Way],
+        ways: Sequence[BatchedDirection],
         memory: PumpMemory,
         functions: Functions,
         epoll: Epoll,
@@ -51,7 +57,7 @@ class Clients:
         """What the kernel has dropped at the return paths of a link, as far as it was asked."""
         self._unasked: Iterator[int] = iter(())
         self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
-        self._refusals = [Refusals(link.spec) for link in links]
+        self._refusals = [RefusedClients(link.spec) for link in links]
         self._expired_ns = 0
 
     def add(self, link: int, name: bytes) -> None:
@@ -82,7 +88,7 @@ class Clients:
         self._expired_ns = now_ns
         since_ns = now_ns - self._idle_ns[clients["link"]]
         idle = (clients["number"] >= 0) & (clients["last_ns"] < since_ns)
-        for row in np.flatnonzero(idle & (clients["under_way"] == 0)).tolist():
+        for row in np.flatnonzero(idle & (clients["in_flight"] == 0)).tolist():
             path = self._paths.get(row)
             if path is None or not has_data(path):
                 self._forget(row)
@@ -156,7 +162,7 @@ class Clients:
         client = memory.clients[row]
         client["last_ns"] = self._memory.pump["now_ns"]
         client["number"], client["link"], client["place"] = number, link, place
-        client["under_way"] = 0
+        client["in_flight"] = 0
         client["name_bytes"] = name_bytes
         memory.clients["name"][row] = np.frombuffer(name, np.uint8)
         memory.clients["local"][row] = np.frombuffer(local, np.uint8)
@@ -174,7 +180,7 @@ class Clients:
         self._drops[row] = 0
         memory.sockets["fd"][place] = path.fileno()
         memory.sockets["error"][place] = 0
-        local, _ = name_of(Place(int(path.family), path.getsockname()))
+        local, _ = name_of(ListenAddress(int(path.family), path.getsockname()))
         memory.clients["local"][row] = np.frombuffer(local, np.uint8)
         self._epoll.add(path.fileno(), place)
 

@@ -10,8 +10,8 @@ from netem.engine.compiled_pump import functions
 from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 from netem.engine.pump.pump_layout import TABLES
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import Decision
-from netem.rules.link_rules import Program, State
+from netem.rule_records import RecordedDecision
+from netem.rules.link_rules import LinkMemory, LinkProgram
 from noack.config.impairments import Corrupt, LinkSettings
 
 _ROWS = 16
@@ -25,7 +25,7 @@ class Grown(NamedTuple):
     recent_ns: NDArray[Any]
 
 
-class Way:
+class BatchedDirection:
     """One direction of a link.
 
     Args:
@@ -43,7 +43,7 @@ class Way:
         settings: LinkSettings,
         seed: int,
         name: tuple[str, str],
-        decisions: Sequence[Sequence[Decision]],
+        decisions: Sequence[Sequence[RecordedDecision]],
         row: NDArray[Any],
         link_state: NDArray[Any],
         counters: NDArray[Any],
@@ -88,7 +88,7 @@ class Way:
         self.settings, self.program, self.state = settings, program, state
         self._show()
 
-    def _state(self, plain: Program, rows: int) -> State:
+    def _state(self, plain: LinkProgram, rows: int) -> LinkMemory:
         state = compiled_state(plain, empty_state(plain), rows, recent_width(plain))
         return state._replace(link=self._link_state[0], counters=self._counters[0])
 

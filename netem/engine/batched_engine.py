@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 
 from netem.compile_notice import announced
-from netem.engine.batched_clients import Clients
-from netem.engine.batched_directions import Way
+from netem.engine.batched_clients import ClientTable
+from netem.engine.batched_directions import BatchedDirection
 from netem.engine.compiled_pump import are_kept, functions
 from netem.engine.compiled_rules import folder
 from netem.engine.epoll_waiter import Epoll
@@ -37,9 +37,9 @@ from netem.engine.relay_interface import (
 )
 from netem.engine.relay_sockets import raise_file_limit, stamp_arrivals
 from netem.engine.socket_names import name_of
-from netem.engine.unintended_losses import Losses
-from netem.engine.unreachable_servers import Unreachable
-from netem.rule_records import Counters, Verdict, dtype_of
+from netem.engine.unintended_losses import UnintendedLosses
+from netem.engine.unreachable_servers import UnreachableServers
+from netem.rule_records import Counters, PacketDecision, dtype_of
 from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
 from noack.runtime.udp_sockets import LOOPBACK, drops_of
@@ -86,15 +86,15 @@ class BatchedRelay:
         pump["epoll"] = self._epoll.fileno()
         pump["sleeps"] = not self._epoll.waits_by_ns()
         pump["spin_ns"] = spin_ns
-        self._ways: list[Way] = []
-        self._losses: list[Losses] = []
-        self._unreachable = [Unreachable(spec) for spec in self.specs]
+        self._ways: list[BatchedDirection] = []
+        self._losses: list[UnintendedLosses] = []
+        self._unreachable = [UnreachableServers(spec) for spec in self.specs]
         for number, link in enumerate(self._links):
             self._listen(number)
             for side, direction in enumerate(DIRECTIONS):
                 place = slice(len(self._ways), len(self._ways) + 1)
                 self._ways.append(
-                    Way(
+                    BatchedDirection(
                         (link.spec.forward, link.spec.back)[side],
                         link.spec.seed,
                         (link.spec.name, direction),
@@ -104,11 +104,13 @@ class BatchedRelay:
                         memory.counters[place],
                     )
                 )
-                self._losses.append(Losses(link.spec.name, direction))
-        self._clients = Clients(self._links, self._ways, self._memory, self._functions, self._epoll)
+                self._losses.append(UnintendedLosses(link.spec.name, direction))
+        self._clients = ClientTable(
+            self._links, self._ways, self._memory, self._functions, self._epoll
+        )
         for number in range(len(self._ways)):
             self._stamp_arrivals(number)
-        self._verdicts = np.zeros(1, dtype_of(Verdict))
+        self._verdicts = np.zeros(1, dtype_of(PacketDecision))
         self._rarely_ns = 0
         self.began_unix_ns: int | None = None
         """Unix time at which the relay began to run, to which its times refer."""
@@ -269,7 +271,7 @@ class BatchedRelay:
             settings=way.settings,
             counters=Counters(*memory.counters[place].tolist()),
             unintended=self._losses[place].counts(),
-            under_way=int(memory.link_states["under_way"][place]),
+            in_flight=int(memory.link_states["in_flight"][place]),
             flows=self._report_flows(place),
             delays=memory.delays[place].copy(),
             lateness=memory.lateness[place].copy(),
@@ -286,7 +288,7 @@ class BatchedRelay:
                 flow=int(clients["number"][row]),
                 client=self._clients.address(row),
                 packets=int(flows["packets"][clients["place"][row]]),
-                longest_run=int(flows["longest_run"][clients["place"][row]]),
+                longest_loss_burst=int(flows["longest_loss_burst"][clients["place"][row]]),
             )
             for row in busiest
         ]

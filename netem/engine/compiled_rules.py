@@ -21,25 +21,25 @@ from netem import relay_events, rule_records
 from netem.engine import histogram
 from netem.rule_program import new_flow
 from netem.rule_records import array_of, dtype_of
-from netem.rules.link_rules import Program, State
+from netem.rules.link_rules import LinkMemory, LinkProgram
 from netem.rules.mansd import NEVER_NS
 from noack.runtime import code_cache
 from noack.runtime.code_cache import cache_folder, compiler
 
 _PROGRAM = {
-    "stages": rule_records.Stage,
-    "chances": rule_records.Chance,
-    "chains": rule_records.Chain,
-    "four_states": rule_records.FourStateChain,
-    "scripts": rule_records.Script,
-    "waits": rule_records.Wait,
-    "bottlenecks": rule_records.Bottleneck,
-    "darknesses": rule_records.Darkness,
-    "decisions": rule_records.Decision,
+    "stages": rule_records.RuleStage,
+    "chances": rule_records.ChanceSettings,
+    "chains": rule_records.GilbertElliottSettings,
+    "four_states": rule_records.FourStateSettings,
+    "scripts": rule_records.ScriptSettings,
+    "waits": rule_records.DelaySettings,
+    "bottlenecks": rule_records.RateSettings,
+    "darknesses": rule_records.BlackoutSettings,
+    "decisions": rule_records.RecordedDecision,
 }
 
 
-def compiled_program(program: Program) -> Program:
+def compiled_program(program: LinkProgram) -> LinkProgram:
     """Return a program as arrays, for compiled rules."""
     tables: dict[str, Any] = {
         name: array_of(record, getattr(program, name)) for name, record in _PROGRAM.items()
@@ -50,7 +50,7 @@ def compiled_program(program: Program) -> Program:
     return program._replace(**tables)
 
 
-def compiled_state(program: Program, state: State, rows: int, width: int) -> State:
+def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: int) -> LinkMemory:
     """Return a state as arrays, with room for ``rows`` flows; see :func:`set_flow`.
 
     Args:
@@ -61,17 +61,17 @@ def compiled_state(program: Program, state: State, rows: int, width: int) -> Sta
     """
     arrays: dict[str, Any] = {
         "flows": np.zeros(rows, dtype_of(rule_records.FlowState)),
-        "memory": np.zeros((rows, len(program.stages)), dtype_of(rule_records.Memory)),
+        "memory": np.zeros((rows, len(program.stages)), dtype_of(rule_records.StageMemory)),
         "recent_ns": np.zeros((rows, width), np.int64),
         "queues": array_of(rule_records.QueueState, state.queues),
         "departures_ns": np.array(state.departures_ns, dtype=np.int64),
         "link": array_of(rule_records.LinkState, [state.link])[0],
         "counters": array_of(rule_records.Counters, [state.counters])[0],
     }
-    return State(**arrays)
+    return LinkMemory(**arrays)
 
 
-def set_flow(state: State, row: int, number: int, first_delivered: bool) -> None:
+def set_flow(state: LinkMemory, row: int, number: int, first_delivered: bool) -> None:
     """Let a row of a state of arrays be that of a new flow."""
     flows, memory, recent_ns = _arrays(state)
     flows[row] = array_of(rule_records.FlowState, [new_flow(number, first_delivered)])[0]
@@ -79,7 +79,7 @@ def set_flow(state: State, row: int, number: int, first_delivered: bool) -> None
     recent_ns[row] = NEVER_NS
 
 
-def _arrays(state: State) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def _arrays(state: LinkMemory) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     return state.flows, state.memory, state.recent_ns  # type: ignore[return-value]
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from netem.engine.relay_interface import Address, LinkSpec
 from netem.engine.relay_sockets import (
     Endpoint,
-    Place,
+    ListenAddress,
     address_of,
     leads_to,
     listen,
@@ -26,20 +26,20 @@ class OpenLink:
     spec: LinkSpec
     endpoint: Endpoint
     """Where clients send to."""
-    server: Place
+    server: ListenAddress
     path: Endpoint | None
     """Where it sends from, if it takes no answers; else each client has a path of its own."""
 
     @property
-    def here(self) -> Place:
+    def here(self) -> ListenAddress:
         """Where it listens."""
-        return Place(int(self.endpoint.family), self.endpoint.getsockname())
+        return ListenAddress(int(self.endpoint.family), self.endpoint.getsockname())
 
     @property
-    def local(self) -> Place:
+    def local(self) -> ListenAddress:
         """Where it sends to the server from, unless each client has a path of its own."""
         endpoint = self.path or self.endpoint
-        return Place(int(endpoint.family), endpoint.getsockname())
+        return ListenAddress(int(endpoint.family), endpoint.getsockname())
 
     @property
     def address(self) -> Address:
@@ -88,7 +88,7 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
 
 def _refuse_loops(links: Sequence[OpenLink]) -> None:
     """A datagram that comes back would be a new client's each time, and never end."""
-    by_port: dict[int, list[tuple[OpenLink, Place]]] = {}
+    by_port: dict[int, list[tuple[OpenLink, ListenAddress]]] = {}
     for link in links:
         by_port.setdefault(link.address[1], []).append((link, link.here))
     following = {

@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 
-from netem.rule_records import Verdict
-from netem.rules.link_rules import Program, State, admit
+from netem.rule_records import PacketDecision
+from netem.rules.link_rules import LinkMemory, LinkProgram, admit
 
 
 def admit_many(
-    program: Program,
-    state: State,
+    program: LinkProgram,
+    state: LinkMemory,
     flows: Sequence[int],
     sizes_bytes: Sequence[int],
     arrivals_ns: Sequence[int],
-    verdicts: Sequence[Verdict],
+    verdicts: Sequence[PacketDecision],
 ) -> None:
     """Decide what becomes of k datagrams, in the order of their arrival; see :func:`admit`."""
     for number in range(len(flows)):

@@ -6,15 +6,15 @@ from typing import NamedTuple
 
 from netem.engine.histogram import bucket_of, empty
 from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkSpec
-from netem.engine.unintended_losses import Losses
+from netem.engine.unintended_losses import UnintendedLosses
 from netem.link_machine import Datagram, Link
-from netem.rule_records import Verdict
+from netem.rule_records import PacketDecision
 from noack.config.impairments import LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_RELEASE
 
 
-class Departure(NamedTuple):
+class ScheduledDeparture(NamedTuple):
     """A datagram, or a copy, that is to be sent."""
 
     flow: int
@@ -40,7 +40,7 @@ class _Kept(NamedTuple):
     """How many are under way."""
 
 
-class PlainWay:
+class PlainDirection:
     """One direction of a link.
 
     Args:
@@ -53,13 +53,15 @@ class PlainWay:
         self.settings = settings
         decisions = spec.decisions.get(direction, ())
         self.link = Link(settings, spec.seed, spec.name, direction, decisions=decisions)
-        self.losses = Losses(spec.name, direction)
+        self.losses = UnintendedLosses(spec.name, direction)
         self.errors: Counter[int] = Counter()
         """Datagrams that could not be sent, or kept until then, by errno."""
         self._delays, self._lateness = empty(), empty()
         self._kept: dict[tuple[int, int], _Kept] = {}
 
-    def admit(self, flow: int, data: bytes, now_ns: int) -> tuple[Verdict, Sequence[Departure]]:
+    def admit(
+        self, flow: int, data: bytes, now_ns: int
+    ) -> tuple[PacketDecision, Sequence[ScheduledDeparture]]:
         """Decide what becomes of a datagram; return what leaves at once."""
         outputs = self.link.handle(Datagram(flow, data), now_ns)
         verdict = self.link.verdict
@@ -71,19 +73,19 @@ class PlainWay:
         now = [which for which in range(2) if times_ns[which] == now_ns]
         datagrams = [output for output in outputs if isinstance(output, Datagram)]
         return verdict, [
-            Departure(
+            ScheduledDeparture(
                 flow, datagram.data, verdict.packet, verdict.fate, now_ns, now_ns, bits[which],
                 delayed=False, copy=which == 1, stale=False,
             )
             for which, datagram in zip(now, datagrams, strict=True)
         ]  # fmt: skip
 
-    def due(self, now_ns: int) -> Iterator[Departure]:
+    def due(self, now_ns: int) -> Iterator[ScheduledDeparture]:
         """Let out what is due, one by one."""
         while (deadline_ns := self.link.next_deadline_ns()) is not None and deadline_ns <= now_ns:
             yield self._departure(self.link.on_timer(now_ns))
 
-    def sent(self, departure: Departure, now_ns: int) -> None:
+    def sent(self, departure: ScheduledDeparture, now_ns: int) -> None:
         """Take note that a datagram was sent."""
         self._delays[bucket_of(now_ns - departure.arrival_ns)] += 1
         if departure.delayed:
@@ -102,13 +104,13 @@ class PlainWay:
             settings=self.settings,
             counters=self.link.counters,
             unintended=self.losses.counts(),
-            under_way=self.link.under_way,
+            in_flight=self.link.in_flight,
             flows=flows,
             delays=self._delays.copy(),
             lateness=self._lateness.copy(),
         )
 
-    def _departure(self, outputs: Sequence[Datagram | Record | Notice]) -> Departure:
+    def _departure(self, outputs: Sequence[Datagram | Record | Notice]) -> ScheduledDeparture:
         datagram, record = outputs
         if not isinstance(datagram, Datagram) or not isinstance(record, Record):
             raise TypeError(f"not what a {NETEM_RELEASE} comes with: {outputs}")
@@ -116,7 +118,7 @@ class PlainWay:
         kept = self._kept.pop((flow, packet))
         if kept.left > 1:
             self._kept[flow, packet] = kept._replace(left=kept.left - 1)
-        return Departure(
+        return ScheduledDeparture(
             flow, datagram.data, packet, kept.fate, kept.arrival_ns, release_ns, kept.bits[copy],
             delayed=True, copy=bool(copy), stale=bool(stale),
         )  # fmt: skip

@@ -10,9 +10,9 @@ from typing import Any
 
 from netem.engine.headroom import has_headroom
 from netem.engine.link_listeners import OpenLink, open_links
-from netem.engine.plain_direction import Departure, PlainWay
-from netem.engine.plain_taps import Ends, PlainTaps, Way
-from netem.engine.refused_clients import STOPPED_NS, Refusals
+from netem.engine.plain_direction import PlainDirection, ScheduledDeparture
+from netem.engine.plain_taps import PlainTaps, TapDirection, TapEndpoints
+from netem.engine.refused_clients import STOPPED_NS, RefusedClients
 from netem.engine.relay_interface import (
     DIRECTIONS,
     Address,
@@ -30,7 +30,7 @@ from netem.engine.relay_sockets import (
     raise_file_limit,
     return_path,
 )
-from netem.engine.unreachable_servers import Unreachable
+from netem.engine.unreachable_servers import UnreachableServers
 from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, drops_of
@@ -56,7 +56,7 @@ class _Client:
     local: Address
     """Where its return path is."""
     last_ns: int
-    under_way: int = 0
+    in_flight: int = 0
     drops: int = 0
 
 
@@ -67,8 +67,8 @@ class _PlainLink:
         self.number, self.link = number, link
         spec = link.spec
         self.ways = (
-            PlainWay(spec, "forward", spec.forward),
-            PlainWay(spec, "back", spec.back),
+            PlainDirection(spec, "forward", spec.forward),
+            PlainDirection(spec, "back", spec.back),
         )
         self.clients: dict[Any, _Client] = {}
         self.by_number: dict[int, _Client] = {}
@@ -76,8 +76,8 @@ class _PlainLink:
         self.closed_drops = 0
         self.refused = 0
         self.port_unreachable = 0
-        self.refusals = Refusals(spec)
-        self.unreachable = Unreachable(spec)
+        self.refusals = RefusedClients(spec)
+        self.unreachable = UnreachableServers(spec)
 
     def take_errors(self, endpoint: Endpoint) -> bool:
         """Whether there are ICMP errors of earlier datagrams; no more are there then."""
@@ -86,15 +86,15 @@ class _PlainLink:
             self.port_unreachable += found.count(errno.ECONNREFUSED)
         return bool(found)
 
-    def way(self, back: bool) -> Way:
+    def way(self, back: bool) -> TapDirection:
         """A direction, as taps are told."""
         mansd = self.ways[back].settings.mansd
-        return Way(self.number, back, -1 if mansd is None else mansd)
+        return TapDirection(self.number, back, -1 if mansd is None else mansd)
 
-    def ends(self, client: _Client) -> Ends:
+    def ends(self, client: _Client) -> TapEndpoints:
         """Where a client's datagrams go from and to."""
         spec = self.link.spec
-        return Ends(address_of(client.place), self.link.address, client.local, spec.to)
+        return TapEndpoints(address_of(client.place), self.link.address, client.local, spec.to)
 
 
 class PlainRelay:
@@ -236,7 +236,7 @@ class PlainRelay:
                 way.errors[errno.ENOMEM] += 1
                 continue
             verdict, departures = way.admit(sender.number, data, now_ns)
-            sender.under_way += (verdict.release_ns > now_ns) + (verdict.copy_ns > now_ns)
+            sender.in_flight += (verdict.release_ns > now_ns) + (verdict.copy_ns > now_ns)
             if self._taps:
                 self._taps.arrival(
                     link.way(back), link.ends(sender), sender.number, data, verdict, now_ns
@@ -259,10 +259,12 @@ class PlainRelay:
             for _, _, link, side in due:
                 for departure in link.ways[side].due(now_ns):
                     client = link.by_number[departure.flow]
-                    client.under_way -= 1
+                    client.in_flight -= 1
                     self._send(link, side == 1, client, departure)
 
-    def _send(self, link: _PlainLink, back: bool, client: _Client, departure: Departure) -> None:
+    def _send(
+        self, link: _PlainLink, back: bool, client: _Client, departure: ScheduledDeparture
+    ) -> None:
         way, error = link.ways[back], 0
         if back:
             error = _transmit(link, link.link.endpoint, departure.data, client.place)
@@ -318,7 +320,7 @@ class PlainRelay:
             for client in list(link.clients.values()):
                 if stopped:  # what it sent meanwhile has not been read yet
                     client.last_ns = now_ns
-                if client.last_ns < now_ns - idle_ns and not client.under_way:
+                if client.last_ns < now_ns - idle_ns and not client.in_flight:
                     self._forget(link, client)
                 elif client.error:
                     self._reconnect(link, client)
@@ -352,11 +354,11 @@ class PlainRelay:
             link.ways[1].losses.lost_in_kernel(drops)
 
 
-def _flows(link: _PlainLink, way: PlainWay) -> Sequence[FlowReport]:
+def _flows(link: _PlainLink, way: PlainDirection) -> Sequence[FlowReport]:
     known = []
     for client in link.clients.values():
         flow = way.link.flow(client.number)
-        packets, longest = (flow.packets, flow.longest_run) if flow is not None else (0, 0)
+        packets, longest = (flow.packets, flow.longest_loss_burst) if flow is not None else (0, 0)
         known.append(FlowReport(client.number, address_of(client.place), packets, longest))
     return sorted(known, key=lambda flow: -flow.packets)[:_REPORTED_FLOWS]
 

@@ -6,16 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from netem.engine.plain_direction import Departure
+from netem.engine.plain_direction import ScheduledDeparture
 from netem.engine.relay_interface import Address, Tap
 from netem.relay_events import ADDRESS_BYTES, EVENT
-from netem.rule_records import Verdict
+from netem.rule_records import PacketDecision
 from netem.rules.mansd import NEVER_NS
 
 _MOST = 512
 
 
-class Ends(NamedTuple):
+class TapEndpoints(NamedTuple):
     """Where a client's datagrams go from and to."""
 
     client: Address
@@ -25,7 +25,7 @@ class Ends(NamedTuple):
     server: Address
 
 
-class Way(NamedTuple):
+class TapDirection(NamedTuple):
     """A direction of a link."""
 
     link: int
@@ -53,7 +53,13 @@ class PlainTaps:
         return bool(self._taps)
 
     def arrival(
-        self, way: Way, ends: Ends, flow: int, data: bytes, verdict: Verdict, now_ns: int
+        self,
+        way: TapDirection,
+        ends: TapEndpoints,
+        flow: int,
+        data: bytes,
+        verdict: PacketDecision,
+        now_ns: int,
     ) -> None:
         """Tell that a datagram has come, and what was decided."""
         event = self._add(way, ends, way.back, data, now_ns)
@@ -61,18 +67,20 @@ class PlainTaps:
         event["run"] = verdict.run
         event["delay_ns"] = _delay(verdict.release_ns, now_ns)
         event["copy_delay_ns"] = _delay(verdict.copy_ns, now_ns)
-        event["held_ns"] = verdict.held_ns
+        event["hold_back_ns"] = verdict.hold_back_ns
         event["bit"], event["copy_bit"] = verdict.bit, verdict.copy_bit
         event["departure"] = 0
 
-    def departure(self, way: Way, ends: Ends, departure: Departure, now_ns: int) -> None:
+    def departure(
+        self, way: TapDirection, ends: TapEndpoints, departure: ScheduledDeparture, now_ns: int
+    ) -> None:
         """Tell that a datagram, or a copy, has left."""
         event = self._add(way, ends, not way.back, departure.data, now_ns)
         event["flow"], event["packet"] = departure.flow, departure.packet
         event["fate"] = departure.fate
         event["delay_ns"] = now_ns - departure.arrival_ns
         event["copy_delay_ns"] = event["copy_bit"] = -1
-        event["run"] = event["held_ns"] = 0
+        event["run"] = event["hold_back_ns"] = 0
         event["bit"] = departure.bit
         event["departure"] = 1
         event["copy"], event["stale"] = departure.copy, departure.stale
@@ -87,7 +95,9 @@ class PlainTaps:
             self._count = 0
             self._data.clear()
 
-    def _add(self, way: Way, ends: Ends, server_side: bool, data: bytes, now_ns: int) -> np.void:
+    def _add(
+        self, way: TapDirection, ends: TapEndpoints, server_side: bool, data: bytes, now_ns: int
+    ) -> np.void:
         if self._count == _MOST:
             self.tell()
         event: np.void = self._events[self._count]

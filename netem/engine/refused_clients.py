@@ -11,7 +11,7 @@ STOPPED_NS = 1_000_000_000
 """An engine that has not looked for idle clients for so long was stopped, or starved."""
 
 
-class Refusals:
+class RefusedClients:
     """Those of one link; each reason is said once, on standard error.
 
     Args:

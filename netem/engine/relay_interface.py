@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.rule_records import Counters, Decision
+from netem.rule_records import Counters, RecordedDecision
 from noack.config.impairments import LinkSettings
 
 Address = tuple[str, int]
@@ -42,7 +42,9 @@ class LinkSpec:
     """A client's return path is closed after so long without a datagram in either direction."""
     most_clients: int = 65_536
     """Datagrams of more clients than that are refused, and counted."""
-    decisions: Mapping[Direction, Sequence[Sequence[Decision]]] = field(default_factory=dict)
+    decisions: Mapping[Direction, Sequence[Sequence[RecordedDecision]]] = field(
+        default_factory=dict
+    )
     """Recorded decisions of each flow, taken again before the settings apply."""
 
 
@@ -53,7 +55,7 @@ class FlowReport:
     flow: int
     client: Address
     packets: int
-    longest_run: int
+    longest_loss_burst: int
     """Most successive datagrams that were not effectively delivered, of those that came since the
     settings are in force."""
 
@@ -67,7 +69,7 @@ class DirectionReport:
     unintended: Mapping[str, int]
     """Unintended losses: ``lost_in_kernel`` (the receive buffer overflowed), and by the system's
     message what could not be sent, or kept until then. Any breaks the guarantee."""
-    under_way: int
+    in_flight: int
     """Datagrams that are delayed now."""
     flows: Sequence[FlowReport]
     """Of the clients that are there now: those that sent most, at most 16."""

@@ -31,14 +31,14 @@ _ERROR_BYTES = 128
 Endpoint = socket.socket
 
 
-class Place(NamedTuple):
+class ListenAddress(NamedTuple):
     """Where a datagram can be sent: a family and what its sockets call an address."""
 
     family: int
     address: Any
 
 
-def place_of(address: Address, what: str) -> Place:
+def place_of(address: Address, what: str) -> ListenAddress:
     """Return an address as sockets want it.
 
     Raises:
@@ -53,10 +53,10 @@ def place_of(address: Address, what: str) -> Place:
         raise CallerError(
             f"{what}: {host}: not an address of IPv4 or IPv6 ({error.strerror})"
         ) from None
-    return Place(int(found[0][0]), found[0][4])
+    return ListenAddress(int(found[0][0]), found[0][4])
 
 
-def listen(spec: LinkSpec, place: Place) -> Endpoint:
+def listen(spec: LinkSpec, place: ListenAddress) -> Endpoint:
     """Return the socket that a link listens on.
 
     Raises:
@@ -80,7 +80,7 @@ def listen(spec: LinkSpec, place: Place) -> Endpoint:
     return endpoint
 
 
-def return_path(server: Place) -> Endpoint:
+def return_path(server: ListenAddress) -> Endpoint:
     """Return a socket towards the server, from which only the server's answers are taken.
 
     Raises:
@@ -96,7 +96,7 @@ def return_path(server: Place) -> Endpoint:
     return endpoint
 
 
-def one_way_path(server: Place) -> Endpoint:
+def one_way_path(server: ListenAddress) -> Endpoint:
     """Return a socket from which a link that takes no answers sends to its server.
 
     It lets nothing in: answers are dropped at once, and counted by
@@ -122,7 +122,7 @@ def one_way_path(server: Place) -> Endpoint:
     return endpoint
 
 
-def leads_to(server: Place, here: Place) -> bool:
+def leads_to(server: ListenAddress, here: ListenAddress) -> bool:
     """Whether what is sent to ``server`` comes to a socket that listens ``here``, on its port.
 
     The system says where from and where to it would go, so that an address of this machine is known

@@ -5,10 +5,10 @@ import struct
 
 from netem.engine.pump.pump_layout import NAME_BYTES
 from netem.engine.relay_interface import Address
-from netem.engine.relay_sockets import Place
+from netem.engine.relay_sockets import ListenAddress
 
 
-def name_of(place: Place) -> tuple[bytes, int]:
+def name_of(place: ListenAddress) -> tuple[bytes, int]:
     """Return a place as a socket address, padded to NAME_BYTES, and its length."""
     host, port = place.address[:2]
     head = struct.pack("=H", place.family) + struct.pack("!H", port)

@@ -16,7 +16,7 @@ _HOW = {
 }
 
 
-class Losses:
+class UnintendedLosses:
     """Those of one direction of a link.
 
     Args:

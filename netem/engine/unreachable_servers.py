@@ -5,7 +5,7 @@ from netem.standard_error import say
 from noack.runtime.address import text_of
 
 
-class Unreachable:
+class UnreachableServers:
     """What a link knows of its server's absence; said once, on standard error.
 
     Args:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.fates.fate_trace import FORMAT, METADATA, SCHEMA
-from netem.rule_records import Decision
+from netem.rule_records import RecordedDecision
 from noack.config.impairments import Mansd
 from noack.core.errors import CallerError, one_line
 from noack.protocol.record_tables import Fate
@@ -25,7 +25,7 @@ _LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 class Fates(NamedTuple):
     """What a trace says, of each direction of each link."""
 
-    decisions: Mapping[tuple[str, Direction], Sequence[Sequence[Decision]]]
+    decisions: Mapping[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]]
     """Of each flow, in the order of its datagrams."""
     caps: Mapping[tuple[str, Direction], int | None]
     """M − 1, if it was kept."""
@@ -53,7 +53,7 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             known = ", ".join(links_recorded)
             raise CallerError(f"{path}: has no fates of a link {link!r}; it has those of {known}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
-    found: dict[tuple[str, Direction], Sequence[Sequence[Decision]]] = {}
+    found: dict[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]] = {}
     caps: dict[tuple[str, Direction], int | None] = {}
     for link in links_recorded if links is None else links:
         for direction in DIRECTIONS:
@@ -124,7 +124,7 @@ def _document(path: Path, text: bytes | None) -> _Document:
 
 def _flows(
     rows: Mapping[str, NDArray[Any]], most_flows: int, place: str
-) -> Sequence[Sequence[Decision]]:
+) -> Sequence[Sequence[RecordedDecision]]:
     """Return the decisions of each flow, from the rows of a direction."""
     _check(rows, most_flows, place)
     order = np.lexsort((rows["packet"], rows["flow"]))
@@ -141,8 +141,8 @@ def _flows(
         )
     names = ("fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
     columns = [rows[name][order].tolist() for name in names]
-    decisions = [Decision(*values) for values in zip(*columns, strict=True)]
-    found: list[Sequence[Decision]] = [()] * (int(flows[-1]) + 1 if len(flows) else 0)
+    decisions = [RecordedDecision(*values) for values in zip(*columns, strict=True)]
+    found: list[Sequence[RecordedDecision]] = [()] * (int(flows[-1]) + 1 if len(flows) else 0)
     for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
         found[int(flows[begin])] = decisions[begin:end]
     return found

@@ -12,7 +12,7 @@ column
 ``delay_ns``              from its arrival until it leaves; −1 never
 ``copy_delay_ns``         the same of its duplicate; −1 if there is none
 ``bit``, ``copy_bit``     which bit of it, and of its duplicate, is flipped; −1 none
-``held_ns``               by how much it is held back so that the cap holds
+``hold_back_ns``               by how much it is held back so that the cap holds
 ========================= =====================================================================
 
 The file's metadata has a JSON document under ``noack``: the version that wrote it, the links with
@@ -43,7 +43,7 @@ NUMBERS: Mapping[str, str] = {
     "copy_delay_ns": "int64",
     "bit": "int32",
     "copy_bit": "int32",
-    "held_ns": "int64",
+    "hold_back_ns": "int64",
 }
 """Columns of numbers and their types."""
 

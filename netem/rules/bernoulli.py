@@ -1,11 +1,13 @@
 """Bernoulli losses: each datagram is lost with a probability, independently unless correlated."""
 
-from netem.rule_records import Chance, FlowState, Memory
+from netem.rule_records import ChanceSettings, FlowState, StageMemory
 from netem.rules.correlated_chance import happens
 from netem.rules.normal import score
 
 
-def lost(chance: Chance, memory: Memory, flow: FlowState, u: float, scored: bool) -> bool:
+def lost(
+    chance: ChanceSettings, memory: StageMemory, flow: FlowState, u: float, scored: bool
+) -> bool:
     """Whether the next datagram would be lost; ``u`` is a uniform number.
 
     With ``scored`` the flow learns how bad its times are.

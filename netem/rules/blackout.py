@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from netem.rule_records import Darkness
+from netem.rule_records import BlackoutSettings
 
 
-def dark(darkness: Darkness, times_ns: Sequence[int], now_ns: int) -> bool:
+def dark(darkness: BlackoutSettings, times_ns: Sequence[int], now_ns: int) -> bool:
     """Whether it is dark at ``now_ns``.
 
     Args:

@@ -4,11 +4,11 @@ The latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gau
 happens when z_i exceeds the normal quantile of 1 − p: with probability p exactly, whatever ρ is.
 """
 
-from netem.rule_records import Chance, Memory
+from netem.rule_records import ChanceSettings, StageMemory
 from netem.rules.normal import score
 
 
-def latent(correlation: float, innovation: float, memory: Memory, u: float) -> float:
+def latent(correlation: float, innovation: float, memory: StageMemory, u: float) -> float:
     """Advance a latent process by one datagram and return z, standard normal.
 
     Args:
@@ -26,7 +26,7 @@ def latent(correlation: float, innovation: float, memory: Memory, u: float) -> f
     return z
 
 
-def happens(chance: Chance, memory: Memory, u: float) -> bool:
+def happens(chance: ChanceSettings, memory: StageMemory, u: float) -> bool:
     """Whether it happens to the next datagram; ``u`` is a uniform number."""
     if chance.correlation == 0.0:
         return u < chance.probability

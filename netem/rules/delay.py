@@ -7,7 +7,7 @@ the jitter as standard deviation; empirical ones are drawn between the observed 
 import math
 from collections.abc import Sequence
 
-from netem.rule_records import FlowState, Memory, Wait
+from netem.rule_records import DelaySettings, FlowState, StageMemory
 from netem.rules.correlated_chance import latent
 from netem.rules.normal import cdf, score
 
@@ -31,7 +31,7 @@ def pareto(u: float) -> float:
     return (math.pow(1.0 - u, -1.0 / 3.0) - _PARETO_MEAN) / _PARETO_DEVIATION
 
 
-def quantile_ns(wait: Wait, table_ns: Sequence[float], u: float) -> float:
+def quantile_ns(wait: DelaySettings, table_ns: Sequence[float], u: float) -> float:
     """Quantile of the random part, in ns; ``u`` in [0, 1)."""
     if wait.shape == NORMAL:
         return wait.jitter_ns * score(u)
@@ -48,7 +48,7 @@ def quantile_ns(wait: Wait, table_ns: Sequence[float], u: float) -> float:
 
 
 def delay_ns(
-    wait: Wait, table_ns: Sequence[float], memory: Memory, flow: FlowState, u: float
+    wait: DelaySettings, table_ns: Sequence[float], memory: StageMemory, flow: FlowState, u: float
 ) -> int:
     """Draw a delay, in whole ns; ``u`` is a uniform number.
 

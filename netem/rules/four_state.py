@@ -4,10 +4,10 @@
 From 4 the chain returns to 1. It starts in 1 and moves before each datagram.
 """
 
-from netem.rule_records import FourStateChain, Memory
+from netem.rule_records import FourStateSettings, StageMemory
 
 
-def lost(chain: FourStateChain, memory: Memory, u: float) -> bool:
+def lost(chain: FourStateSettings, memory: StageMemory, u: float) -> bool:
     """Whether the next datagram would be lost; ``u`` is a uniform number."""
     state = memory.phase + 1
     if state == 1:

@@ -7,7 +7,7 @@ state and 1 − h in the bad. In the stationary chain the loss rate is
     (1 − k) r/(p + r) + (1 − h) p/(p + r).
 """
 
-from netem.rule_records import Chain, FlowState, Memory
+from netem.rule_records import FlowState, GilbertElliottSettings, StageMemory
 from netem.rules.normal import score
 
 GOOD = 0
@@ -15,7 +15,13 @@ BAD = 1
 
 
 def lost(
-    chain: Chain, memory: Memory, flow: FlowState, u: float, v: float, w: float, scored: bool
+    chain: GilbertElliottSettings,
+    memory: StageMemory,
+    flow: FlowState,
+    u: float,
+    v: float,
+    w: float,
+    scored: bool,
 ) -> bool:
     """Whether the next datagram would be lost; u, v and w are uniform numbers.
 

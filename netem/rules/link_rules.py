@@ -4,21 +4,21 @@ from collections.abc import MutableSequence, Sequence
 from typing import NamedTuple
 
 from netem.rule_records import (
-    Bottleneck,
-    Chain,
-    Chance,
+    BlackoutSettings,
+    ChanceSettings,
     Counters,
-    Darkness,
-    Decision,
+    DelaySettings,
     FlowState,
-    FourStateChain,
+    FourStateSettings,
+    GilbertElliottSettings,
     LinkState,
-    Memory,
+    PacketDecision,
     QueueState,
-    Script,
-    Stage,
-    Verdict,
-    Wait,
+    RateSettings,
+    RecordedDecision,
+    RuleStage,
+    ScriptSettings,
+    StageMemory,
 )
 from netem.rules import bernoulli, four_state, gilbert_elliott, scripted_losses
 from netem.rules.blackout import dark
@@ -51,23 +51,23 @@ BLACKED_OUT = 5
 """The values of :class:`noack.protocol.record_tables.Fate`."""
 
 
-class Program(NamedTuple):
+class LinkProgram(NamedTuple):
     """The settings of a link, as its rules read them: k stages, and a table for each kind."""
 
-    stages: Sequence[Stage]
+    stages: Sequence[RuleStage]
     """(k,) In the order in which they apply."""
-    chances: Sequence[Chance]
-    chains: Sequence[Chain]
-    four_states: Sequence[FourStateChain]
-    scripts: Sequence[Script]
-    waits: Sequence[Wait]
-    bottlenecks: Sequence[Bottleneck]
-    darknesses: Sequence[Darkness]
+    chances: Sequence[ChanceSettings]
+    chains: Sequence[GilbertElliottSettings]
+    four_states: Sequence[FourStateSettings]
+    scripts: Sequence[ScriptSettings]
+    waits: Sequence[DelaySettings]
+    bottlenecks: Sequence[RateSettings]
+    darknesses: Sequence[BlackoutSettings]
     integers: Sequence[int]
     """Tables of scripts and blackouts."""
     reals: Sequence[float]
     """Tables of empirical delays, in ns."""
-    decisions: Sequence[Decision]
+    decisions: Sequence[RecordedDecision]
     """Recorded decisions that are taken again, flow by flow."""
     decisions_begin: Sequence[int]
     """(flows + 1,) Where those of each recorded flow begin, and the last ends; or empty."""
@@ -81,12 +81,12 @@ class Program(NamedTuple):
     """Whether something can be overtaken."""
 
 
-class State(NamedTuple):
+class LinkMemory(NamedTuple):
     """What a link remembers."""
 
     flows: Sequence[FlowState]
     """(rows,) A row may be used again for another flow when a flow has ended."""
-    memory: Sequence[Sequence[Memory]]
+    memory: Sequence[Sequence[StageMemory]]
     """(rows, k)"""
     recent_ns: Sequence[MutableSequence[int]]
     """(rows, mansd + 1) Release times; see :mod:`netem.rules.mansd`."""
@@ -99,9 +99,9 @@ class State(NamedTuple):
 
 
 def loses(
-    program: Program,
-    stage: Stage,
-    memory: Memory,
+    program: LinkProgram,
+    stage: RuleStage,
+    memory: StageMemory,
     flow: FlowState,
     packet: int,
 ) -> bool:
@@ -123,12 +123,12 @@ def loses(
 
 
 def admit(
-    program: Program,
-    state: State,
+    program: LinkProgram,
+    state: LinkMemory,
     row: int,
     size_bytes: int,
     now_ns: int,
-    verdict: Verdict,
+    verdict: PacketDecision,
 ) -> None:
     """Decide what becomes of a datagram that comes in at ``now_ns``.
 
@@ -217,7 +217,7 @@ def admit(
                 spared = True
             else:
                 fate = refusal
-    if fate == DELIVERED and release_ns > now_ns and state.link.under_way >= program.limit:
+    if fate == DELIVERED and release_ns > now_ns and state.link.in_flight >= program.limit:
         if must:
             spared = True
         else:
@@ -227,7 +227,7 @@ def admit(
     elif copy_ns != NEVER_NS and copy_ns < release_ns:
         release_ns, copy_ns, bit, copy_bit = copy_ns, release_ns, copy_bit, bit
     if copy_ns > now_ns:
-        room = program.limit - state.link.under_way
+        room = program.limit - state.link.in_flight
         if room < (2 if release_ns > now_ns else 1):
             copy_ns, copy_bit = NEVER_NS, -1
     settle(program, state, row, packet, fate, spared, release_ns, copy_ns, bit, copy_bit,
@@ -235,14 +235,14 @@ def admit(
 
 
 def repeat(
-    program: Program,
-    state: State,
+    program: LinkProgram,
+    state: LinkMemory,
     row: int,
     packet: int,
     size_bytes: int,
-    decision: Decision,
+    decision: RecordedDecision,
     now_ns: int,
-    verdict: Verdict,
+    verdict: PacketDecision,
 ) -> None:
     """Decide as was decided before, and keep the guarantee all the same.
 
@@ -276,8 +276,8 @@ def within(bit: int, size_bytes: int) -> int:
 
 
 def settle(
-    program: Program,
-    state: State,
+    program: LinkProgram,
+    state: LinkMemory,
     row: int,
     packet: int,
     fate: int,
@@ -287,7 +287,7 @@ def settle(
     bit: int,
     copy_bit: int,
     now_ns: int,
-    verdict: Verdict,
+    verdict: PacketDecision,
 ) -> None:
     """Keep the guarantee for a datagram whose way is known, count it, and fill in the verdict."""
     flow, recent_ns, counters = (
@@ -303,19 +303,19 @@ def settle(
             effective_ns = copy_ns
         else:
             fate = CORRUPTED
-    held_ns, overtakes = 0, 0
+    hold_back_ns, makes_stale = 0, 0
     if effective_ns != NEVER_NS:
         if program.tracks:
             needed_ns = needed_until_ns(flow, recent_ns, program.mansd, packet)
             if needed_ns > effective_ns:
-                held_ns = needed_ns - effective_ns
+                hold_back_ns = needed_ns - effective_ns
                 effective_ns = needed_ns
                 if bit < 0:
                     release_ns = needed_ns
                 if copy_ns != NEVER_NS:
                     copy_ns = max(copy_ns, needed_ns)
                 counters.held_back += 1
-            overtakes = overtake(recent_ns, program.mansd, packet, effective_ns)
+            makes_stale = overtake(recent_ns, program.mansd, packet, effective_ns)
         if spared:
             fate = FORCED
         if flow.forced_first != 0:
@@ -325,18 +325,18 @@ def settle(
     else:
         flow.run += 1
         run = min(flow.run, packet + 1 - flow.since)
-        flow.longest_run = max(flow.longest_run, run)
-        counters.longest_run = max(counters.longest_run, run)
+        flow.longest_loss_burst = max(flow.longest_loss_burst, run)
+        counters.longest_loss_burst = max(counters.longest_loss_burst, run)
     if program.tracks and program.mansd >= 0:
         recent_ns[packet % (program.mansd + 1)] = effective_ns
     count(counters, fate)
     if copy_ns != NEVER_NS:
         counters.duplicated += 1
     if release_ns > now_ns:
-        state.link.under_way += 1
+        state.link.in_flight += 1
     if copy_ns > now_ns:
-        state.link.under_way += 1
-    counters.most_under_way = max(counters.most_under_way, state.link.under_way)
+        state.link.in_flight += 1
+    counters.most_in_flight = max(counters.most_in_flight, state.link.in_flight)
     verdict.fate = fate
     verdict.packet = packet
     verdict.run = flow.run
@@ -344,8 +344,8 @@ def settle(
     verdict.copy_ns = copy_ns
     verdict.bit = bit
     verdict.copy_bit = copy_bit
-    verdict.held_ns = held_ns
-    verdict.overtakes = overtakes
+    verdict.hold_back_ns = hold_back_ns
+    verdict.makes_stale = makes_stale
 
 
 def count(counters: Counters, fate: int) -> None:
@@ -365,7 +365,7 @@ def count(counters: Counters, fate: int) -> None:
 
 
 def leave(
-    state: State, row: int, packet: int, size_bytes: int, delayed: bool, counts: bool
+    state: LinkMemory, row: int, packet: int, size_bytes: int, delayed: bool, counts: bool
 ) -> bool:
     """Take note that a datagram, or a copy, leaves; return whether it is stale.
 
@@ -383,14 +383,14 @@ def leave(
     counters.forwarded += 1
     counters.forwarded_bytes += size_bytes
     if delayed:
-        state.link.under_way -= 1
+        state.link.in_flight -= 1
     stale = packet < flow.newest
     if counts:
         if stale:
-            counters.overtaken += 1
+            counters.delivered_out_of_order += 1
         else:
             run = packet - max(flow.newest, flow.since - 1) - 1
             flow.newest = packet
-            flow.longest_run = max(flow.longest_run, run)
-            counters.longest_run = max(counters.longest_run, run)
+            flow.longest_loss_burst = max(flow.longest_loss_burst, run)
+            counters.longest_loss_burst = max(counters.longest_loss_burst, run)
     return stale

@@ -52,9 +52,9 @@ def needed_until_ns(flow: FlowState, recent_ns: Sequence[int], mansd: int, packe
 def overtake(recent_ns: MutableSequence[int], mansd: int, packet: int, release_ns: int) -> int:
     """Mark as stale what ``packet``, leaving at ``release_ns``, overtakes; return how many."""
     width = mansd + 1
-    overtaken = 0
+    delivered_out_of_order = 0
     for number in range(max(packet - width, 0), packet):
         if recent_ns[number % width] > release_ns:
             recent_ns[number % width] = NEVER_NS
-            overtaken += 1
-    return overtaken
+            delivered_out_of_order += 1
+    return delivered_out_of_order

@@ -6,7 +6,7 @@ the same however late the emulator itself is.
 
 from collections.abc import MutableSequence
 
-from netem.rule_records import Bottleneck, QueueState
+from netem.rule_records import QueueState, RateSettings
 
 _NS = 1_000_000_000
 _LATEST_NS = 2**61
@@ -14,7 +14,7 @@ _LATEST_NS = 2**61
 
 
 def enters(
-    bottleneck: Bottleneck, queue: QueueState, departures_ns: MutableSequence[int], now_ns: int
+    bottleneck: RateSettings, queue: QueueState, departures_ns: MutableSequence[int], now_ns: int
 ) -> bool:
     """Whether the queue has room at ``now_ns``; takes out what has left until then.
 
@@ -32,7 +32,7 @@ def enters(
 
 
 def serve(
-    bottleneck: Bottleneck,
+    bottleneck: RateSettings,
     queue: QueueState,
     departures_ns: MutableSequence[int],
     size_bytes: int,

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from netem.rule_records import Script
+from netem.rule_records import ScriptSettings
 
 
-def lost(script: Script, numbers: Sequence[int], packet: int) -> bool:
+def lost(script: ScriptSettings, numbers: Sequence[int], packet: int) -> bool:
     """Whether datagram ``packet`` of a flow would be lost.
 
     Args:

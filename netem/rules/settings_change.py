@@ -2,12 +2,16 @@
 
 from collections.abc import MutableSequence, Sequence
 
-from netem.rule_records import Bottleneck, FlowState, QueueState, Stage
-from netem.rules.link_rules import RATE, Program, State
+from netem.rule_records import FlowState, QueueState, RateSettings, RuleStage
+from netem.rules.link_rules import RATE, LinkMemory, LinkProgram
 
 
 def carry(
-    old: Program, before: State, new: Program, after: State, latest_ns: Sequence[int]
+    old: LinkProgram,
+    before: LinkMemory,
+    new: LinkProgram,
+    after: LinkMemory,
+    latest_ns: Sequence[int],
 ) -> None:
     """Fill what ``new`` remembers from what ``old`` remembered.
 
@@ -39,8 +43,8 @@ def carry(
             after.memory[row][place].score = before.memory[row][was].score
     for row in range(len(before.flows)):
         before.flows[row].since = before.flows[row].packets
-        before.flows[row].longest_run = 0
-    after.counters.longest_run = 0
+        before.flows[row].longest_loss_burst = 0
+    after.counters.longest_loss_burst = 0
     if new.tracks and new.mansd >= 0:
         for row in range(len(before.flows)):
             _carry_releases(
@@ -49,7 +53,7 @@ def carry(
             )  # fmt: skip
 
 
-def _place_of(program: Program, stage: Stage) -> int:
+def _place_of(program: LinkProgram, stage: RuleStage) -> int:
     """Place of the stage with the same kind and name; −1 if there is none."""
     for place in range(len(program.stages)):
         other = program.stages[place]
@@ -59,10 +63,10 @@ def _place_of(program: Program, stage: Stage) -> int:
 
 
 def _carry_queue(
-    old: Bottleneck,
+    old: RateSettings,
     queue: QueueState,
     departures_ns: Sequence[int],
-    new: Bottleneck,
+    new: RateSettings,
     new_queue: QueueState,
     new_departures_ns: MutableSequence[int],
 ) -> None:
@@ -80,9 +84,9 @@ def _carry_queue(
 
 def _carry_releases(
     flow: FlowState,
-    old: Program,
+    old: LinkProgram,
     old_ns: Sequence[int],
-    new: Program,
+    new: LinkProgram,
     new_ns: MutableSequence[int],
     latest_ns: int,
 ) -> None:

@@ -4,24 +4,24 @@ from netem.rule_program import program_of
 from netem.rules.delay import quantile_ns
 from netem.words.quantities import number_text, percent_text, rate_text, time_text
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 
 _NOTEWORTHY = 1e-4
@@ -72,35 +72,35 @@ def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
 
 def _loss(loss: Loss) -> str:
     match loss:
-        case Lossless():
+        case NoLoss():
             return "loses nothing"
-        case Bernoulli() if loss.correlation:
+        case BernoulliLoss() if loss.correlation:
             return f"loses {_share(loss)} of the datagrams{_likeness(loss)}"
-        case Bernoulli():
+        case BernoulliLoss():
             return f"loses {_share(loss)} of the datagrams, each independently"
-        case GilbertElliott():
+        case GilbertElliottLoss():
             return _gilbert_elliott(loss)
-        case FourState():
+        case FourStateLoss():
             return (
                 "loses by a Markov chain of four states: bursts begin with probability "
                 f"{_brief(loss.p13)} and end with {_brief(loss.p31)}; within one, delivery begins "
                 f"with {_brief(loss.p32)} and ends with {_brief(loss.p23)}; single losses come "
                 f"with {_brief(loss.p14)}"
             )
-        case Periodic():
+        case PeriodicLoss():
             begin = f", from number {loss.first} on" if loss.first else ""
             return f"loses {loss.burst} of every {loss.period} datagrams of a flow, in a row{begin}"
-        case Scripted():
+        case ScriptedLoss():
             numbers = ", ".join(map(str, loss.lost[:8])) + (", ..." if len(loss.lost) > 8 else "")
             again = f", and again every {loss.repeat_every}" if loss.repeat_every else ""
             return f"loses the datagrams {numbers or '(none)'} of each flow{again}"
-        case Trace():
+        case TraceLoss():
             return f"loses what {loss.file} marks with a 1{', once' if not loss.repeat else ''}"
-        case WorstCase():
+        case WorstCaseLoss():
             return "loses everything that the cap lets it lose"
 
 
-def _gilbert_elliott(loss: GilbertElliott) -> str:
+def _gilbert_elliott(loss: GilbertElliottLoss) -> str:
     p, r = loss.transitions
     bad = f"bad times begin with probability {_brief(p)} per datagram"
     length = f" and last {_figure(1 / r)} datagrams on average" if r else " and never end"
@@ -180,11 +180,11 @@ def _blackout(blackout: Blackout) -> str:
     return f"lets nothing through from {', '.join(parts)}{more} after the start{every}"
 
 
-def _share(chance: Bernoulli | Duplicate | Corrupt | Reorder) -> str:
+def _share(chance: BernoulliLoss | Duplicate | Corrupt | Reorder) -> str:
     return _brief(chance.probability)
 
 
-def _likeness(chance: Bernoulli | Duplicate | Corrupt | Reorder) -> str:
+def _likeness(chance: BernoulliLoss | Duplicate | Corrupt | Reorder) -> str:
     if not chance.correlation:
         return ""
     return f"; successive ones alike by {_brief(chance.correlation)}"

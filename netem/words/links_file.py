@@ -18,7 +18,7 @@ from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
 from noack.config.impairment_files import read_files
 from noack.config.impairments import LinkSettings
-from noack.config.section import Section, Seed
+from noack.config.section import ScenarioSection, Seed
 from noack.core.errors import CallerError
 from noack.runtime.address import parse_address
 
@@ -40,7 +40,7 @@ Side = Annotated[
 ]
 
 
-class LinkTable(Section):
+class LinkTable(ScenarioSection):
     """One link of a relay: where it listens, where it sends to, what it does in each direction."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
@@ -94,7 +94,7 @@ class LinkTable(Section):
         )
 
 
-class LinksFile(Section):
+class LinksFile(ScenarioSection):
     """Links of one relay."""
 
     link: Annotated[tuple[LinkTable, ...], Field(min_length=1)]

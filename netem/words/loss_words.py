@@ -9,7 +9,7 @@ from netem.words.quantities import (
     NUMBER,
     PERCENT,
 )
-from netem.words.word_reader import Reader
+from netem.words.word_reader import WordReader
 
 LOSS_MODELS = (
     "random", "state", "gemodel", "burst", "periodic", "trace", "script", "worst", "none",
@@ -30,7 +30,7 @@ Table = dict[str, Any]
 """A table of settings, before it is validated."""
 
 
-def read_loss(reader: Reader) -> Table:
+def read_loss(reader: WordReader) -> Table:
     """Read what follows ``loss``; return the loss model as a table."""
     if reader.number_follows():
         return _bernoulli(reader)
@@ -62,14 +62,14 @@ def read_loss(reader: Reader) -> Table:
             return {"model": "lossless"}
 
 
-def _bernoulli(reader: Reader) -> Table:
+def _bernoulli(reader: WordReader) -> Table:
     table: Table = {"model": "bernoulli", "probability": reader.value(PERCENT)}
     if reader.number_follows():
         table["correlation"] = reader.value(CORRELATION)
     return table
 
 
-def _four_state(reader: Reader) -> Table:
+def _four_state(reader: WordReader) -> Table:
     """``state p13 [p31 [p32 [p23 [p14]]]]``; p13 alone makes independent losses, as in tc."""
     p13 = reader.value(PERCENT)
     table: Table = {"model": "four_state", "p13": p13, "p31": 1 - p13}
@@ -80,7 +80,7 @@ def _four_state(reader: Reader) -> Table:
     return table
 
 
-def _gilbert_elliott(reader: Reader) -> Table:
+def _gilbert_elliott(reader: WordReader) -> Table:
     """``gemodel p [r [1-h [1-k]]]``; p alone makes independent losses, as in tc."""
     p = reader.value(PERCENT)
     table: Table = {"model": "gilbert_elliott", "good_to_bad": p, "bad_to_good": 1 - p}
@@ -91,7 +91,7 @@ def _gilbert_elliott(reader: Reader) -> Table:
     return table
 
 
-def _periodic(reader: Reader) -> Table:
+def _periodic(reader: WordReader) -> Table:
     found = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_PERIODIC))
     if found is None:
         reader.wrong(f"expected {_PERIODIC}")
@@ -102,7 +102,7 @@ def _periodic(reader: Reader) -> Table:
     return table
 
 
-def _script(reader: Reader) -> Table:
+def _script(reader: WordReader) -> Table:
     lost = [] if reader.accept("none") else reader.values(COUNT, _SCRIPT)
     table: Table = {"model": "scripted", "lost": lost}
     if reader.accept("every"):

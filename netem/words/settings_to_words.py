@@ -5,24 +5,24 @@ import shlex
 from netem.words.quantities import number_text, percent_text, rate_text, time_text
 from netem.words.words_to_settings import SHAPES
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 
 _OVERHEAD = Rate.model_fields["overhead_bytes"].default
@@ -66,30 +66,30 @@ def impairment_text(impairment: Impairment) -> str:
 
 def _loss_text(loss: Loss) -> str:
     match loss:
-        case Lossless():
+        case NoLoss():
             return "none"
-        case Bernoulli():
+        case BernoulliLoss():
             return _chance_text(loss)
-        case GilbertElliott(mean_loss=float(share), mean_burst=float(length)):
+        case GilbertElliottLoss(mean_loss=float(share), mean_burst=float(length)):
             return f"burst {percent_text(share)} {number_text(length)}"
-        case GilbertElliott():
+        case GilbertElliottLoss():
             p, r = loss.transitions
             return "gemodel " + _percents(
                 (p, r, loss.loss_in_bad, loss.loss_in_good), (None, None, 1.0, 0.0)
             )
-        case FourState():
+        case FourStateLoss():
             return "state " + _percents(
                 (loss.p13, loss.p31, loss.p32, loss.p23, loss.p14), (None, None, 0.0, 1.0, 0.0)
             )
-        case Periodic():
+        case PeriodicLoss():
             begin = f" from {loss.first}" if loss.first else ""
             return f"periodic {loss.burst}/{loss.period}{begin}"
-        case Scripted():
+        case ScriptedLoss():
             every = f" every {loss.repeat_every}" if loss.repeat_every else ""
             return f"script {','.join(map(str, loss.lost)) or 'none'}{every}"
-        case Trace():
+        case TraceLoss():
             return f"trace {shlex.quote(loss.file)}{'' if loss.repeat else ' once'}"
-        case WorstCase():
+        case WorstCaseLoss():
             return "worst"
 
 
@@ -101,7 +101,7 @@ def _percents(shares: tuple[float, ...], defaults: tuple[float | None, ...]) -> 
     return " ".join(map(percent_text, shares[:count]))
 
 
-def _chance_text(chance: Bernoulli | Duplicate | Corrupt | Reorder) -> str:
+def _chance_text(chance: BernoulliLoss | Duplicate | Corrupt | Reorder) -> str:
     correlation = f" {percent_text(chance.correlation)}" if chance.correlation else ""
     return percent_text(chance.probability) + correlation
 

@@ -7,22 +7,22 @@ from netem.words.quantities import percent_text, rate_text, time_text
 from netem.words.settings_to_words import impairment_text
 from netem.words.words_to_settings import SHAPES
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Delay,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 
 _HEADERS_BYTES = 42
@@ -77,9 +77,9 @@ def _lacks(impairment: Impairment, before: Sequence[Impairment]) -> str | None:
     if any(one.kind == impairment.kind for one in before):
         return f"a second {impairment.kind}"
     match impairment:
-        case LossOf(loss=Periodic() | Scripted() | Trace()):
+        case LossOf(loss=PeriodicLoss() | ScriptedLoss() | TraceLoss()):
             return "losses by the datagrams' numbers"
-        case LossOf(loss=WorstCase()):
+        case LossOf(loss=WorstCaseLoss()):
             return "a worst case"
         case Blackout():
             return "blackouts"
@@ -112,25 +112,25 @@ def _words(impairment: Impairment) -> str:
 
 def _loss_words(loss: Loss) -> str:
     match loss:
-        case Lossless():
+        case NoLoss():
             return ""
-        case Bernoulli():
+        case BernoulliLoss():
             correlation = f" {percent_text(loss.correlation)}" if loss.correlation else ""
             return f"loss random {percent_text(loss.probability)}{correlation}"
-        case GilbertElliott():
+        case GilbertElliottLoss():
             shares = (*loss.transitions, loss.loss_in_bad, loss.loss_in_good)
             return f"loss gemodel {' '.join(map(percent_text, shares))}"
-        case FourState():
+        case FourStateLoss():
             shares5 = (loss.p13, loss.p31, loss.p32, loss.p23, loss.p14)
             return f"loss state {' '.join(map(percent_text, shares5))}"
-        case Periodic() | Scripted() | Trace() | WorstCase():
+        case PeriodicLoss() | ScriptedLoss() | TraceLoss() | WorstCaseLoss():
             return "loss"
 
 
 def _differences(impairments: Sequence[Impairment]) -> tuple[str, ...]:
     notes = []
     if any(getattr(one, "correlation", 0) for one in impairments) or any(
-        isinstance(one, LossOf) and isinstance(one.loss, Bernoulli) and one.loss.correlation
+        isinstance(one, LossOf) and isinstance(one.loss, BernoulliLoss) and one.loss.correlation
         for one in impairments
     ):
         notes.append("its correlation changes the probability, or the spread, of what it is given")

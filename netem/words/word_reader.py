@@ -14,7 +14,7 @@ T = TypeVar("T")
 _SPACES = " \t\r\n"
 
 
-class Reader:
+class WordReader:
     """A sequence of words.
 
     Args:

@@ -25,7 +25,7 @@ from netem.words.quantities import (
     TIME,
     TIME_S,
 )
-from netem.words.word_reader import Reader
+from netem.words.word_reader import WordReader
 from noack.config.impairments import Delay, Distribution, Impairment, LinkSettings, Rate, Reorder
 from noack.config.section import Seed
 from noack.core.errors import CallerError
@@ -48,7 +48,7 @@ _SAMPLES = "delays with their units, e.g. 1ms,2ms,10ms"
 _SEED: TypeAdapter[int] = TypeAdapter(Seed)
 
 
-class Words(NamedTuple):
+class LinkWords(NamedTuple):
     """What words say."""
 
     settings: LinkSettings
@@ -56,7 +56,7 @@ class Words(NamedTuple):
     """Of the random streams, if the words give one."""
 
 
-def parse(words: str | Sequence[str]) -> Words:
+def parse(words: str | Sequence[str]) -> LinkWords:
     """Read the settings of one direction of a link from words.
 
     Args:
@@ -66,7 +66,7 @@ def parse(words: str | Sequence[str]) -> Words:
     Raises:
         CallerError: one line; which word, what was expected there, the nearest known word.
     """
-    reader = Reader(words)
+    reader = WordReader(words)
     impairments: list[Impairment] = []
     settings: Table = {}
     while (word := reader.begin()) is not None:
@@ -81,7 +81,7 @@ def parse(words: str | Sequence[str]) -> Words:
             reader.wrong("given twice")
         settings[word] = True if word == "first" else reader.value(COUNT)
         _check_setting(reader, word, settings[word])
-    return Words(
+    return LinkWords(
         _settings(impairments, settings),
         settings.get("seed"),
     )
@@ -99,7 +99,7 @@ def settings_of(words: str | Sequence[str]) -> LinkSettings:
     return settings
 
 
-def _keyword(reader: Reader, word: str) -> str:
+def _keyword(reader: WordReader, word: str) -> str:
     if word in _REFUSED:
         reader.wrong(_REFUSED[word])
     if word in _AFTER:
@@ -120,7 +120,7 @@ def _settings(impairments: list[Impairment], settings: Mapping[str, Any]) -> Lin
         raise CallerError(f"lossrel: {_message(error).partition(': ')[2]}") from None
 
 
-def _check_setting(reader: Reader, word: str, value: Any) -> None:
+def _check_setting(reader: WordReader, word: str, value: Any) -> None:
     if word == "seed":
         try:
             _SEED.validate_python(value)
@@ -130,7 +130,7 @@ def _check_setting(reader: Reader, word: str, value: Any) -> None:
         _validated(TypeAdapter(LinkSettings), {_SETTINGS[word]: value}, reader)
 
 
-def _validated(kind: TypeAdapter[Any], table: Table, reader: Reader) -> Any:
+def _validated(kind: TypeAdapter[Any], table: Table, reader: WordReader) -> Any:
     try:
         return kind.validate_json(json.dumps(table))  # strict takes lists for tuples only in JSON
     except ValidationError as error:
@@ -146,7 +146,7 @@ def _message(error: ValidationError) -> str:
 
 
 def _check_place(
-    reader: Reader, impairment: Impairment, before: Sequence[Impairment], *, bare_gap: bool
+    reader: WordReader, impairment: Impairment, before: Sequence[Impairment], *, bare_gap: bool
 ) -> None:
     if isinstance(impairment, Reorder):
         if not any(isinstance(one, Delay | Rate) for one in before):
@@ -157,15 +157,15 @@ def _check_place(
                          f"there is a reorder, or a gap, before it; write {how}")  # fmt: skip
 
 
-def _loss(reader: Reader) -> Table:
+def _loss(reader: WordReader) -> Table:
     table = {"kind": "loss", "loss": read_loss(reader)}
     if reader.accept("ecn"):
         reader.wrong(_REFUSED["ecn"])
     return table
 
 
-def _chance(kind: str) -> Callable[[Reader], Table]:
-    def read(reader: Reader) -> Table:
+def _chance(kind: str) -> Callable[[WordReader], Table]:
+    def read(reader: WordReader) -> Table:
         table: Table = {"kind": kind, "probability": reader.value(PERCENT)}
         if reader.number_follows():
             table["correlation"] = reader.value(CORRELATION)
@@ -174,18 +174,18 @@ def _chance(kind: str) -> Callable[[Reader], Table]:
     return read
 
 
-def _reorder(reader: Reader) -> Table:
+def _reorder(reader: WordReader) -> Table:
     table = _chance("reorder")(reader)
     if reader.accept("gap"):
         table["gap"] = reader.value(COUNT)
     return table
 
 
-def _gap(reader: Reader) -> Table:
+def _gap(reader: WordReader) -> Table:
     return {"kind": "reorder", "gap": reader.value(COUNT)}
 
 
-def _delay(reader: Reader) -> Table:
+def _delay(reader: WordReader) -> Table:
     table: Table = {"kind": "delay", "delay_s": reader.value(TIME_S)}
     if reader.number_follows():
         table["jitter_s"] = reader.value(TIME_S)
@@ -206,12 +206,12 @@ def _delay(reader: Reader) -> Table:
             return table
 
 
-def _once(reader: Reader, table: Table, key: str) -> None:
+def _once(reader: WordReader, table: Table, key: str) -> None:
     if key in table:
         reader.wrong("this delay has one already")
 
 
-def _distribution(reader: Reader, table: Table) -> None:
+def _distribution(reader: WordReader, table: Table) -> None:
     name = reader.file(f"one of {', '.join(SHAPES)}, or a file")
     if name not in SHAPES:
         table |= {"distribution": "empirical", "file": name}
@@ -221,7 +221,7 @@ def _distribution(reader: Reader, table: Table) -> None:
         reader.wrong("says nothing without jitter; write delay TIME JITTER distribution NAME")
 
 
-def _rate(reader: Reader) -> Table:
+def _rate(reader: WordReader) -> Table:
     table: Table = {"kind": "rate", "rate_bps": reader.value(RATE_BPS)}
     for key, signs in (("overhead_bytes", "-"), ("cell_bytes", ""), ("cell_overhead_bytes", "-")):
         if not reader.number_follows(signs):
@@ -232,7 +232,7 @@ def _rate(reader: Reader) -> Table:
     return table
 
 
-def _blackout(reader: Reader) -> Table:
+def _blackout(reader: WordReader) -> Table:
     intervals: list[tuple[float, ...]] = []
     for part in reader.word(_INTERVALS).split(","):
         found = re.fullmatch(f"({TIME})-({TIME})", part)
@@ -246,7 +246,7 @@ def _blackout(reader: Reader) -> Table:
 
 
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(Impairment)
-_IMPAIRMENTS: Mapping[str, Callable[[Reader], Table]] = {
+_IMPAIRMENTS: Mapping[str, Callable[[WordReader], Table]] = {
     "loss": _loss,
     "delay": _delay,
     "duplicate": _chance("duplicate"),

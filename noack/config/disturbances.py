@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Discriminator, Field, FiniteFloat, model_validator
 
 from noack.config.matrices import Row, require_length, require_squares
-from noack.config.section import NonNegative, Positive, Section
+from noack.config.section import NonNegative, Positive, ScenarioSection
 from noack.core.linear_systems import Vector
 
 Place = Literal["input", "state"]
 
 
-class _Disturbance(Section):
+class _Disturbance(ScenarioSection):
     @property
     def size(self) -> tuple[str, Row]:
         """The key that says how large it is, and its entries: one per input, or per state."""
@@ -29,7 +29,7 @@ class _Disturbance(Section):
         return np.zeros(len(self.size[1]))
 
 
-class Uniform(_Disturbance):
+class UniformDisturbance(_Disturbance):
     """At every step anew, uniform within a bound."""
 
     kind: Literal["uniform"]
@@ -55,7 +55,7 @@ class Uniform(_Disturbance):
         return np.square(self.bound) / 3
 
 
-class Gaussian(_Disturbance):
+class GaussianDisturbance(_Disturbance):
     """At every step anew, normally distributed around 0."""
 
     kind: Literal["gaussian"]
@@ -81,7 +81,7 @@ class Gaussian(_Disturbance):
         return np.square(self.std)
 
 
-class Sine(_Disturbance):
+class SineDisturbance(_Disturbance):
     """Amplitude · sin(2π hz t + phase)."""
 
     kind: Literal["sine"]
@@ -101,7 +101,7 @@ class Sine(_Disturbance):
         return "amplitude", self.amplitude
 
 
-class Step(_Disturbance):
+class StepDisturbance(_Disturbance):
     """A constant from one time on, or between two: a load, a gust."""
 
     kind: Literal["step"]
@@ -127,7 +127,10 @@ class Step(_Disturbance):
         return "amplitude", self.amplitude
 
 
-AnyDisturbance = Annotated[Uniform | Gaussian | Sine | Step, Discriminator("kind")]
+AnyDisturbance = Annotated[
+    UniformDisturbance | GaussianDisturbance | SineDisturbance | StepDisturbance,
+    Discriminator("kind"),
+]
 
 
 def variance_at(place: Place, disturbances: tuple[AnyDisturbance, ...], entries: int) -> Vector:

@@ -14,8 +14,8 @@ from noack.config.impairments import (
     LinkSettings,
     Loss,
     LossOf,
-    Scripted,
-    Trace,
+    ScriptedLoss,
+    TraceLoss,
 )
 from noack.config.named_file import NamedFile
 
@@ -81,7 +81,7 @@ def read_impairment(impairment: Impairment, folder: Path, place: str = "") -> Im
 
 def read_loss(loss: Loss, folder: Path, place: str = "") -> Loss:
     """Return a loss model that names no file; see :func:`read_files`."""
-    if not isinstance(loss, Trace):
+    if not isinstance(loss, TraceLoss):
         return loss
     what = NamedFile(loss.file, folder, place)
     marks = np.frombuffer(what.content().translate(None, _SPACES), np.uint8)
@@ -93,7 +93,7 @@ def read_loss(loss: Loss, folder: Path, place: str = "") -> Loss:
     lost = np.flatnonzero(marks == ord("1"))
     if lost.size > MAX_SCRIPT:
         what.wrong(f"loses {lost.size} datagrams; at most {MAX_SCRIPT} can be")
-    return Scripted(lost=tuple(lost.tolist()), repeat_every=marks.size if loss.repeat else 0)
+    return ScriptedLoss(lost=tuple(lost.tolist()), repeat_every=marks.size if loss.repeat else 0)
 
 
 def _within(place: str, key: str) -> str:

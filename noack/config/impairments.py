@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.section import Correlation, Probability, Section
+from noack.config.section import Correlation, Probability, ScenarioSection
 
 MAX_SCRIPT = 10_000_000
 MOST_DELAY_S = 3600.0
@@ -22,13 +22,13 @@ Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 FileName = Annotated[str, Field(min_length=1)]
 
 
-class Lossless(Section):
+class NoLoss(ScenarioSection):
     """Nothing is lost."""
 
     model: Literal["lossless"] = "lossless"
 
 
-class Bernoulli(Section):
+class BernoulliLoss(ScenarioSection):
     """Each datagram is lost with a probability; independently, unless correlated."""
 
     model: Literal["bernoulli"] = "bernoulli"
@@ -38,7 +38,7 @@ class Bernoulli(Section):
     """Between the latent variables of successive datagrams; 0 is independent loss."""
 
 
-class GilbertElliott(Section):
+class GilbertElliottLoss(ScenarioSection):
     """Two-state Markov loss: a good and a bad state, each with its own loss probability.
 
     Either the probabilities of changing state, or ``mean_loss`` and ``mean_burst``.
@@ -92,7 +92,7 @@ class GilbertElliott(Section):
         return self.good_to_bad or 0.0, self.bad_to_good or 0.0
 
 
-class FourState(Section):
+class FourStateLoss(ScenarioSection):
     """Markov loss with four states (Salsano et al., GI model; ``loss state`` of tc).
 
     State 1: gap, delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss
@@ -120,7 +120,7 @@ class FourState(Section):
         return self
 
 
-class Periodic(Section):
+class PeriodicLoss(ScenarioSection):
     """Of every ``period`` datagrams of a flow, ``burst`` in a row are lost."""
 
     model: Literal["periodic"] = "periodic"
@@ -138,7 +138,7 @@ class Periodic(Section):
         return self
 
 
-class Scripted(Section):
+class ScriptedLoss(ScenarioSection):
     """Exactly the named datagrams of each flow are lost, counted from 0."""
 
     model: Literal["scripted"] = "scripted"
@@ -156,7 +156,7 @@ class Scripted(Section):
         return self
 
 
-class Trace(Section):
+class TraceLoss(ScenarioSection):
     """Losses from a text file: a 1 for each lost datagram, a 0 for each that is not."""
 
     model: Literal["trace"] = "trace"
@@ -166,19 +166,26 @@ class Trace(Section):
     """Begin again at the end; false delivers what comes after."""
 
 
-class WorstCase(Section):
+class WorstCaseLoss(ScenarioSection):
     """Everything is lost that the MANSD allows to be lost."""
 
     model: Literal["worst_case"] = "worst_case"
 
 
 Loss = Annotated[
-    Lossless | Bernoulli | GilbertElliott | FourState | Periodic | Scripted | Trace | WorstCase,
+    NoLoss
+    | BernoulliLoss
+    | GilbertElliottLoss
+    | FourStateLoss
+    | PeriodicLoss
+    | ScriptedLoss
+    | TraceLoss
+    | WorstCaseLoss,
     Field(discriminator="model"),
 ]
 
 
-class LossOf(Section):
+class LossOf(ScenarioSection):
     """Loss by a model."""
 
     kind: Literal["loss"] = "loss"
@@ -186,7 +193,7 @@ class LossOf(Section):
     """The loss model."""
 
 
-class Duplicate(Section):
+class Duplicate(ScenarioSection):
     """Sends a datagram twice."""
 
     kind: Literal["duplicate"] = "duplicate"
@@ -196,7 +203,7 @@ class Duplicate(Section):
     """Between successive datagrams."""
 
 
-class Corrupt(Section):
+class Corrupt(ScenarioSection):
     """Flips one bit of the payload, at random."""
 
     kind: Literal["corrupt"] = "corrupt"
@@ -216,7 +223,7 @@ Samples = Annotated[
 ]
 
 
-class Delay(Section):
+class Delay(ScenarioSection):
     """Holds a datagram back by a constant time and a random one; never by less than 0."""
 
     kind: Literal["delay"] = "delay"
@@ -255,7 +262,7 @@ class Delay(Section):
         return self
 
 
-class Reorder(Section):
+class Reorder(ScenarioSection):
     """Lets a datagram overtake: it leaves at once, however long it should be delayed."""
 
     kind: Literal["reorder"] = "reorder"
@@ -267,7 +274,7 @@ class Reorder(Section):
     """It is the turn of one datagram in ``gap``."""
 
 
-class Rate(Section):
+class Rate(ScenarioSection):
     """A bottleneck: one datagram after the other, with a finite queue before it (tail drop)."""
 
     kind: Literal["rate"] = "rate"
@@ -306,7 +313,7 @@ class Rate(Section):
 TimeS = Annotated[FiniteFloat, Field(ge=0, le=1e9)]
 
 
-class Blackout(Section):
+class Blackout(ScenarioSection):
     """Nothing comes through during intervals of time."""
 
     kind: Literal["blackout"] = "blackout"
@@ -330,7 +337,7 @@ Impairment = Annotated[
 ]
 
 
-class LinkSettings(Section):
+class LinkSettings(ScenarioSection):
     """What one direction of a link does, in this order, to the datagrams of each flow."""
 
     impairments: tuple[Impairment, ...] = ()
@@ -378,7 +385,7 @@ def require_scores(impairments: Iterable[Impairment], loss: Loss | None = None) 
     for number, impairment in enumerate(impairments):
         if isinstance(impairment, LossOf):
             loss = impairment.loss
-        tells = isinstance(loss, Bernoulli | GilbertElliott)
+        tells = isinstance(loss, BernoulliLoss | GilbertElliottLoss)
         if isinstance(impairment, Delay) and impairment.loss_correlation and not tells:
             raise ValueError(
                 f"impairments.{number}.loss_correlation: needs a loss before it, "

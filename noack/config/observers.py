@@ -6,13 +6,13 @@ import numpy as np
 from pydantic import Discriminator, FiniteFloat, model_validator
 
 from noack.config.matrices import Row, Rows, require_length, require_shape, require_squares
-from noack.config.section import Section
+from noack.config.section import ScenarioSection
 from noack.core.linear_systems import Vector
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 
 
-class Measurement(Section):
+class Measurement(ScenarioSection):
     """What is measured of the plant: y = C x + v."""
 
     C: Rows | None = None
@@ -62,7 +62,7 @@ class Measurement(Section):
             require_length(getattr(self, key), f"{place}.{key}", p, "one per measured output")
 
 
-class Luenberger(Section):
+class LuenbergerSettings(ScenarioSection):
     """x̂(t_k) = x̂⁻ + L (y − C x̂⁻), x̂⁻ being predicted by Â, B̂ and the input since t_(k−1)."""
 
     kind: Literal["luenberger"]
@@ -116,7 +116,7 @@ class Luenberger(Section):
         return tuple(found)
 
 
-class Kalman(Section):
+class KalmanSettings(ScenarioSection):
     """The time-varying Kalman filter of the model, its covariance in Joseph's form."""
 
     kind: Literal["kalman"]
@@ -173,4 +173,4 @@ class Kalman(Section):
                 raise ValueError(f"observer.{key}: must be positive {definite}")
 
 
-AnyObserver = Annotated[Luenberger | Kalman, Discriminator("kind")]
+AnyObserver = Annotated[LuenbergerSettings | KalmanSettings, Discriminator("kind")]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from pydantic import ValidationError
 
-from noack.config.runtime_parameters import LOSS, MANSD, SETPOINT, text_of, trigger_knobs
+from noack.config.runtime_parameters import LOSS, MANSD, SETPOINT, text_of, trigger_parameters
 from noack.config.scenario import Scenario
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
@@ -27,7 +27,7 @@ LATE = "violation"
 """Level of the notice of a process that applies a change late."""
 
 
-class Change(NamedTuple):
+class ParameterChange(NamedTuple):
     """Settings that are in force from a time on."""
 
     number: int
@@ -88,35 +88,40 @@ def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
         raise CallerError(f"the change: {error}") from None
 
 
-def knobs_of(scenario: Scenario) -> dict[str, Any]:
+def current_parameters(scenario: Scenario) -> dict[str, Any]:
     """What can be changed during a run, and its values."""
     trigger = scenario.trigger
     loss = scenario.network.loss.model_dump(mode="json", exclude_none=True)
-    values = {key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_knobs(trigger)}
+    values = {
+        key: getattr(trigger, key.removeprefix("trigger.")) for key in trigger_parameters(trigger)
+    }
     n, _ = scenario.model.dimensions
     setpoint = list(scenario.controller.setpoint or [0.0] * n)
     return {LOSS: loss, MANSD: scenario.network.mansd, **values, SETPOINT: setpoint}
 
 
-def scheduled(scenario: Scenario) -> list[Change]:
+def scheduled(scenario: Scenario) -> list[ParameterChange]:
     """The changes that a scenario has written down."""
-    return [Change(number, one.at_ns, dict(one.set)) for number, one in enumerate(scenario.changes)]
+    return [
+        ParameterChange(number, one.at_ns, dict(one.set))
+        for number, one in enumerate(scenario.changes)
+    ]
 
 
 CHANGED = "change"
 """Level of the notice of a change."""
 
 
-def said_of(change: Change, more: str = "") -> Notice:
+def said_of(change: ParameterChange, more: str = "") -> Notice:
     """The line of the run's log that tells of a change."""
     text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{more}"
     return Notice(change.t_ns, CHANGED, text)
 
 
-class Changeable(Machine[T], Protocol[T]):
+class ReconfigurableMachine(Machine[T], Protocol[T]):
     """A machine whose settings may change during a run."""
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Take a change that is in force from its time on; answers with one row.
 
         Raises:
@@ -125,10 +130,10 @@ class Changeable(Machine[T], Protocol[T]):
         ...
 
 
-class Unchangeable:
+class FixedMachine:
     """Part of machines whose settings stay as they are: those of the acknowledgement baseline."""
 
-    def announce(self, change: Change, now_ns: int) -> Sequence[Record | Notice]:
+    def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
         """Refuse a change.
 
         Raises:
@@ -137,7 +142,7 @@ class Unchangeable:
         raise CallerError(f"nothing can be changed here during a run: {text_of(change.settings)}")
 
 
-class InForce(NamedTuple):
+class AppliedParameters(NamedTuple):
     """A scenario, and since when it is in force in a machine's own time."""
 
     since_ns: int
@@ -149,7 +154,7 @@ class InForce(NamedTuple):
     """What the machine made of the scenario when it was told."""
 
 
-class Schedule:
+class ChangeSchedule:
     """The scenarios of a run, one after the other, as a machine has been told.
 
     Args:
@@ -161,13 +166,13 @@ class Schedule:
         self, scenario: Scenario, prepare: Callable[[Scenario], Any] = lambda scenario: None
     ) -> None:
         self._prepare = prepare
-        self._all = [InForce(-(2**63), -1, {}, scenario, None)]
+        self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
         """From when on the next one is in force that has not been taken; None if none is known."""
 
     def announce(
-        self, table: str, change: Change, number: int, now_ns: int, reached_ns: int
+        self, table: str, change: ParameterChange, number: int, now_ns: int, reached_ns: int
     ) -> list[Record | Notice]:
         """Take a change; return its row, and what is to be said of it.
 
@@ -182,7 +187,9 @@ class Schedule:
             CallerError: with it, the scenario would not be a valid one; nothing is changed.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
-        entry = InForce(since_ns, change.number, change.settings, self._all[0].scenario, None)
+        entry = AppliedParameters(
+            since_ns, change.number, change.settings, self._all[0].scenario, None
+        )
         every = [*self._all]
         first = bisect(every, (since_ns, change.number), key=lambda one: (one.since_ns, one.number))
         every.insert(first, entry)
@@ -202,7 +209,7 @@ class Schedule:
             outputs.append(Notice(since_ns, LATE, text))
         return outputs
 
-    def take(self, t_ns: int) -> InForce | None:
+    def take(self, t_ns: int) -> AppliedParameters | None:
         """The next scenario that is in force at a time and has not been taken; None if none is."""
         if self.next_ns is None or self.next_ns > t_ns:
             return None

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
 from noack.config.matrices import Row, Rows, require_length
-from noack.config.section import NonNegative, Positive, Section
+from noack.config.section import NonNegative, Positive, ScenarioSection
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION
 
@@ -20,7 +20,7 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
-class System(Section):
+class PlantSettings(ScenarioSection):
     """What every system's settings have."""
 
     states: ClassVar[tuple[str, ...]] = ()
@@ -66,14 +66,14 @@ class System(Section):
             )
 
 
-class Linear(System):
+class LinearSettings(PlantSettings):
     """ẋ = A x + B u, as the plant's other keys draw it."""
 
     kind: Literal["linear"] = "linear"
     """What the plant is."""
 
 
-class CartPole(System):
+class CartPoleSettings(PlantSettings):
     """A pole upright on a cart that a force moves, on a straight rail.
 
     Unless given, the parameters are those of the Control Tutorials for MATLAB and Simulink
@@ -112,7 +112,7 @@ _MULTI_BODY = (
 )  # fmt: skip
 
 
-class Vehicle(System):
+class VehicleSettings(PlantSettings):
     """A road vehicle of CommonRoad's vehicle models, beside the lane that the x-axis is.
 
     Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is as in the lane models: of the
@@ -175,7 +175,7 @@ class Vehicle(System):
         return self
 
 
-class FourTank(System):
+class FourTankSettings(PlantSettings):
     """Two tanks that two pumps fill, each through another tank above it as well.
 
     Johansson, "The Quadruple-Tank Process", IEEE Trans. Control Systems Technology 8(3), 2000;
@@ -208,7 +208,7 @@ class FourTank(System):
         return ("level_1", "level_2", "level_3", "level_4")
 
 
-class Quadrotor(System):
+class QuadrotorSettings(PlantSettings):
     """A rigid body that hovers: its thrust along its own axis, torques about them, drag in the air.
 
     Unless given, the parameters are of Luukkonen, "Modelling and Control of Quadcopter", Aalto
@@ -235,7 +235,7 @@ class Quadrotor(System):
     """Gravity."""
 
 
-class Fmu(System):
+class FmuSettings(PlantSettings):
     """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: any tool's model, exported.
 
     It is native code that is run in the plant's process; see docs/plants.md.
@@ -284,7 +284,7 @@ class Fmu(System):
         require_length(self.operating_input, "plant.system.operating_input", m, why)
 
 
-class Python(System):
+class PythonSettings(PlantSettings):
     """A class of the user's own, from an installed package or from a file.
 
     Its code is run in the plant's process; see docs/plants.md for what the class must offer.
@@ -324,12 +324,12 @@ def _kind(given: object) -> str:
 
 
 AnySystem = Annotated[
-    Annotated[Linear, Tag("linear")]
-    | Annotated[CartPole, Tag("cart_pole")]
-    | Annotated[FourTank, Tag("four_tank")]
-    | Annotated[Quadrotor, Tag("quadrotor")]
-    | Annotated[Vehicle, Tag("vehicle")]
-    | Annotated[Fmu, Tag("fmu")]
-    | Annotated[Python, Tag("python")],
+    Annotated[LinearSettings, Tag("linear")]
+    | Annotated[CartPoleSettings, Tag("cart_pole")]
+    | Annotated[FourTankSettings, Tag("four_tank")]
+    | Annotated[QuadrotorSettings, Tag("quadrotor")]
+    | Annotated[VehicleSettings, Tag("vehicle")]
+    | Annotated[FmuSettings, Tag("fmu")]
+    | Annotated[PythonSettings, Tag("python")],
     Discriminator(_kind),
 ]

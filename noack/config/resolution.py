@@ -11,9 +11,9 @@ import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
 from noack.config.observability import observer_gain, unseen_mode
-from noack.config.observers import AnyObserver, Luenberger
+from noack.config.observers import AnyObserver, LuenbergerSettings
 from noack.config.scenario import Scenario
-from noack.config.sections.model_section import Model
+from noack.config.sections.model_section import ModelSection
 from noack.config.setpoint import input_at
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
@@ -25,7 +25,7 @@ _SURELY_FINITE = 600.0
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopMatrices:
     """The matrices of a resolved scenario, in the paper's notation (n states, m inputs)."""
 
     A_model: Matrix
@@ -99,14 +99,14 @@ def resolve(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
 
 
-def loop_of(resolved: Scenario) -> Loop:
+def loop_of(resolved: Scenario) -> LoopMatrices:
     """Return the matrices of a resolved scenario."""
     model, plant = resolved.model, resolved.plant
     A_model, B_model, K = np.array(model.A), np.array(model.B), np.array(model.gain)
     H = A_model + B_model @ K if resolved.mode == "model" else np.zeros_like(A_model)
     weight = resolved.trigger.weight
     setpoint = setpoint_of(resolved)
-    return Loop(
+    return LoopMatrices(
         A_model=A_model,
         B_model=B_model,
         K=K,
@@ -145,7 +145,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     )  # fmt: skip
 
 
-def _observer(scenario: Scenario, model: Model) -> AnyObserver | None:
+def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
     """The observer, with a gain where it has poles."""
     observer = scenario.observer
     if observer is None:
@@ -167,7 +167,7 @@ def _observer(scenario: Scenario, model: Model) -> AnyObserver | None:
             f"plant.measurement.C: no observer can follow: the mode e^({rate} t) of "
             "the model does not show in what is measured, and does not decay"
         )
-    if isinstance(observer, Luenberger) and observer.poles_per_s is not None:
+    if isinstance(observer, LuenbergerSettings) and observer.poles_per_s is not None:
         try:
             z = tuple(complex(np.exp(pole * period_ns * 1e-9)) for pole in observer.poles)
             gain = observer_gain(step, C, z)
@@ -193,10 +193,10 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
         )
 
 
-def _explicit_model(model: Model) -> Model:
+def _explicit_model(model: ModelSection) -> ModelSection:
     if model.name is not None:
         named = NAMED_MODELS[model.name](model.parameters)
-        return Model(
+        return ModelSection(
             A=_rows(named.A),
             B=_rows(named.B),
             gain=model.gain or _rows(named.K),

@@ -24,7 +24,7 @@ SHORT: Mapping[str, str] = {
 }
 """Short names of keys."""
 
-_AT_THE_START = ("reserve",)
+_AT_THE_START = ("eta_0",)
 """Numbers of a trigger that say how it begins."""
 
 
@@ -35,7 +35,7 @@ def full_key(name: str) -> str:
     return f"network.{name}" if name.startswith("loss.") else name
 
 
-def trigger_knobs(trigger: BaseModel) -> tuple[str, ...]:
+def trigger_parameters(trigger: BaseModel) -> tuple[str, ...]:
     """The keys of a trigger's numbers: policy and norm stay what they are."""
     return tuple(
         f"trigger.{name}"
@@ -44,7 +44,7 @@ def trigger_knobs(trigger: BaseModel) -> tuple[str, ...]:
     )
 
 
-def require_knobs(settings: Mapping[str, Any], trigger: BaseModel) -> None:
+def require_runtime_parameters(settings: Mapping[str, Any], trigger: BaseModel) -> None:
     """Check that all keys are such as can be changed during a run.
 
     Args:
@@ -54,7 +54,7 @@ def require_knobs(settings: Mapping[str, Any], trigger: BaseModel) -> None:
     Raises:
         ValueError: one is not; the message says which are.
     """
-    known = (LOSS, MANSD, *trigger_knobs(trigger), SETPOINT)
+    known = (LOSS, MANSD, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
         if key not in known and not key.startswith(f"{LOSS}."):
             short = ", ".join(SHORT)
@@ -71,7 +71,7 @@ def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
 
     Args:
         content: of a scenario, as from JSON; changed in place.
-        settings: values by keys that :func:`require_knobs` has let pass.
+        settings: values by keys that :func:`require_runtime_parameters` has let pass.
     """
     model = f"{LOSS}.model"
     if model in settings and settings[model] != content["network"]["loss"].get("model"):

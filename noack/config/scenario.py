@@ -14,27 +14,27 @@ import numpy as np
 from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
 from noack.config.disturbances import require_disturbances, variance_at
-from noack.config.impairments import Loss, Mansd, Trace, require_scores
+from noack.config.impairments import Loss, Mansd, TraceLoss, require_scores
 from noack.config.matrices import require_length, require_shape
-from noack.config.observers import AnyObserver, Kalman
-from noack.config.plant_systems import Linear
-from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_knobs
-from noack.config.section import Section
-from noack.config.sections.controller_section import Controller
-from noack.config.sections.model_section import Model
-from noack.config.sections.network_section import Network
-from noack.config.sections.plant_section import Plant
+from noack.config.observers import AnyObserver, KalmanSettings
+from noack.config.plant_systems import LinearSettings
+from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
+from noack.config.section import ScenarioSection
+from noack.config.sections.controller_section import ControllerSection
+from noack.config.sections.model_section import ModelSection
+from noack.config.sections.network_section import NetworkSection
+from noack.config.sections.plant_section import PlantSection
 from noack.config.sections.rates import period_ns
 from noack.config.sections.run_sections import (
-    Certificate,
-    Ports,
-    Realtime,
-    Recovery,
+    CertificateSection,
+    PortsSection,
+    RealtimeSection,
+    RecoverySection,
     ScheduledChange,
-    Seeds,
+    SeedsSection,
 )
 from noack.config.setpoint import input_at
-from noack.config.triggers import AnyTrigger, Decaying, require_on_grid
+from noack.config.triggers import AnyTrigger, DecayingSettings, require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
@@ -45,7 +45,7 @@ MOST_CHANGES = 256
 """In a run."""
 
 
-class Scenario(Section):
+class Scenario(ScenarioSection):
     """A run of the loop, completely described."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
@@ -61,22 +61,22 @@ class Scenario(Section):
     start_within_s: Annotated[FiniteFloat, Field(gt=0, le=86_400)] | None = None
     """The run ends if its processes are not ready within this wall time, which grows with the
     system's load, up to 20 times. By default 30, and unlimited if people start processes."""
-    model: Model
-    plant: Plant
+    model: ModelSection
+    plant: PlantSection
     trigger: AnyTrigger
     """When the sensor transmits."""
     observer: AnyObserver | None = None
     """How the sensor estimates the state from what is measured: a table with ``kind``; unless
     given, what is measured is the state."""
-    network: Network
-    controller: Controller = Controller()
-    certificate: Certificate = Certificate()
-    recovery: Recovery = Recovery()
+    network: NetworkSection
+    controller: ControllerSection = ControllerSection()
+    certificate: CertificateSection = CertificateSection()
+    recovery: RecoverySection = RecoverySection()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
     """What changes while the run goes on, in the order of time."""
-    seeds: Seeds = Seeds()
-    ports: Ports = Ports()
-    realtime: Realtime = Realtime()
+    seeds: SeedsSection = SeedsSection()
+    ports: PortsSection = PortsSection()
+    realtime: RealtimeSection = RealtimeSection()
 
     def __str__(self) -> str:
         """What matters, in a few lines."""
@@ -98,16 +98,16 @@ class Scenario(Section):
     @property
     def is_decaying(self) -> bool:
         """Whether the trigger is the paper's."""
-        return isinstance(self.trigger, Decaying)
+        return isinstance(self.trigger, DecayingSettings)
 
     @property
-    def decaying(self) -> Decaying:
+    def decaying(self) -> DecayingSettings:
         """The trigger, if it is the paper's.
 
         Raises:
             CallerError: it is another.
         """
-        if not isinstance(self.trigger, Decaying):
+        if not isinstance(self.trigger, DecayingSettings):
             raise CallerError(
                 f'trigger.policy: this is for the paper\'s trigger, "decaying", only; '
                 f'this scenario has "{self.trigger.policy}"'
@@ -156,7 +156,7 @@ class Scenario(Section):
         """
         if self.is_acknowledged:
             raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
-        require_knobs(settings, self.trigger)
+        require_runtime_parameters(settings, self.trigger)
         # What is not touched is not looked at again: the processes of a run do this in their loop.
         touched = {key.split(".")[0] for key in settings}
         content: dict[str, Any] = {
@@ -180,14 +180,14 @@ class Scenario(Section):
             found._check_setpoint(n)
         return found
 
-    def _changed_network(self, content: Mapping[str, Any], *, of_loss: bool) -> Network:
+    def _changed_network(self, content: Mapping[str, Any], *, of_loss: bool) -> NetworkSection:
         """The network with the loss and the cap that are given; of the rest, nothing changes."""
         update: dict[str, Any] = {}
         if "mansd" in content:
             update["mansd"] = _CHANGEABLE[MANSD].validate_json(json.dumps(content["mansd"]))
         if of_loss:
             update["loss"] = _CHANGEABLE[LOSS].validate_json(json.dumps(content["loss"]))
-            if isinstance(update["loss"], Trace):
+            if isinstance(update["loss"], TraceLoss):
                 raise ValueError(
                     "network.loss.model: a trace is read before a run begins; give its losses as "
                     '{ model = "scripted", lost = [...] }'
@@ -204,7 +204,7 @@ class Scenario(Section):
         Raises:
             ValueError: one may not.
         """
-        require_knobs(settings, self.trigger)
+        require_runtime_parameters(settings, self.trigger)
         content = self.model_dump(mode="json", exclude_none=True, exclude={"changes"})
         put_settings(content, settings)
         return content
@@ -212,7 +212,7 @@ class Scenario(Section):
     @property
     def is_linear(self) -> bool:
         """Whether the plant is a linear system."""
-        return isinstance(self.plant.system, Linear)
+        return isinstance(self.plant.system, LinearSettings)
 
     @property
     def is_certifiable(self) -> bool:
@@ -327,9 +327,9 @@ class Scenario(Section):
     def acknowledgement_timeout_ns(self) -> int:
         """How long the sensor waits for an acknowledgement before it transmits again."""
         network = self.network
-        if network.way_back.timeout_s is not None:
-            return round(network.way_back.timeout_s * NS_PER_S)
-        there_and_back_s = network.link.longest_delay_s + network.way_back.link.longest_delay_s
+        if network.reverse.timeout_s is not None:
+            return round(network.reverse.timeout_s * NS_PER_S)
+        there_and_back_s = network.link.longest_delay_s + network.reverse.link.longest_delay_s
         return _TIMEOUT_PERIODS * self.measurement_period_ns + round(there_and_back_s * NS_PER_S)
 
     @property
@@ -433,7 +433,7 @@ class Scenario(Section):
                 f"{plant.measure_every} steps, {self.outputs} + {self.inputs_reported} numbers; "
                 f"at most {MAX_DIMENSION} fit"
             )
-        if not isinstance(observer, Kalman):
+        if not isinstance(observer, KalmanSettings):
             return
         noise = plant.measurement.variance(n) if observer.noise_std is None else observer.noise_std
         if observer.R is None and not all(np.array(noise) > 0):
@@ -468,12 +468,12 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     LOSS: TypeAdapter(Loss),
     MANSD: TypeAdapter(Mansd),
     "trigger": TypeAdapter(AnyTrigger),
-    "controller": TypeAdapter(Controller),
+    "controller": TypeAdapter(ControllerSection),
 }
 """What can be changed during a run, part by part."""
 
 
-def _said(section: Section, kind: str) -> str:
+def _said(section: ScenarioSection, kind: str) -> str:
     """What a section is, and its values that are not the defaults."""
     given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
     values = (

@@ -12,7 +12,7 @@ from noack.config import toml_file
 from noack.config.impairment_files import read_impairment, read_loss
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
-from noack.config.sections.network_section import Acknowledgements, Network
+from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
 from noack.config.system_files import read_system
 from noack.core.errors import CallerError, printable
 
@@ -87,7 +87,9 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     )
 
 
-def _read(section: Network | Acknowledgements, folder: Path, place: str) -> dict[str, Any]:
+def _read(
+    section: NetworkSection | AcknowledgementSection, folder: Path, place: str
+) -> dict[str, Any]:
     impairments = tuple(
         read_impairment(impairment, folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)

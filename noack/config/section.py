@@ -11,7 +11,7 @@ Correlation = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**64)]
 
 
-class Section(BaseModel):
+class ScenarioSection(BaseModel):
     """A frozen table of a settings file that knows all its keys."""
 
     model_config = ConfigDict(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from noack.config.disturbances import variance_at
-from noack.config.observers import Kalman, Luenberger
+from noack.config.observers import KalmanSettings, LuenbergerSettings
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector, discretise
@@ -68,7 +68,7 @@ def true_model(resolved: Scenario) -> EstimationModel:
 def believed_model(resolved: Scenario) -> EstimationModel:
     """The model with the covariances that the Kalman filter has been told, if it has."""
     model, kalman = true_model(resolved), resolved.observer
-    if not isinstance(kalman, Kalman):
+    if not isinstance(kalman, KalmanSettings):
         return model
     loop, disturbances = loop_of(resolved), resolved.plant.disturbances
     Q, R = model.Q, model.R
@@ -103,9 +103,9 @@ def steady_state(resolved: Scenario) -> SteadyState:
     told, true, observer = believed_model(resolved), true_model(resolved), resolved.observer
     A, Q = told.over_a_measurement()
     n, C = len(A), told.C
-    if isinstance(observer, Luenberger):
+    if isinstance(observer, LuenbergerSettings):
         L = np.array(observer.gain)
-    elif isinstance(observer, Kalman):
+    elif isinstance(observer, KalmanSettings):
         try:
             predicted = solve_discrete_are(A.T, C.T, Q, told.R)
         except (np.linalg.LinAlgError, ValueError):  # the numbers are too far apart for it

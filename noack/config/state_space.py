@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from noack.config.matrices import require_shape
 from noack.config.matrix_files import GAIN, unfit, write_matrices
-from noack.config.sections.model_section import Model, instability
+from noack.config.sections.model_section import ModelSection, instability
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
@@ -27,7 +27,7 @@ def model_of(
     *,
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
-) -> Model:
+) -> ModelSection:
     """Return the model of a loop, to be put into a scenario.
 
     Args:
@@ -44,7 +44,7 @@ def model_of(
     inputs = input_names or _labels(system, "input_labels")
     matrices = matrices_of(system, gain)
     try:
-        return Model(
+        return ModelSection(
             A=_rows(matrices["A"]),
             B=_rows(matrices["B"]),
             gain=_rows(matrices[GAIN]),

@@ -7,7 +7,7 @@ without which nothing is run.
 from pathlib import Path
 
 from noack.config.named_file import NamedFile
-from noack.config.plant_systems import AnySystem, Fmu, Python
+from noack.config.plant_systems import AnySystem, FmuSettings, PythonSettings
 
 
 def read_system(system: AnySystem, folder: Path, place: str) -> AnySystem:
@@ -24,14 +24,14 @@ def read_system(system: AnySystem, folder: Path, place: str) -> AnySystem:
     Raises:
         CallerError: there is no such file, or it cannot be read.
     """
-    if not isinstance(system, Fmu | Python) or system.file is None:
+    if not isinstance(system, FmuSettings | PythonSettings) or system.file is None:
         return system
     file = NamedFile(system.file, folder, place)
     sha256 = system.sha256 or file.sha256()
     return system.model_copy(update={"file": str(file.path.absolute()), "sha256": sha256})
 
 
-def unchanged(system: Fmu | Python) -> Path:
+def unchanged(system: FmuSettings | PythonSettings) -> Path:
     """Return where a loaded system's file is.
 
     Raises:

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
 from noack.config.matrices import Rows, require_shape
-from noack.config.section import Positive, Section
+from noack.config.section import Positive, ScenarioSection
 from noack.core.clock import NS_PER_S
 
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
@@ -15,7 +15,7 @@ Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
 Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
 
 
-class _Weighted(Section):
+class _Weighted(ScenarioSection):
     weight: Rows | None = None
     """W of the norm ‖v‖_W = ‖W v‖₂ by rows, n x n, invertible; the identity unless given."""
 
@@ -30,7 +30,7 @@ class _Weighted(Section):
             raise ValueError("trigger.weight: W must be invertible, this one is singular")
 
 
-class Decaying(_Weighted):
+class DecayingSettings(_Weighted):
     """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
 
     policy: Literal["decaying"] = "decaying"
@@ -43,7 +43,7 @@ class Decaying(_Weighted):
     """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
 
 
-class Absolute(_Weighted):
+class AbsoluteSettings(_Weighted):
     """Send-on-delta: transmit when ‖e_s‖_W > δ."""
 
     policy: Literal["absolute"]
@@ -52,7 +52,7 @@ class Absolute(_Weighted):
     """δ, in the units of ‖W x‖."""
 
 
-class Relative(_Weighted):
+class RelativeSettings(_Weighted):
     """Transmit when ‖e_s‖_W > σ‖x‖_W (Tabuada 2007)."""
 
     policy: Literal["relative"]
@@ -61,7 +61,7 @@ class Relative(_Weighted):
     """σ."""
 
 
-class Mixed(_Weighted):
+class MixedSettings(_Weighted):
     """Transmit when ‖e_s‖_W² > σ²‖x‖_W² + ε²."""
 
     policy: Literal["mixed"]
@@ -72,7 +72,7 @@ class Mixed(_Weighted):
     """ε, in the units of ‖W x‖."""
 
 
-class Quadratic(_Weighted):
+class QuadraticSettings(_Weighted):
     """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s)."""
 
     policy: Literal["quadratic"]
@@ -110,7 +110,7 @@ class _WithLyapunov(_Weighted):
                 raise ValueError("trigger.Q: must be symmetric and positive definite")
 
 
-class Lyapunov(_WithLyapunov):
+class LyapunovSettings(_WithLyapunov):
     """Transmit when V(x) = xᵀPx > V(x(t_k)) e^{−ρ(t−t_k)}, t_k the last event."""
 
     policy: Literal["lyapunov"]
@@ -119,7 +119,7 @@ class Lyapunov(_WithLyapunov):
     """ρ."""
 
 
-class Dynamic(_WithLyapunov):
+class DynamicSettings(_WithLyapunov):
     """Transmit when η + θw ≤ 0, η̇ = −λη + w, w = σxᵀQx − 2xᵀPBKe_s (Girard 2015)."""
 
     policy: Literal["dynamic"]
@@ -130,11 +130,11 @@ class Dynamic(_WithLyapunov):
     """θ, in seconds."""
     decay_per_s: Annotated[FiniteFloat, Field(ge=0, le=1e4)]
     """λ. What is saved is forgotten within 1/λ, which exact simulation must follow."""
-    reserve: Annotated[FiniteFloat, Field(ge=0, le=1e15)] = 0.0
+    eta_0: Annotated[FiniteFloat, Field(ge=0, le=1e15)] = 0.0
     """η at the start."""
 
 
-class Periodic(_Weighted):
+class PeriodicSettings(_Weighted):
     """Time-triggered: transmit every period."""
 
     policy: Literal["periodic"]
@@ -143,7 +143,7 @@ class Periodic(_Weighted):
     """Period."""
 
 
-class SelfTriggered(_Weighted):
+class SelfTriggeredSettings(_Weighted):
     """At each event the sensor decides when the next one is.
 
     It is when ‖e_s‖_W could reach the paper's threshold, given
@@ -176,7 +176,7 @@ class SelfTriggered(_Weighted):
         return self
 
 
-class _Combined(Section):
+class _Combined(ScenarioSection):
     rule: "AnyTrigger"
     """The rule that is combined."""
     interval_s: Interval
@@ -195,14 +195,14 @@ class _Combined(Section):
             raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
 
 
-class Deadline(_Combined):
+class DeadlineSettings(_Combined):
     """Any rule, and at the latest so long after the last event."""
 
     policy: Literal["deadline"]
     """The event-triggering policy."""
 
 
-class Dwell(_Combined):
+class DwellSettings(_Combined):
     """Any rule, but not earlier than so long after the last event."""
 
     policy: Literal["dwell"]
@@ -217,21 +217,21 @@ def _policy(given: object) -> object:
 
 
 AnyTrigger = Annotated[
-    Annotated[Decaying, Tag("decaying")]
-    | Annotated[Absolute, Tag("absolute")]
-    | Annotated[Relative, Tag("relative")]
-    | Annotated[Mixed, Tag("mixed")]
-    | Annotated[Quadratic, Tag("quadratic")]
-    | Annotated[Lyapunov, Tag("lyapunov")]
-    | Annotated[Dynamic, Tag("dynamic")]
-    | Annotated[Periodic, Tag("periodic")]
-    | Annotated[SelfTriggered, Tag("self_triggered")]
-    | Annotated[Deadline, Tag("deadline")]
-    | Annotated[Dwell, Tag("dwell")],
+    Annotated[DecayingSettings, Tag("decaying")]
+    | Annotated[AbsoluteSettings, Tag("absolute")]
+    | Annotated[RelativeSettings, Tag("relative")]
+    | Annotated[MixedSettings, Tag("mixed")]
+    | Annotated[QuadraticSettings, Tag("quadratic")]
+    | Annotated[LyapunovSettings, Tag("lyapunov")]
+    | Annotated[DynamicSettings, Tag("dynamic")]
+    | Annotated[PeriodicSettings, Tag("periodic")]
+    | Annotated[SelfTriggeredSettings, Tag("self_triggered")]
+    | Annotated[DeadlineSettings, Tag("deadline")]
+    | Annotated[DwellSettings, Tag("dwell")],
     Discriminator(_policy),
 ]
 
-for _combined in (_Combined, Deadline, Dwell):
+for _combined in (_Combined, DeadlineSettings, DwellSettings):
     _combined.model_rebuild()
 
 
@@ -246,9 +246,11 @@ def require_on_grid(trigger: AnyTrigger, measured_ns: int, key: str = "trigger")
     Raises:
         ValueError: it does not.
     """
-    if isinstance(trigger, Deadline | Dwell):
+    if isinstance(trigger, DeadlineSettings | DwellSettings):
         require_on_grid(trigger.rule, measured_ns, f"{key}.rule")
-    elif isinstance(trigger, Quadratic) and round(trigger.period_s * NS_PER_S) % measured_ns:
+    elif (
+        isinstance(trigger, QuadraticSettings) and round(trigger.period_s * NS_PER_S) % measured_ns
+    ):
         raise ValueError(
             f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
             "between measurements"

@@ -8,14 +8,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from noack.protocol.wire_format import Message
 
-INCARNATION = 2**40
-"""A restarted process numbers from its incarnation times this on: newer than all before it."""
+GENERATION = 2**40
+"""A restarted process numbers from its generation times this on: newer than all before it."""
 
 
 class Start(NamedTuple):
     """Where a machine takes up its work in a run."""
 
-    incarnation: int = 0
+    generation: int = 0
     """How often its process has been started anew in this run; one that was knows no state."""
     from_ns: int = 0
     """No timer is due before."""
@@ -23,12 +23,12 @@ class Start(NamedTuple):
     @property
     def first_number(self) -> int:
         """The first of its sequence numbers, and of the numbers of its inputs."""
-        return self.incarnation * INCARNATION
+        return self.generation * GENERATION
 
     @property
     def again(self) -> bool:
         """Whether the process was started anew while the run went on."""
-        return self.incarnation > 0
+        return self.generation > 0
 
 
 BEGINNING = Start()

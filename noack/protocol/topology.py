@@ -15,7 +15,7 @@ from typing import NamedTuple
 from noack.protocol.wire_format import Flow
 
 
-class Leg(NamedTuple):
+class MessageRoute(NamedTuple):
     """What a process receives, and what it sends to whom."""
 
     receives: Flow
@@ -23,14 +23,14 @@ class Leg(NamedTuple):
     to: str
 
 
-LEGS: Mapping[str, Leg] = {
-    "plant": Leg(Flow.ACTUATION, Flow.MEASUREMENT, "sensor"),
-    "sensor": Leg(Flow.MEASUREMENT, Flow.UPDATE, "netem"),
-    "netem": Leg(Flow.UPDATE, Flow.UPDATE, "controller"),
-    "controller": Leg(Flow.UPDATE, Flow.ACTUATION, "plant"),
+ROUTES: Mapping[str, MessageRoute] = {
+    "plant": MessageRoute(Flow.ACTUATION, Flow.MEASUREMENT, "sensor"),
+    "sensor": MessageRoute(Flow.MEASUREMENT, Flow.UPDATE, "netem"),
+    "netem": MessageRoute(Flow.UPDATE, Flow.UPDATE, "controller"),
+    "controller": MessageRoute(Flow.UPDATE, Flow.ACTUATION, "plant"),
 }
 
-SENDER: Mapping[str, str] = {leg.to: role for role, leg in LEGS.items()}
+SENDER: Mapping[str, str] = {leg.to: role for role, leg in ROUTES.items()}
 """From whom each process receives."""
 
 ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
@@ -39,7 +39,7 @@ ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
 ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
 """From whom each process receives them."""
 
-LOOP_ROLES = tuple(LEGS)
+LOOP_ROLES = tuple(ROUTES)
 PLANT = "plant"
 CHANGEABLE = ("sensor", "netem", "controller")
 """Processes whose settings may change during a run."""

@@ -22,12 +22,12 @@ from noack.core.errors import PeerError
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Nanoseconds = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-Incarnation = Annotated[int, Field(ge=0, lt=2**20)]
+Generation = Annotated[int, Field(ge=0, lt=2**20)]
 Ranges = tuple[tuple[Count, Count], ...]
 """Half-open ranges of numbers."""
 
 
-class Said(BaseModel):
+class ControlMessage(BaseModel):
     """A message; it may say more."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="allow")
@@ -38,43 +38,43 @@ def _require_number(host: str) -> str:
     return host
 
 
-Place = tuple[
+SocketAddress = tuple[
     Annotated[str, AfterValidator(_require_number)], Annotated[int, Field(ge=1, le=65_535)]
 ]
 """An address: host, as a number, and port."""
 
 
-class Knock(Said):
+class AdmissionRequest(ControlMessage):
     """A process asks whether it may join."""
 
     instance: str
     """Tells it from another of its role."""
 
 
-class Admission(Said):
+class Admission(ControlMessage):
     """The coordinator says who a process is in the run."""
 
-    incarnation: Incarnation
+    generation: Generation
     """How many of its role were in the run before it."""
     admitted_ns: Nanoseconds
     """Simulated time at which it was let in; whatever is older was for the one before it."""
     from_ns: Nanoseconds
     """When it is to take up its work."""
-    address: Place | None
+    address: SocketAddress | None
     """Where the one before it received, and now it."""
     after: str | None
     """What became of the one before it."""
 
 
-class Hello(Said):
+class JoinRequest(ControlMessage):
     """A process is ready to start."""
 
     instance: str
-    address: Place | None
+    address: SocketAddress | None
     """Where it receives; None for the recorder."""
 
 
-class Announced(Said):
+class ChangeAnnouncement(ControlMessage):
     """The coordinator says what is changed, and from when on."""
 
     number: Count
@@ -89,14 +89,14 @@ class Announced(Said):
     """The same by the calendar, or that the scenario says so."""
 
 
-class Asked(Said):
+class ChangeRequest(ControlMessage):
     """A person asks for a change of settings; or, with none, what they are."""
 
     settings: dict[str, JsonValue] = Field({})
     """Values by keys of the scenario."""
 
 
-class Answer(Said):
+class ChangeReply(ControlMessage):
     """The coordinator answers what is asked of a run's settings."""
 
     name: str
@@ -105,45 +105,45 @@ class Answer(Said):
     """Simulated time."""
     from_s: FiniteFloat | None
     """From when on what was asked for is in force; None if nothing was."""
-    knobs: dict[str, JsonValue]
+    runtime_parameters: dict[str, JsonValue]
     """Values by keys, with all changes that have been announced."""
 
 
-class Begin(Said):
+class RunStart(ControlMessage):
     """The coordinator says that the run begins, or has begun."""
 
     epoch_ns: Count
     """Monotonic clock reading at simulated time 0."""
-    addresses: dict[str, Place]
+    addresses: dict[str, SocketAddress]
     """Where each process receives."""
-    changes: tuple[Announced, ...] = ()
+    changes: tuple[ChangeAnnouncement, ...] = ()
     """What is known by now of changes."""
 
 
-class BatchHeader(Said):
+class BatchHeader(ControlMessage):
     """A batch of rows."""
 
     first: Count
-    """Number of its first row in its table, of those of this incarnation."""
-    incarnation: Incarnation = 0
+    """Number of its first row in its table, of those of this generation."""
+    generation: Generation = 0
 
 
-class Kept(Said):
-    """The recorder says what it has on disk of an incarnation of a process."""
+class PersistedAck(ControlMessage):
+    """The recorder says what it has on disk of an generation of a process."""
 
-    incarnation: Count
+    generation: Count
     rows: dict[str, Ranges]
     """By table."""
 
 
-class Missing(Said):
+class MissingRows(ControlMessage):
     """The recorder says what it lacks of a process that says goodbye."""
 
     rows: dict[str, Ranges]
     """By table."""
 
 
-class LogLine(Said):
+class LogLine(ControlMessage):
     """A line of a process for the run's log."""
 
     t_ns: Nanoseconds
@@ -151,23 +151,23 @@ class LogLine(Said):
     text: str
 
 
-class Channel(Said):
+class ChannelCounters(ControlMessage):
     """Counters of what a process hears."""
 
     rejected: dict[str, Count] = Field({})
     """Datagrams by reason."""
-    acknowledgements: "Channel | None" = None
+    acknowledgements: "ChannelCounters | None" = None
 
 
-class Report(Said):
+class ProcessReport(ControlMessage):
     """What a process says at its end."""
 
     ended: str
     """Why it ended."""
-    channel: Channel
+    channel: ChannelCounters
     rows: dict[str, Count]
     """How many it made, by table."""
-    incarnation: Count = 0
+    generation: Count = 0
     instance: str = ""
     """Tells it from another of its role."""
     realtime: dict[str, str] = Field({})
@@ -176,13 +176,13 @@ class Report(Said):
     """Simulated time up to which it had done what was due; None if it failed."""
 
 
-class Progress(Said):
+class RunProgress(ControlMessage):
     """The recorder's account of a run under way."""
 
     t_s: FiniteFloat
     events: Count
     deliveries: Count
-    longest_drop_run: Count
+    longest_loss_burst: Count
     x_norm: float | None
     live: str | None
     void: list[str] = []
@@ -191,10 +191,10 @@ class Progress(Said):
     """What was changed during the run."""
 
 
-M = TypeVar("M", bound=Said)
+M = TypeVar("M", bound=ControlMessage)
 
 
-def heard(kind: type[M], payload: bytes | str) -> dict[str, Any]:
+def parse_message(kind: type[M], payload: bytes | str) -> dict[str, Any]:
     """Return what a message says.
 
     Raises:

@@ -20,20 +20,20 @@ from noack.config.scenario import MOST_CHANGES
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import Secret, cause_of, open_star
+from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
 _ASK_AGAIN_S = 5.0
 _POLL_S = 0.01
 """Twenty runs that wait at their start are a hundred processes that look so often."""
 
 
-def secret_of(ticket: Ticket) -> Secret:
+def secret_of(ticket: Ticket) -> SessionSecret:
     """Return the secret of a run's plane; the run's key cannot be found from it."""
     keyed = hashlib.blake2b(b"the control plane's password", key=ticket.key, digest_size=32)
-    return Secret(f"{ticket.run_id:016x}", keyed.hexdigest())
+    return SessionSecret(f"{ticket.run_id:016x}", keyed.hexdigest())
 
 
-class Plane:
+class ControlPlane:
     """One process's connection to the control plane of a run.
 
     Args:
@@ -51,7 +51,7 @@ class Plane:
         self.instance = secrets.token_hex(8)
         endpoint = ticket.endpoint
         try:
-            self.session = open_star(endpoint, secret_of(ticket), listen=listen)
+            self.session = open_session(endpoint, secret_of(ticket), listen=listen)
         except zenoh.ZError as error:
             verb = "listen on" if listen else "reach the run's coordinator at"
             raise NoAnswerError(f"cannot {verb} {endpoint}: {cause_of(error)}") from None
@@ -111,7 +111,7 @@ class Plane:
         """Ask every process of the run to end."""
         self.session.put(self.key("stop"), reason, priority=Priority.REAL_TIME)
 
-    def say_kept(self, role: str, content: object) -> None:
+    def acknowledge_rows(self, role: str, content: object) -> None:
         """Tell a process what of it is on disk."""
         self.session.put(
             self.key("kept", role),

@@ -17,17 +17,17 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, ValidationError
 
 from noack.config.scenario import Scenario
-from noack.config.section import Section, Seed
+from noack.config.section import ScenarioSection, Seed
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.wire_format import KEY_BYTES
-from noack.runtime.lock_file import held
+from noack.runtime.lock_file import lock_file
 from noack.runtime.private_folder import open_private, private_folder, require_name
 
 DEFAULT_SESSION = "default"
 
 
-class _Fields(Section):
+class _Fields(ScenarioSection):
     """A ticket as JSON."""
 
     run_id: Seed
@@ -108,7 +108,7 @@ def published(ticket: Ticket, session: str) -> Iterator[Path]:
     path = ticket_path(session)
     with ExitStack() as stack:
         try:
-            stack.enter_context(held("", session, ticket.fields()))
+            stack.enter_context(lock_file("", session, ticket.fields()))
         except FileExistsError:
             raise CallerError(
                 f"session {session!r}: another run is open in it; choose --session NAME"

@@ -19,7 +19,7 @@ from noack.runtime.private_folder import PrivateFolder, open_private
 _SUFFIX = ".json"
 
 
-class Held(NamedTuple):
+class LockFile(NamedTuple):
     """A file whose owner runs."""
 
     path: Path
@@ -28,7 +28,7 @@ class Held(NamedTuple):
 
 
 @contextmanager
-def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
+def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
     """Keep a file while the context lasts.
 
     Args:
@@ -56,7 +56,7 @@ def held(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
                 folder.remove_same(name, os.fstat(file.fileno()))
 
 
-def running(kind: str) -> list[Held]:
+def live_lock_files(kind: str) -> list[LockFile]:
     """Return the files of a kind whose owner runs, by name.
 
     Raises:
@@ -85,7 +85,7 @@ def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
                 raise
 
 
-def _alive(folder: PrivateFolder, name: str) -> Held | None:
+def _alive(folder: PrivateFolder, name: str) -> LockFile | None:
     """Return a file if its owner runs; the file of one that does not is removed."""
     try:
         descriptor = folder.open(name)
@@ -96,6 +96,6 @@ def _alive(folder: PrivateFolder, name: str) -> Held | None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            return Held(folder.path / name, status.st_mtime_ns, file.read())
+            return LockFile(folder.path / name, status.st_mtime_ns, file.read())
         folder.remove_same(name, status)
     return None

@@ -10,9 +10,9 @@ from contextlib import ExitStack
 
 from noack.core.errors import ExitStatus, NoackError, NoAnswerError
 from noack.runtime.command_line import Parser, failed
-from noack.runtime.control_plane import Plane
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
-from noack.runtime.process_life import HORIZON, Node, lifeline_cut
+from noack.runtime.process_life import HORIZON, RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
 _TICKET_TIMEOUT_S = 24 * 3600.0
@@ -23,7 +23,7 @@ TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 
 def run_process(
     role: str,
-    body: Callable[[Node], None],
+    body: Callable[[RunProcess], None],
     session: str = DEFAULT_SESSION,
     *,
     as_json: bool = False,
@@ -64,7 +64,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
 
-def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | None) -> ExitStatus:
+def main(
+    role: str, body: Callable[[RunProcess], None], arguments: Sequence[str] | None
+) -> ExitStatus:
     """Command line of one process that does nothing but join a run."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = Parser(
@@ -79,10 +81,12 @@ def main(role: str, body: Callable[[Node], None], arguments: Sequence[str] | Non
     return join_run(role, body, options)
 
 
-def join_run(role: str, body: Callable[[Node], None], options: argparse.Namespace) -> ExitStatus:
+def join_run(
+    role: str, body: Callable[[RunProcess], None], options: argparse.Namespace
+) -> ExitStatus:
     """Join a run with the options of :func:`add_options`."""
 
-    def body_and_report(node: Node) -> None:
+    def body_and_report(node: RunProcess) -> None:
         body(node)
         if options.json:
             print(json.dumps(node.report, indent=2))
@@ -106,7 +110,7 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
     return ticket
 
 
-def _admitted(role: str, ticket: Ticket, signals: Signals) -> Node:
+def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
     """Connect to a run and ask to be let in.
 
     A launched process tries again as long as its launcher waits. On a busy machine a connection may
@@ -119,9 +123,9 @@ def _admitted(role: str, ticket: Ticket, signals: Signals) -> Node:
     while True:
         try:
             with ExitStack() as stack:
-                plane = stack.enter_context(Plane(ticket, role))
-                node = Node(role, ticket, plane, signals)
-                node.knock()
+                plane = stack.enter_context(ControlPlane(ticket, role))
+                node = RunProcess(role, ticket, plane, signals)
+                node.request_admission()
                 stack.pop_all()
                 return node
         except NoAnswerError:

@@ -16,8 +16,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, cast
 
-from noack.config.parameter_changes import Change, Changeable
-from noack.config.resolution import Loop, loop_of, tables_of
+from noack.config.parameter_changes import ParameterChange, ReconfigurableMachine
+from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.core.clock import NS_PER_S, RunClock
 from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
@@ -26,16 +26,24 @@ from noack.protocol.topology import (
     ACKNOWLEDGED_BY,
     ACKNOWLEDGES_TO,
     CHANGEABLE,
-    LEGS,
     LOOP_ROLES,
     RECORDER,
+    ROUTES,
     SENDER,
 )
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message
 from noack.runtime.address import Address
 from noack.runtime.command_line import print_to_stderr
-from noack.runtime.control_messages import Admission, Announced, Begin, Kept, Missing, Said, heard
-from noack.runtime.control_plane import Plane
+from noack.runtime.control_messages import (
+    Admission,
+    ChangeAnnouncement,
+    ControlMessage,
+    MissingRows,
+    PersistedAck,
+    RunStart,
+    parse_message,
+)
+from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.real_time_loop import Channel, run_loop
 from noack.runtime.real_time_settings import realtime
@@ -78,7 +86,7 @@ class ReportingChannel(Channel[T], Protocol[T]):
 OpenChannel = Callable[[socket.socket, Mapping[str, Address]], ReportingChannel[T]]
 
 
-class Node:
+class RunProcess:
     """A process of the loop that has been admitted to a run.
 
     Args:
@@ -88,11 +96,11 @@ class Node:
         signals: the signals it has received.
     """
 
-    def __init__(self, role: str, ticket: Ticket, plane: Plane, signals: Signals) -> None:
+    def __init__(self, role: str, ticket: Ticket, plane: ControlPlane, signals: Signals) -> None:
         self.role = role
         self.ticket = ticket
         self.scenario = ticket.scenario
-        self.loop: Loop = loop_of(ticket.scenario)
+        self.loop: LoopMatrices = loop_of(ticket.scenario)
         self.plane = plane
         self._signals = signals
         self._ended: str | None = None
@@ -108,7 +116,7 @@ class Node:
         """What became of the one whose place it takes, if it takes one's."""
         self.report: dict[str, Any] = {}
 
-    def knock(self) -> None:
+    def request_admission(self) -> None:
         """Ask to be let in; learn whether the run has begun, and another has gone before.
 
         Raises:
@@ -116,7 +124,7 @@ class Node:
             PeerError: this process is not let in.
         """
         admission = self._ask("admit", {}, Admission, _ADMISSION_TIMEOUT_S)
-        self.start = Start(admission["incarnation"], admission["from_ns"])
+        self.start = Start(admission["generation"], admission["from_ns"])
         if self.start.again:
             self._place, self.after = admission["address"], admission["after"]
             self._admitted_ns = admission["admitted_ns"]
@@ -130,7 +138,7 @@ class Node:
         Raises:
             PeerError: the run never started.
         """
-        begin = self._ask("join", {"address": address}, Begin, _JOIN_TIMEOUT_S)
+        begin = self._ask("join", {"address": address}, RunStart, _JOIN_TIMEOUT_S)
         self.clock = RunClock(begin["epoch_ns"], self.scenario.speed)
         addresses: Mapping[str, Address] = begin["addresses"]
         self._changes = list(begin.get("changes", ()))
@@ -141,7 +149,9 @@ class Node:
             print_to_stderr(f"noack {self.role}: {verb}")
         return addresses
 
-    def _ask(self, what: str, more: dict[str, Any], answer: type[Said], timeout_s: float) -> Any:
+    def _ask(
+        self, what: str, more: dict[str, Any], answer: type[ControlMessage], timeout_s: float
+    ) -> Any:
         """Ask the coordinator as this process."""
         question = {"pid": os.getpid(), "instance": self.plane.instance, **more}
         self._joining = True
@@ -154,9 +164,11 @@ class Node:
             raise PeerError(self._ended) if self._ended else error from None
         finally:
             self._joining = False
-        return heard(answer, said)
+        return parse_message(answer, said)
 
-    def changes(self, at_once: int | None = None) -> list[tuple[Change, Mapping[str, Any]]]:
+    def changes(
+        self, at_once: int | None = None
+    ) -> list[tuple[ParameterChange, Mapping[str, Any]]]:
         """Changes of the run's settings that have become known, each once and in their order.
 
         Args:
@@ -167,18 +179,18 @@ class Node:
         """
         while (said := self.plane.announced()) is not None:
             with contextlib.suppress(PeerError):  # whoever says so is not the coordinator
-                self._changes.append(heard(Announced, said))
-        found: list[tuple[Change, Mapping[str, Any]]] = []
+                self._changes.append(parse_message(ChangeAnnouncement, said))
+        found: list[tuple[ParameterChange, Mapping[str, Any]]] = []
         while self._changes and (at_once is None or len(found) < at_once):
             one = self._changes.pop(0)
             if one["number"] >= self._changes_heard:  # a late joiner hears of some twice
                 self._changes_heard = one["number"] + 1
-                found.append((Change(one["number"], one["t_ns"], one["settings"]), one))
+                found.append((ParameterChange(one["number"], one["t_ns"], one["settings"]), one))
         return found
 
     def run_messages(self, machine: Machine[Message]) -> None:
         """Run a machine that speaks the loop's wire format over its leg of the topology."""
-        leg = LEGS[self.role]
+        leg = ROUTES[self.role]
         decoder = Decoder(
             leg.receives,
             self.scenario.entries(leg.receives),
@@ -220,7 +232,7 @@ class Node:
         rows = tables_of(self.scenario)
         owned = {table: dtype for table, dtype in rows.items() if OWNER[table] == self.role}
         telemetry = TelemetryBuffer(
-            owned, self.plane.publish_telemetry, self.start.incarnation, self._kept_by_recorder
+            owned, self.plane.publish_telemetry, self.start.generation, self._kept_by_recorder
         )
         grace_ns = int(_GRACE_S * NS_PER_S * self.scenario.speed)
         settings, port = self.scenario.realtime, getattr(self.scenario.ports, self.role)
@@ -229,13 +241,15 @@ class Node:
         with (
             closing(bind(port, f"ports.{self.role}")) as endpoint,
             # Taken before the barrier: locking memory may take a tenth of a second.
-            realtime(settings.enabled, settings.fifo_priority, place) as granted,
+            realtime(settings.enabled, settings.fifo_priority, place) as applied,
         ):
             channel = open_channel(endpoint, self.join(endpoint.getsockname()))
             if self.after is not None:
                 telemetry.notice(Notice(self.start.from_ns, RESTART, f"started anew: {self.after}"))
             reached_ns: int | None = None
-            changeable = cast(Changeable[T], machine) if self.role in CHANGEABLE else None
+            changeable = (
+                cast(ReconfigurableMachine[T], machine) if self.role in CHANGEABLE else None
+            )
             try:
                 behind_ns = run_loop(
                     machine,
@@ -259,10 +273,10 @@ class Node:
                 self.report = {
                     "pid": os.getpid(),
                     "ended": self.ended,
-                    "realtime": granted,
+                    "realtime": applied,
                     "channel": channel.report(),
                     "rows": telemetry.totals(),
-                    "incarnation": self.start.incarnation,
+                    "generation": self.start.generation,
                     "instance": self.plane.instance,
                     "reached_ns": reached_ns,
                 }
@@ -298,7 +312,9 @@ class Node:
                 self._ended = "the run's coordinator is gone"
         return self._ended
 
-    def _announce(self, machine: Changeable[Any] | None, now_ns: int) -> Sequence[Record | Notice]:
+    def _announce(
+        self, machine: ReconfigurableMachine[Any] | None, now_ns: int
+    ) -> Sequence[Record | Notice]:
         """Tell a machine of changes; during the loop a few at a time, as each takes a while."""
         if machine is None:
             return ()
@@ -317,11 +333,11 @@ class Node:
         if said is None:
             return {}
         try:
-            kept = heard(Kept, said)
+            kept = parse_message(PersistedAck, said)
         except PeerError:  # whoever says so is not the recorder
             return {}
         rows: Mapping[str, Sequence[tuple[int, int]]] = kept["rows"]
-        return rows if kept["incarnation"] == self.start.incarnation else {}
+        return rows if kept["generation"] == self.start.generation else {}
 
     def _hand_over(self, telemetry: TelemetryBuffer) -> None:
         reachable = self.ended != LAUNCHER_GONE and not self.ended.startswith(RECORDER)
@@ -329,7 +345,7 @@ class Node:
         try:
             for _ in range(3 if reachable else 0):
                 said = self.plane.request("goodbye", self.report, timeout_s=_GOODBYE_TIMEOUT_S)
-                missing = heard(Missing, said)["rows"]
+                missing = parse_message(MissingRows, said)["rows"]
                 if not missing:
                     return
                 telemetry.resend(missing, self.plane.publish_telemetry_blocking)
@@ -339,9 +355,9 @@ class Node:
         writer = SpoolWriter(Path(self.ticket.run_dir) / "spool", self.plane.instance)
 
         def spool(table: str, header: bytes, payload: bytes) -> None:
-            incarnation, first = first_row(header)
+            generation, first = first_row(header)
             if table == NOTICES:
-                table, first = notices_of(self.role), notice_number(incarnation, first)
+                table, first = notices_of(self.role), notice_number(generation, first)
             writer.append(table, first, payload)
 
         telemetry.resend({table: [(0, n)] for table, n in telemetry.totals().items()}, spool)

@@ -48,7 +48,7 @@ class Channel(Protocol[T]):
         ...
 
 
-class Sink(Protocol):
+class RecordSink(Protocol):
     """Where a machine's records and notices go."""
 
     def append(self, record: Record) -> None:
@@ -68,7 +68,7 @@ def run_loop(
     machine: Machine[T],
     channel: Channel[T],
     clock: RunClock,
-    telemetry: Sink,
+    telemetry: RecordSink,
     *,
     end_ns: int | None,
     stop: Callable[[], bool],

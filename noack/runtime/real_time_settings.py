@@ -38,7 +38,7 @@ def realtime(
         For each setting ``"granted"``, or ``"refused: why"``, or ``"not asked for"``.
     """
     settings = ("memory_lock", "timer_slack", "sched_fifo", "affinity", "cpu_dma_latency")
-    granted = dict.fromkeys(settings, "not asked for")
+    applied = dict.fromkeys(settings, "not asked for")
     with contextlib.ExitStack() as undo:
         gc.collect()
         gc.freeze()
@@ -47,13 +47,13 @@ def realtime(
         if enabled:
             # Locking memory takes a tenth of a second: at real-time priority it would hold up
             # whatever else runs on this core.
-            granted["memory_lock"] = _attempt(_memory_lock)
-            granted["timer_slack"] = _attempt(_timer_slack)
-            granted["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
-            if place is not None and granted["sched_fifo"] == "granted":
-                granted["affinity"] = _attempt(lambda: _affinity(place, undo))
-            granted["cpu_dma_latency"] = _attempt(lambda: _cpu_dma_latency(undo))
-        yield granted
+            applied["memory_lock"] = _attempt(_memory_lock)
+            applied["timer_slack"] = _attempt(_timer_slack)
+            applied["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
+            if place is not None and applied["sched_fifo"] == "applied":
+                applied["affinity"] = _attempt(lambda: _affinity(place, undo))
+            applied["cpu_dma_latency"] = _attempt(lambda: _cpu_dma_latency(undo))
+        yield applied
 
 
 def _attempt(take: object) -> str:
@@ -62,7 +62,7 @@ def _attempt(take: object) -> str:
     except (OSError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         return f"refused: {reason}"
-    return "granted"
+    return "applied"
 
 
 def _fifo(priority: int, undo: contextlib.ExitStack) -> None:

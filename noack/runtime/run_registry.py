@@ -16,10 +16,10 @@ from pydantic import TypeAdapter, ValidationError
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.runtime import lock_file
-from noack.runtime.control_messages import Answer, heard
+from noack.runtime.control_messages import ChangeReply, parse_message
 from noack.runtime.control_plane import secret_of
 from noack.runtime.join_ticket import Ticket
-from noack.runtime.zenoh_session import Secret, answer_to, cause_of, open_star
+from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session
 
 _KIND = "runs"
 _ANSWER_S = 10.0
@@ -53,7 +53,7 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
     secret = secret_of(ticket)
     run_id = f"{ticket.run_id:016x}"
     run = OpenRun(run_id, ticket.run_dir, session, ticket.endpoint, secret.user, secret.password)
-    with lock_file.held(_KIND, run_id, run._asdict()) as path:
+    with lock_file.lock_file(_KIND, run_id, run._asdict()) as path:
         yield path
 
 
@@ -67,7 +67,9 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
     Raises:
         CallerError: there is none.
     """
-    newest_first = sorted(lock_file.running(_KIND), key=lambda file: file.written_ns, reverse=True)
+    newest_first = sorted(
+        lock_file.live_lock_files(_KIND), key=lambda file: file.written_ns, reverse=True
+    )
     found = [_read(file) for file in newest_first]
     fitting = [
         run
@@ -91,9 +93,9 @@ def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
         CallerError: what was asked for is wrong; one line per mistake.
         PeerError: the run does not answer.
     """
-    secret = Secret(run.user, run.password)
+    secret = SessionSecret(run.user, run.password)
     try:
-        star = open_star(run.endpoint, secret, listen=False)
+        star = open_session(run.endpoint, secret, listen=False)
     except zenoh.ZError as error:
         raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
     try:
@@ -103,10 +105,10 @@ def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
         star.close()  # type: ignore[no-untyped-call]
     if answer is None:
         raise PeerError(f"{run.run_dir}: the run does not answer")
-    return heard(Answer, answer)
+    return parse_message(ChangeReply, answer)
 
 
-def _read(file: lock_file.Held) -> OpenRun:
+def _read(file: lock_file.LockFile) -> OpenRun:
     try:
         return _OPEN_RUN.validate_json(file.content, strict=True)
     except ValidationError as error:

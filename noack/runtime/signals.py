@@ -22,10 +22,10 @@ class Signals:
     @contextmanager
     def handled(self) -> Iterator["Signals"]:
         """Handle the signals while the context lasts; nohup is respected."""
-        heard = set(_ENDING)
+        parse_message = set(_ENDING)
         if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
-            heard.remove(signal.SIGHUP)
-        before = {number: signal.signal(number, self._note) for number in heard}
+            parse_message.remove(signal.SIGHUP)
+        before = {number: signal.signal(number, self._note) for number in parse_message}
         try:
             yield self
         finally:

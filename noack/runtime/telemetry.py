@@ -13,8 +13,8 @@ from itertools import islice
 
 import numpy as np
 
-from noack.protocol.machine_interface import INCARNATION, Notice, Record
-from noack.runtime.control_messages import BatchHeader, heard
+from noack.protocol.machine_interface import GENERATION, Notice, Record
+from noack.runtime.control_messages import BatchHeader, parse_message
 
 _BATCH_ROWS = 256
 _KEPT_BYTES = 256 * 1024 * 1024
@@ -33,7 +33,7 @@ Ranges = Sequence[tuple[int, int]]
 """Half-open ranges of row numbers."""
 
 
-class Received:
+class ReceivedRows:
     """Row numbers that have arrived, in any order, as few ranges as possible."""
 
     def __init__(self) -> None:
@@ -67,7 +67,7 @@ class TelemetryBuffer:
     Args:
         tables: row type of each table that the process fills.
         publish: takes a full batch; must not block.
-        incarnation: of the process.
+        generation: of the process.
         confirmed: asked for rows that are on disk.
     """
 
@@ -75,11 +75,11 @@ class TelemetryBuffer:
         self,
         tables: Mapping[str, np.dtype[np.void]],
         publish: Publish,
-        incarnation: int = 0,
+        generation: int = 0,
         confirmed: Callable[[], Mapping[str, Ranges]] = dict,
     ) -> None:
         self._publish = publish
-        self._incarnation = incarnation
+        self._incarnation = generation
         self._confirmed = confirmed
         self._rows = {table: np.zeros(_BATCH_ROWS, dtype) for table, dtype in tables.items()}
         self._filled = dict.fromkeys(tables, 0)
@@ -165,7 +165,7 @@ class TelemetryBuffer:
         self._kept_bytes = sum(len(batch[3]) for batch in kept)
 
     def _header(self, first: int, rows: int) -> bytes:
-        header = {"first": first, "rows": rows, "incarnation": self._incarnation}
+        header = {"first": first, "rows": rows, "generation": self._incarnation}
         return json.dumps(header).encode()
 
 
@@ -175,13 +175,13 @@ def first_row(header: bytes) -> tuple[int, int]:
     Raises:
         PeerError: it is no header of a batch.
     """
-    found = heard(BatchHeader, header)
-    return found.get("incarnation", 0), found["first"]
+    found = parse_message(BatchHeader, header)
+    return found.get("generation", 0), found["first"]
 
 
-def notice_number(incarnation: int, first: int) -> int:
-    """Number under which a process's notice is spooled; it says of which incarnation it is."""
-    return incarnation * INCARNATION + first
+def notice_number(generation: int, first: int) -> int:
+    """Number under which a process's notice is spooled; it says of which generation it is."""
+    return generation * GENERATION + first
 
 
 def notices_of(role: str) -> str:

@@ -25,14 +25,14 @@ _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor"
 """Who finds that many before him comes again soon."""
 
 
-class Secret(NamedTuple):
+class SessionSecret(NamedTuple):
     """What opens a star; neither part holds a colon or a line's end."""
 
     user: str
     password: str
 
 
-def open_star(endpoint: str, secret: Secret, *, listen: bool) -> zenoh.Session:
+def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
     """Open a session in a star.
 
     Args:
@@ -45,14 +45,14 @@ def open_star(endpoint: str, secret: Secret, *, listen: bool) -> zenoh.Session:
     """
     if not listen:
         shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret._asdict().items()}
-        return zenoh.open(star_config(endpoint, listen=False, more=shown))
+        return zenoh.open(session_config(endpoint, listen=False, more=shown))
     with _dictionary(secret) as path:
         more = {"transport/auth/usrpwd/dictionary_file": path}
-        return zenoh.open(star_config(endpoint, listen=True, more=more))
+        return zenoh.open(session_config(endpoint, listen=True, more=more))
 
 
 @contextmanager
-def _dictionary(secret: Secret) -> Iterator[str]:
+def _dictionary(secret: SessionSecret) -> Iterator[str]:
     """A file for zenoh, which reads passwords from nothing else, that never lies on a disk."""
     reading, writing = os.pipe()
     try:
@@ -63,7 +63,7 @@ def _dictionary(secret: Secret) -> Iterator[str]:
         os.close(reading)
 
 
-def star_config(
+def session_config(
     endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
 ) -> zenoh.Config:
     """Return the configuration of a star's centre (``listen``), or of one who connects to it.

@@ -10,25 +10,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import Loop, loop_of
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import SteadyState, steady_state
 from noack.config.triggers import (
-    Absolute,
+    AbsoluteSettings,
     AnyTrigger,
-    Deadline,
-    Decaying,
-    Dwell,
-    Mixed,
-    Relative,
-    SelfTriggered,
+    DeadlineSettings,
+    DecayingSettings,
+    DwellSettings,
+    MixedSettings,
+    RelativeSettings,
+    SelfTriggeredSettings,
 )
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.certificate import Conditions, Constants
+from noack.theory.certificate import Constants, NetworkConditions
 
 
-class Verdict(StrEnum):
+class AssumptionStatus(StrEnum):
     """What is known of an assumption."""
 
     HOLDS = "holds"
@@ -47,7 +47,7 @@ class Assumption(NamedTuple):
     what: str
     source: str
     """Where the paper makes it."""
-    verdict: Verdict
+    verdict: AssumptionStatus
     why: str
 
 
@@ -66,11 +66,11 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     ]
 
 
-def _not_linear(loop: Loop, resolved: Scenario) -> list[Assumption]:
+def _not_linear(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     return [
         Assumption(
-            "the plant is ẋ = Ax + Bu", "eq:plant", Verdict.VIOLATED,
+            "the plant is ẋ = Ax + Bu", "eq:plant", AssumptionStatus.VIOLATED,
             f'it is of kind "{resolved.plant.system.kind}": the theorems and the certificates say '
             "nothing of it",
         ),
@@ -87,13 +87,13 @@ def _disturbed(resolved: Scenario) -> list[Assumption]:
     what = ", ".join(f"{one.kind} at the {one.at}" for one in resolved.plant.disturbances)
     return [
         Assumption(
-            "nothing disturbs the plant", "eq:plant", Verdict.VIOLATED,
+            "nothing disturbs the plant", "eq:plant", AssumptionStatus.VIOLATED,
             f"{what}: the theorems and the certificates say nothing of it",
         )
     ]  # fmt: skip
 
 
-def _estimated(loop: Loop, resolved: Scenario) -> list[Assumption]:
+def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     """What an observer, or noise, makes of "the sensor measures x"."""
     if resolved.knows_state:
         return []
@@ -106,7 +106,7 @@ def _estimated(loop: Loop, resolved: Scenario) -> list[Assumption]:
         + ("entry" if resolved.outputs == 1 else "entries")
     )
     measured = Assumption(
-        "the sensor measures x", "Section II", Verdict.VIOLATED,
+        "the sensor measures x", "Section II", AssumptionStatus.VIOLATED,
         f"it knows x {how}: the theorems and the certificates say nothing of that",
     )  # fmt: skip
     if resolved.observer is None:
@@ -128,7 +128,7 @@ def _estimated(loop: Loop, resolved: Scenario) -> list[Assumption]:
     return [measured, decays, *above]
 
 
-def _above_noise(loop: Loop, resolved: Scenario, found: SteadyState) -> list[Assumption]:
+def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> list[Assumption]:
     """Whether the trigger's least threshold is above what errors of the estimate make of e_s.
 
     That is the difference of two errors, at the last event and now: √2 times their RMS if nothing
@@ -152,28 +152,28 @@ def _above_noise(loop: Loop, resolved: Scenario, found: SteadyState) -> list[Ass
 def least_threshold(trigger: AnyTrigger) -> float | None:
     """Below what a trigger's threshold of ‖e_s‖_W never falls; None of one that has none."""
     match trigger:
-        case Decaying() | SelfTriggered():
+        case DecayingSettings() | SelfTriggeredSettings():
             return trigger.floor
-        case Absolute():
+        case AbsoluteSettings():
             return trigger.delta
-        case Relative():
+        case RelativeSettings():
             return 0.0
-        case Mixed():
+        case MixedSettings():
             return trigger.epsilon
-        case Deadline() | Dwell():
+        case DeadlineSettings() | DwellSettings():
             return least_threshold(trigger.rule)
         case _:
             return None
 
 
-def _trigger(loop: Loop, resolved: Scenario) -> list[Assumption]:
+def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     if resolved.is_decaying:
         rate = _decay_rate(loop, resolved.decaying.alpha_per_s)
         return [rate] if resolved.is_linear else []
     policy = resolved.trigger.policy
     return [
         Assumption(
-            "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", Verdict.VIOLATED,
+            "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", AssumptionStatus.VIOLATED,
             f'it is "{policy}": the paper\'s theorems and the certificates say nothing of it',
         )
     ]  # fmt: skip
@@ -185,17 +185,17 @@ def _protocol(resolved: Scenario) -> list[Assumption]:
     return [
         Assumption(
             "the sensor resets x_s at every event; nothing is acknowledged", "Section II",
-            Verdict.VIOLATED,
+            AssumptionStatus.VIOLATED,
             'protocol = "ack": the theorems and the certificates say nothing of it',
         )
     ]  # fmt: skip
 
 
-def _verdict(holds: bool) -> Verdict:
-    return Verdict.HOLDS if holds else Verdict.VIOLATED
+def _verdict(holds: bool) -> AssumptionStatus:
+    return AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
 
 
-def _closed_loop(loop: Loop) -> Assumption:
+def _closed_loop(loop: LoopMatrices) -> Assumption:
     true = spectral_abscissa(loop.A + loop.B @ loop.K)
     nominal = spectral_abscissa(loop.A_model + loop.B_model @ loop.K)
     return Assumption(
@@ -207,7 +207,7 @@ def _closed_loop(loop: Loop) -> Assumption:
     )
 
 
-def _other_sign(loop: Loop) -> str:
+def _other_sign(loop: LoopMatrices) -> str:
     """A hint where K is the gain of u = −Kx, as most programs give it."""
     given, other = (
         spectral_abscissa(loop.A_model + sign * loop.B_model @ loop.K) for sign in (1.0, -1.0)
@@ -215,7 +215,7 @@ def _other_sign(loop: Loop) -> str:
     return "; the loop's u is +Kx, and −K would stabilise it" if other < 0 <= given else ""
 
 
-def _decay_rate(loop: Loop, alpha_per_s: float) -> Assumption:
+def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
     how = f"decays at any rate below {rate:.3g} /s" if rate > 0 else "does not decay"
     return Assumption(
@@ -241,7 +241,7 @@ def _unstable_and_distinct(A: Matrix) -> Assumption:
     return Assumption(
         "A is unstable with distinct eigenvalues",
         "Proposition 1, used by Theorem 1",
-        Verdict.HOLDS if holds else Verdict.NOT_NEEDED,
+        AssumptionStatus.HOLDS if holds else AssumptionStatus.NOT_NEEDED,
         why if holds else f"{why}; the paper's proof uses it, no bound computed here does",
     )
 
@@ -267,7 +267,7 @@ def _continuous_time(resolved: Scenario) -> Assumption:
     return Assumption(
         "continuous trigger; network and input without delay",
         "Section II",
-        Verdict.IDEALISED,
+        AssumptionStatus.IDEALISED,
         "not met by any sampled loop; certificates allow for the difference. Here: sampled every "
         f"{period_ms:g} ms, input held for {control_ms:g} ms" + _network_delay(resolved),
     )
@@ -285,7 +285,7 @@ def _network_delay(resolved: Scenario) -> str:
 
 def certificate_assumptions(
     resolved: Scenario,
-    conditions: Conditions,
+    conditions: NetworkConditions,
     decay: dict[str, float],
     held: bool,
     constants: Constants | None,
@@ -306,7 +306,7 @@ def certificate_assumptions(
     if held:
         why = "a hold does not decay at all: what is certified is bounded, not decaying"
         models = Assumption(
-            "α is below the decay rate of the models", "(I1)", Verdict.VIOLATED, why
+            "α is below the decay rate of the models", "(I1)", AssumptionStatus.VIOLATED, why
         )
     else:
         models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
@@ -321,17 +321,19 @@ def certificate_assumptions(
     ]
     enforced = "the network enforces it" if network.enforce_mansd else "enforcement is switched off"
     checks = [enforced, *["every run is checked for it"] * 4]
-    verdicts = [Verdict.HOLDS if network.enforce_mansd else Verdict.PRESUPPOSED]
-    verdicts += [Verdict.PRESUPPOSED] * 4
+    verdicts = [AssumptionStatus.HOLDS if network.enforce_mansd else AssumptionStatus.PRESUPPOSED]
+    verdicts += [AssumptionStatus.PRESUPPOSED] * 4
     gain = (
         Assumption(
             "the errors reproduce themselves with a gain below 1",
             "certificate",
-            Verdict.HOLDS,
+            AssumptionStatus.HOLDS,
             f"the gain is {constants.loop_gain:.3g}",
         )
         if constants is not None
-        else Assumption("there is a certificate", "certificate", Verdict.VIOLATED, void or "")
+        else Assumption(
+            "there is a certificate", "certificate", AssumptionStatus.VIOLATED, void or ""
+        )
     )
     return [
         models,
@@ -344,7 +346,7 @@ def certificate_assumptions(
         Assumption(
             "A is unstable with distinct eigenvalues",
             "Proposition 1",
-            Verdict.NOT_NEEDED,
+            AssumptionStatus.NOT_NEEDED,
             "the bounds rest on (I1), which holds for every plant",
         ),
     ]
@@ -355,7 +357,7 @@ def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assu
     why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
     if not holds:
         why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
-    verdict = Verdict.HOLDS if holds else Verdict.VIOLATED
+    verdict = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
     return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector
 from noack.theory.contraction import logarithmic_norm
-from noack.theory.enclosure import NotDecayingError, Response, factors, response
+from noack.theory.enclosure import NotDecayingError, ResponseBounds, factors, response
 from noack.theory.gains import Coefficients, ErrorGains, Growth, Output
 
 
@@ -132,7 +132,7 @@ class BoxGains:
         return np.eye(len(self.A_model))[:, self._rows]
 
     @cached_property
-    def _responses(self) -> tuple[Response, Response, list[Response]]:
+    def _responses(self) -> tuple[ResponseBounds, ResponseBounds, list[ResponseBounds]]:
         """Of the model's closed loop to x(0), to p, and to each w_i."""
         return (
             response(self._closed_loop, self.start),

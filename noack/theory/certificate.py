@@ -29,7 +29,7 @@ _PICARD_ROUNDS = 8
 _COARSE, _FINE = 64, 256
 
 
-class Conditions(NamedTuple):
+class NetworkConditions(NamedTuple):
     """What a certificate presupposes of network and schedule, in the plant's time."""
 
     dropouts: int
@@ -77,7 +77,7 @@ class VoidError(ArithmeticError):
     """There is no certificate; the message says why."""
 
 
-class Plant(Protocol):
+class PlantConstants(Protocol):
     """A plant, or all plants of an uncertainty box; see :mod:`noack.theory.gains`."""
 
     @property
@@ -125,8 +125,8 @@ _CLEAN = Background()
 
 def solve(
     error: ErrorGains,
-    plant: Plant,
-    conditions: Conditions,
+    plant: PlantConstants,
+    conditions: NetworkConditions,
     level: Level,
     background: Background = _CLEAN,
 ) -> Constants:
@@ -157,8 +157,8 @@ class _Step:
     def __init__(
         self,
         error: ErrorGains,
-        plant: Plant,
-        conditions: Conditions,
+        plant: PlantConstants,
+        conditions: NetworkConditions,
         level: Level,
         background: Background,
     ) -> None:
@@ -249,7 +249,7 @@ class _Step:
 
 
 def first_passage_s(
-    plant: Plant, level: float, mismatch: float, input_error: float, own: float
+    plant: PlantConstants, level: float, mismatch: float, input_error: float, own: float
 ) -> float:
     """A time before which ‖e_s‖_W, from 0, cannot reach ``level``.
 
@@ -287,7 +287,9 @@ def first_passage_s(
             known_s, window_s = window_s, 2 * window_s
 
 
-def _first_window_s(plant: Plant, level: float, mismatch: float, input_error: float) -> float:
+def _first_window_s(
+    plant: PlantConstants, level: float, mismatch: float, input_error: float
+) -> float:
     """Where to look: twice the time at the speed of the start, but not nearer than can matter."""
     start = plant.growth(_SHORTEST_S, 1)
     speed = start.mismatch.sup_on_grid() * mismatch + start.input_error.sup_on_grid() * input_error

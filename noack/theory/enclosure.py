@@ -52,7 +52,7 @@ class NotDecayingError(ArithmeticError):
     """The generator is not Hurwitz: over all times, the bounds would be infinite."""
 
 
-class Kernel(NamedTuple):
+class KernelBounds(NamedTuple):
     """Upper bounds of k(τ) = ‖C e^{Gτ} D‖ (spectral norm) on a grid of cells, and beyond it."""
 
     edges_s: NDArray[np.float64]
@@ -93,7 +93,7 @@ class Kernel(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Response:
+class ResponseBounds:
     """e^{Gτ} D at the nodes of a grid; :meth:`through` looks at it through an output matrix C."""
 
     generator: Matrix
@@ -111,7 +111,7 @@ class Response:
     def _bends(self) -> "_Bends":
         return _bends(self.generator, self.states[:-1], np.diff(self.edges_s), self.decay)
 
-    def through(self, C: Matrix) -> Kernel:
+    def through(self, C: Matrix) -> KernelBounds:
         """Bounds of ‖C e^{Gτ} D‖, with C of shape (q, n)."""
         steps_s = np.diff(self.edges_s)
         norms = norm_bounds(C, self.states)
@@ -122,7 +122,7 @@ class Response:
         if self.endless and self.decay is not None:
             rate = self.decay.rate_per_s
             beyond = float(self.decay.bounds(C, self.states[-1:])[0]) * _ROUNDING
-        return Kernel(
+        return KernelBounds(
             self.edges_s,
             (ends + steps_s**2 / 8 * bend) * _ROUNDING,
             (steps_s * middle + steps_s**3 / 12 * bend) * _ROUNDING,
@@ -189,7 +189,7 @@ def _bends(generator: Matrix, nodes: Stack, steps_s: Stack, decay: Decay | None)
     )
 
 
-def response(generator: Matrix, D: Matrix) -> Response:
+def response(generator: Matrix, D: Matrix) -> ResponseBounds:
     """Follow e^{Gτ} D over all times, shapes (n, n) and (n, r).
 
     Raises:
@@ -223,7 +223,7 @@ def response(generator: Matrix, D: Matrix) -> Response:
         if 2 * step_s <= usual_s or _straight(generator, state, 2 * step_s, decay):
             step_s *= 2
     states = np.concatenate([*parts, state[None]])
-    return Response(generator, np.concatenate(edges), states, decay, endless=True)
+    return ResponseBounds(generator, np.concatenate(edges), states, decay, endless=True)
 
 
 def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> bool:
@@ -234,10 +234,10 @@ def _straight(generator: Matrix, state: Matrix, step_s: float, decay: Decay) -> 
     return bool(step_s**2 / 8 * bend[0] <= _SAG * size)
 
 
-def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64) -> Response:
+def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64) -> ResponseBounds:
     """Follow e^{Gτ} D over 0 ≤ τ ≤ ``until_s`` on a grid of ``cells`` equal cells."""
     step_s = until_s / cells
-    return Response(
+    return ResponseBounds(
         generator,
         np.linspace(0.0, until_s, cells + 1),
         _propagate(generator, D, step_s, cells),
@@ -246,10 +246,10 @@ def response_until(generator: Matrix, D: Matrix, until_s: float, cells: int = 64
     )
 
 
-def constant_kernel(value: float) -> Kernel:
+def constant_kernel(value: float) -> KernelBounds:
     """The kernel of a response that neither decays nor grows."""
     edges_s = np.array([0.0, 1.0])
-    return Kernel(edges_s, np.full(1, value), np.full(1, value), value, math.inf, 0.0)
+    return KernelBounds(edges_s, np.full(1, value), np.full(1, value), value, math.inf, 0.0)
 
 
 def factors(matrix: Matrix) -> tuple[Matrix, Matrix]:

@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix
 from noack.theory.enclosure import (
-    Kernel,
-    Response,
+    KernelBounds,
+    ResponseBounds,
     constant_kernel,
     factors,
     norm_bounds,
@@ -50,9 +50,9 @@ class Coefficients(NamedTuple):
 class Growth(NamedTuple):
     """How ‖e_s‖_W grows after a reset."""
 
-    mismatch: Kernel
+    mismatch: KernelBounds
     """‖W e^{Hτ} L_E‖, E = L_E R_E"""
-    input_error: Kernel
+    input_error: KernelBounds
     """‖W e^{Hτ} B U‖"""
 
 
@@ -94,7 +94,7 @@ class ErrorGains:
         return {Output.WEIGHTED: self.weight, Output.GAIN: R, Output.GAIN_RATE: R @ self.H}
 
     @cached_property
-    def kernels(self) -> Mapping[Output, Kernel]:
+    def kernels(self) -> Mapping[Output, KernelBounds]:
         """‖C e^{(H+αI)τ} W^{−1}‖ for every output.
 
         Raises:
@@ -214,7 +214,7 @@ class PlantGains:
         }
 
     @cached_property
-    def _forced(self) -> Response:
+    def _forced(self) -> ResponseBounds:
         return response(self.closed_loop, self.input_matrix)
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
@@ -238,7 +238,7 @@ class PlantGains:
         return self.error.growth(self.split_mismatch[0], self.input_matrix, until_s, cells)
 
 
-def error_gains(loop: Loop, alpha_per_s: float) -> ErrorGains:
+def error_gains(loop: LoopMatrices, alpha_per_s: float) -> ErrorGains:
     """The models' side of a resolved loop."""
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
     return ErrorGains(loop.H, loop.K, weight, alpha_per_s)

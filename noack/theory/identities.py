@@ -11,7 +11,7 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
-class MissedJumps:
+class ModelDifference:
     """Evaluates the right-hand side of (I1) along a run.
 
     Args:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.enclosure import NotDecayingError, response, response_until
 
@@ -47,7 +47,7 @@ class Theorem2(NamedTuple):
         return self.state_start * fast + self.state_forced * (np.exp(-alpha_per_s * t_s) - fast)
 
 
-def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theorem2 | None:
+def theorem_2(loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float) -> Theorem2 | None:
     """Theorem 2 for a given Δ, with the c and ᾱ that give the longest inter-event time.
 
     None if 0 < α < ᾱ cannot be met, or if the numbers leave floating point.
@@ -78,7 +78,7 @@ def theorem_2(loop: Loop, beta: float, alpha_per_s: float, delta: float) -> Theo
 
 
 def _theorem_2(
-    loop: Loop, beta: float, alpha_per_s: float, delta: float, alpha_bar_per_s: float
+    loop: LoopMatrices, beta: float, alpha_per_s: float, delta: float, alpha_bar_per_s: float
 ) -> Theorem2:
     closed, identity = loop.A + loop.B @ loop.K, np.eye(loop.n)
     c = response(closed + alpha_bar_per_s * identity, identity).through(identity).sup()

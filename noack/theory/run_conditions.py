@@ -4,10 +4,10 @@ import math
 
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.theory.certificate import Conditions
+from noack.theory.certificate import NetworkConditions
 
 
-def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
+def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
     """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
 
     In the plant's time, whatever the rates: an update is felt from the first step on whose newest
@@ -29,7 +29,7 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
         wait_ns = under_way_ns + tick_ns - 1
     delay_ns, first_ns = ((t_ns // step_ns + 1) * step_ns for t_ns in (wait_ns, phase_ns))
     start_ns = first_ns if under_way_ns == 0 else max(first_ns + late_ns, delay_ns)
-    return Conditions(
+    return NetworkConditions(
         dropouts=resolved.network.mansd,
         sampling_s=sample_ns / NS_PER_S,
         spacing_s=sample_ns / NS_PER_S,
@@ -39,11 +39,11 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> Conditions:
     )
 
 
-def allowed_conditions(resolved: Scenario) -> Conditions:
+def allowed_conditions(resolved: Scenario) -> NetworkConditions:
     """The conditions of a scenario's certificates: its own schedule, with its allowance."""
     return nominal_conditions(resolved, resolved.certificate.late_periods)
 
 
-def ideal_conditions(resolved: Scenario) -> Conditions:
+def ideal_conditions(resolved: Scenario) -> NetworkConditions:
     """The paper's: a trigger that watches always, an instant network, an input that is not held."""
-    return Conditions(dropouts=resolved.network.mansd)
+    return NetworkConditions(dropouts=resolved.network.mansd)

@@ -15,10 +15,10 @@ from noack.theory.assumptions import Assumption, below, certificate_assumptions
 from noack.theory.box import BoxGains
 from noack.theory.certificate import (
     Background,
-    Conditions,
     Constants,
     Level,
-    Plant,
+    NetworkConditions,
+    PlantConstants,
     VoidError,
     solve,
 )
@@ -33,15 +33,15 @@ _SHARES_OF_ALPHA = (0.8, 0.6, 0.4, 0.2)
 _RESOLUTION = 1e-3
 _TOO_LARGE = "the numbers on the way to it are too large or too small for floating point"
 
-Change = Callable[[Conditions, float], Conditions]
+Change = Callable[[NetworkConditions, float], NetworkConditions]
 """Sets a time of the conditions."""
 
-PlantAt = Callable[[ErrorGains, Matrix, float], Plant]
+PlantAt = Callable[[ErrorGains, Matrix, float], PlantConstants]
 """A plant, given the models' side, where x starts, and α."""
 
 
 @dataclass(frozen=True)
-class Certificate:
+class ScenarioCertificate:
     """What is guaranteed of a loop."""
 
     scope: str
@@ -51,7 +51,7 @@ class Certificate:
     floor: float
     weighted: bool
     """Whether the trigger's norm is weighted."""
-    conditions: Conditions
+    conditions: NetworkConditions
     assumptions: tuple[Assumption, ...]
     constants: Constants | None
     """None if there is no certificate."""
@@ -126,30 +126,32 @@ def _floor_from_s(beta: float, alpha_per_s: float, floor: float) -> float:
     return math.inf if floor == 0 else max(math.log(beta / floor) / alpha_per_s, 0.0)
 
 
-def certify(resolved: Scenario, conditions: Conditions, start_error: float = 0.0) -> Certificate:
-    """The certificate of a scenario's own plant; see :class:`Scope`."""
+def certify(
+    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
+) -> ScenarioCertificate:
+    """The certificate of a scenario's own plant; see :class:`CertificateScope`."""
     return own_plant(resolved, start_error).certificate(conditions)
 
 
 def certify_box(
-    resolved: Scenario, conditions: Conditions, start_error: float = 0.0
-) -> Certificate | None:
+    resolved: Scenario, conditions: NetworkConditions, start_error: float = 0.0
+) -> ScenarioCertificate | None:
     """The certificate of all plants in the scenario's uncertainty box; None if it has none."""
     scope = box(resolved, start_error)
     return None if scope is None else scope.certificate(conditions)
 
 
-def own_plant(resolved: Scenario, start_error: float = 0.0) -> "Scope":
+def own_plant(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope":
     """A scenario's own plant."""
     loop = loop_of(resolved)
 
-    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantConstants:
         return PlantGains(error, loop.A, loop.B, start, alpha_per_s)
 
-    return Scope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
+    return CertificateScope(OWN_PLANT, resolved, loop.A + loop.B @ loop.K, plant_at, start_error)
 
 
-def box(resolved: Scenario, start_error: float = 0.0) -> "Scope | None":
+def box(resolved: Scenario, start_error: float = 0.0) -> "CertificateScope | None":
     """All plants in the scenario's uncertainty box; None if it has none."""
     loop, plant = loop_of(resolved), resolved.plant
     if plant.uncertainty_A is None and plant.uncertainty_B is None:
@@ -157,11 +159,11 @@ def box(resolved: Scenario, start_error: float = 0.0) -> "Scope | None":
     half_A = np.zeros_like(loop.A) if plant.uncertainty_A is None else np.array(plant.uncertainty_A)
     half_B = np.zeros_like(loop.B) if plant.uncertainty_B is None else np.array(plant.uncertainty_B)
 
-    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> Plant:
+    def plant_at(error: ErrorGains, start: Matrix, alpha_per_s: float) -> PlantConstants:
         return BoxGains(error, loop.A_model, loop.B_model, half_A, half_B, start, alpha_per_s)
 
     closed_loop = loop.A_model + loop.B_model @ loop.K
-    return Scope(BOX, resolved, closed_loop, plant_at, start_error)
+    return CertificateScope(BOX, resolved, closed_loop, plant_at, start_error)
 
 
 def outside_box(resolved: Scenario) -> str | None:
@@ -184,7 +186,7 @@ def outside_box(resolved: Scenario) -> str | None:
     return None
 
 
-class Scope:
+class CertificateScope:
     """Plants for which certificates are made; what depends on no condition is computed once.
 
     Args:
@@ -216,9 +218,9 @@ class Scope:
         }
         self._plant_at = plant_at
         self._errors: dict[float, ErrorGains] = {}
-        self._plants: dict[tuple[float, float, bytes], Plant] = {}
+        self._plants: dict[tuple[float, float, bytes], PlantConstants] = {}
 
-    def certificate(self, conditions: Conditions) -> Certificate:
+    def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
         """The certificate under some conditions; a void one says why."""
         trigger = self._resolved.decaying
         first: Constants | None = None
@@ -244,12 +246,12 @@ class Scope:
         assumptions = certificate_assumptions(
             self._resolved, conditions, self._decay, self._held, first, void
         )
-        return Certificate(
+        return ScenarioCertificate(
             self.name, trigger.beta, trigger.alpha_per_s, trigger.floor,
             self._loop.weight is not None, conditions, tuple(assumptions), first, late, void,
         )  # fmt: skip
 
-    def largest(self, conditions: Conditions, change: Change, most_s: float = 10.0) -> float:
+    def largest(self, conditions: NetworkConditions, change: Change, most_s: float = 10.0) -> float:
         """The largest time for which ``change`` of the conditions leaves a certificate.
 
         ``most_s`` if there always is one, 0 if there never is.
@@ -266,7 +268,7 @@ class Scope:
             low, high = (middle, high) if stands(middle) else (low, middle)
         return low
 
-    def _first_phase(self, conditions: Conditions) -> Constants:
+    def _first_phase(self, conditions: NetworkConditions) -> Constants:
         trigger, decay = self._resolved.decaying, min(self._decay.values())
         beta, alpha, floor = trigger.beta, trigger.alpha_per_s, trigger.floor
         start = self._loop.x0[:, None]
@@ -282,7 +284,9 @@ class Scope:
         level = Level(max(beta, floor), floor or None)
         return self._solve(conditions, slower, slower, start, level)
 
-    def _slower(self, conditions: Conditions, alpha_per_s: float, start: Matrix) -> Constants:
+    def _slower(
+        self, conditions: NetworkConditions, alpha_per_s: float, start: Matrix
+    ) -> Constants:
         """Bounds that fall more slowly than the threshold: of a box too large for α.
 
         Raises:
@@ -295,7 +299,7 @@ class Scope:
                 return self._solve(conditions, rate, rate, start, level)
         raise NotDecayingError("the uncertainty box is too large for the loop's gains")
 
-    def _after_floor(self, conditions: Conditions, first: Constants) -> Constants:
+    def _after_floor(self, conditions: NetworkConditions, first: Constants) -> Constants:
         """Once the threshold is the floor: from any state the first phase leaves, without decay.
 
         What the first phase leaves falls like e^{−αt}: what was there τ before t_ε is greater than
@@ -325,7 +329,7 @@ class Scope:
 
     def _solve(
         self,
-        conditions: Conditions,
+        conditions: NetworkConditions,
         error_alpha_per_s: float,
         plant_alpha_per_s: float,
         start: Matrix,

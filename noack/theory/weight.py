@@ -11,9 +11,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, spectral_abscissa
-from noack.theory.certificate import Conditions, Level, VoidError, solve
+from noack.theory.certificate import Level, NetworkConditions, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import ErrorGains, PlantGains
 
@@ -24,7 +24,7 @@ _MOST_FREE = 6
 
 
 def choose_weight(
-    loop: Loop,
+    loop: LoopMatrices,
     beta: float,
     alpha_per_s: float,
     mansd: int,
@@ -62,7 +62,7 @@ def choose_weight(
         error = ErrorGains(loop.H, loop.K, weight, alpha_per_s)
         plant = PlantGains(error, loop.A, loop.B, loop.x0[:, None], alpha_per_s)
         try:
-            found = solve(error, plant, Conditions(mansd), Level(beta, beta))
+            found = solve(error, plant, NetworkConditions(mansd), Level(beta, beta))
         except (VoidError, NotDecayingError):
             return 0.0
         return -(found.inter_event_s or 0.0)

@@ -7,8 +7,8 @@ inter-event time is positive for bounded states, as e_s grows from 0 at a bounde
 from dataclasses import dataclass
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import Form, nothing, of_error
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -17,8 +17,8 @@ class AbsoluteTrigger:
 
     delta: float
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The same after every event."""
-        return Guards(Form(of_error(n, self.weight), nothing(n)), floor=self.delta)
+        return TriggerRule(QuadraticForm(error_map(n, self.weight), empty_map(n)), floor=self.delta)

@@ -9,8 +9,8 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 import math
 
 from noack.core.linear_systems import Matrix, Vector, norm
-from noack.trigger.trigger_condition import Form, nothing, of_error
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 class DecayingTrigger:
@@ -23,7 +23,7 @@ class DecayingTrigger:
         weight: W, shape (n, n), or None for the identity.
     """
 
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
     def __init__(
         self, beta: float, alpha_per_s: float, floor: float = 0.0, weight: Matrix | None = None
@@ -33,10 +33,10 @@ class DecayingTrigger:
         self.floor = floor
         self.weight = weight
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The same after every event: eq:thre counts from the run's start."""
-        form = Form(of_error(n, self.weight), nothing(n))
-        return Guards(form, self.beta, self.alpha_per_s, self.floor)
+        form = QuadraticForm(error_map(n, self.weight), empty_map(n))
+        return TriggerRule(form, self.beta, self.alpha_per_s, self.floor)
 
     def threshold(self, t_ns: float) -> float:
         """max(β e^{−αt}, ε)."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.trigger_policy import Policy
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -24,15 +24,15 @@ class DwellTrigger:
         return self.rule.weight
 
     @property
-    def first_reserve(self) -> float:
+    def initial_dynamic_variable(self) -> float:
         """That of the rule."""
-        return self.rule.first_reserve
+        return self.rule.initial_dynamic_variable
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The rule's, after the dwell time; what is due before then is due at its end."""
-        guards = self.rule.guards(n)
-        return guards._replace(
-            idle_ns=max(guards.idle_ns, self.interval_ns),
-            longest_ns=max(guards.longest_ns, self.interval_ns),
-            shortest_ns=max(guards.shortest_ns, self.interval_ns),
+        rule = self.rule.trigger_rule(n)
+        return rule._replace(
+            idle_ns=max(rule.idle_ns, self.interval_ns),
+            longest_ns=max(rule.longest_ns, self.interval_ns),
+            shortest_ns=max(rule.shortest_ns, self.interval_ns),
         )

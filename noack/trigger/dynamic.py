@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import Form, Reserve, split
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import DynamicVariable, QuadraticForm, quadratic_form
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class DynamicTrigger:
         P: of the Lyapunov function, (n, n).
         Q: its decrease, (n, n).
         BK: B̂K, (n, n).
-        first_reserve: η at the start, ≥ 0.
+        initial_dynamic_variable: η at the start, ≥ 0.
         weight: only for showing errors.
     """
 
@@ -39,20 +39,20 @@ class DynamicTrigger:
     P: Matrix
     Q: Matrix
     BK: Matrix
-    first_reserve: float = 0.0
+    initial_dynamic_variable: float = 0.0
     weight: Matrix | None = None
 
     @cached_property
-    def _forms(self) -> tuple[Form, Form]:
+    def _forms(self) -> tuple[QuadraticForm, QuadraticForm]:
         """−θw and w."""
         n, cross = len(self.P), self.P @ self.BK
         w = np.zeros((2 * n, 2 * n))
         w[:n, :n] = self.sigma * self.Q
         w[:n, n:] = -cross
         w[n:, :n] = -cross.T
-        return split(-self.theta_s * w), split(w)
+        return quadratic_form(-self.theta_s * w), quadratic_form(w)
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The same after every event; η goes on."""
         spent, gained = self._forms
-        return Guards(spent, reserve=Reserve(self.decay_per_s, gained))
+        return TriggerRule(spent, dynamic_variable=DynamicVariable(self.decay_per_s, gained))

@@ -12,8 +12,8 @@ dwell time.
 from dataclasses import dataclass
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import Form, nothing, of_state
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, empty_map, state_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class LyapunovTrigger:
     factor: Matrix
     rate_per_s: float
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The envelope that begins at the event."""
-        form = Form(of_state(n, self.factor), nothing(n))
-        return Guards(form, rate_per_s=self.rate_per_s / 2, from_event=True)
+        form = QuadraticForm(state_map(n, self.factor), empty_map(n))
+        return TriggerRule(form, rate_per_s=self.rate_per_s / 2, from_event=True)

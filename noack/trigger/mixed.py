@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import Form, of_error, of_state
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, error_map, state_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,11 @@ class MixedTrigger:
     sigma: float
     epsilon: float = 0.0
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The same after every event."""
-        down: Matrix = self.sigma * of_state(n, self.weight)
-        return Guards(Form(of_error(n, self.weight), np.asarray(down)), floor=self.epsilon)
+        down: Matrix = self.sigma * state_map(n, self.weight)
+        return TriggerRule(
+            QuadraticForm(error_map(n, self.weight), np.asarray(down)), floor=self.epsilon
+        )

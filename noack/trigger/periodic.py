@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import Form, nothing
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, empty_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -13,8 +13,8 @@ class PeriodicTrigger:
 
     period_ns: int
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """A period after the event."""
-        return Guards(Form(nothing(n), nothing(n)), longest_ns=self.period_ns)
+        return TriggerRule(QuadraticForm(empty_map(n), empty_map(n)), longest_ns=self.period_ns)

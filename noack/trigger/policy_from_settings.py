@@ -3,21 +3,21 @@
 import numpy as np
 
 from noack.config.matrices import Rows
-from noack.config.resolution import Loop, loop_of
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.triggers import (
-    Absolute,
+    AbsoluteSettings,
     AnyTrigger,
-    Deadline,
-    Decaying,
-    Dwell,
-    Dynamic,
-    Lyapunov,
-    Mixed,
-    Periodic,
-    Quadratic,
-    Relative,
-    SelfTriggered,
+    DeadlineSettings,
+    DecayingSettings,
+    DwellSettings,
+    DynamicSettings,
+    LyapunovSettings,
+    MixedSettings,
+    PeriodicSettings,
+    QuadraticSettings,
+    RelativeSettings,
+    SelfTriggeredSettings,
 )
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -48,45 +48,45 @@ def policy_of(resolved: Scenario) -> Policy:
 def _policy(trigger: AnyTrigger, resolved: Scenario) -> Policy:
     W = None if trigger.weight is None else np.array(trigger.weight)
     match trigger:
-        case Decaying():
+        case DecayingSettings():
             return DecayingTrigger(trigger.beta, trigger.alpha_per_s, trigger.floor, W)
-        case Absolute():
+        case AbsoluteSettings():
             return AbsoluteTrigger(trigger.delta, W)
-        case Relative():
+        case RelativeSettings():
             return relative_trigger(trigger.sigma, W)
-        case Mixed():
+        case MixedSettings():
             return MixedTrigger(trigger.sigma, trigger.epsilon, W)
-        case Quadratic():
+        case QuadraticSettings():
             return QuadraticTrigger(
                 np.array(trigger.Q), _ns(trigger.period_s), trigger.epsilon, trigger.heartbeat, W
             )
-        case Lyapunov():
+        case LyapunovSettings():
             P = _lyapunov(loop_of(resolved), trigger.Q)[0]
             return LyapunovTrigger(
                 np.ascontiguousarray(np.linalg.cholesky(P).T), trigger.rate_per_s, W
             )
-        case Dynamic():
+        case DynamicSettings():
             loop = loop_of(resolved)
             P, Q = _lyapunov(loop, trigger.Q)
             return DynamicTrigger(
                 trigger.sigma, trigger.theta_s, trigger.decay_per_s, P, Q,
-                loop.B_model @ loop.K, trigger.reserve, W,
+                loop.B_model @ loop.K, trigger.eta_0, W,
             )  # fmt: skip
-        case Periodic():
+        case PeriodicSettings():
             return PeriodicTrigger(_ns(trigger.period_s), W)
-        case SelfTriggered():
+        case SelfTriggeredSettings():
             return SelfTrigger(
                 trigger.beta, trigger.alpha_per_s, trigger.floor, trigger.growth_per_s,
                 trigger.mismatch_per_s, trigger.disturbance_per_s,
                 _ns(trigger.shortest_s), _ns(trigger.longest_s), W,
             )  # fmt: skip
-        case Deadline():
+        case DeadlineSettings():
             return DeadlineTrigger(_policy(trigger.rule, resolved), _ns(trigger.interval_s))
-        case Dwell():
+        case DwellSettings():
             return DwellTrigger(_policy(trigger.rule, resolved), _ns(trigger.interval_s))
 
 
-def _lyapunov(loop: Loop, given: Rows | None) -> tuple[Matrix, Matrix]:
+def _lyapunov(loop: LoopMatrices, given: Rows | None) -> tuple[Matrix, Matrix]:
     """P and Q with AᵀP + PA = −Q of the model's closed loop."""
     from scipy.linalg import solve_continuous_lyapunov
 

@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_condition import NEVER_NS, Form, split
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import NEVER_NS, QuadraticForm, quadratic_form
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class QuadraticTrigger:
     epsilon: float = 0.0
     heartbeat: int = 0
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
     @cached_property
-    def form(self) -> Form:
+    def form(self) -> QuadraticForm:
         """Q as a difference of squares."""
-        return split(self.Q)
+        return quadratic_form(self.Q)
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """On the grid, later than the event."""
-        return Guards(
+        return TriggerRule(
             self.form, floor=float(np.sqrt(self.epsilon)), grid_ns=self.period_ns,
             longest_ns=self.heartbeat * self.period_ns if self.heartbeat else NEVER_NS,
         )  # fmt: skip

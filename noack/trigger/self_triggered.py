@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 from noack.core.linear_systems import Matrix
 from noack.trigger.self_triggered_interval import Forecast
-from noack.trigger.trigger_condition import Form, nothing
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_condition import QuadraticForm, empty_map
+from noack.trigger.trigger_rule import TriggerRule
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,16 @@ class SelfTrigger:
     shortest_ns: int
     longest_ns: int
     weight: Matrix | None = None
-    first_reserve = 0.0
+    initial_dynamic_variable = 0.0
 
-    def guards(self, n: int) -> Guards:
+    def trigger_rule(self, n: int) -> TriggerRule:
         """The time of the next event, from the state at this one."""
         forecast = Forecast(
             self.beta, self.alpha_per_s, self.floor,
             self.growth_per_s, self.mismatch_per_s, self.disturbance_per_s,
         )  # fmt: skip
-        return Guards(
-            Form(nothing(n), nothing(n)), longest_ns=self.longest_ns, shortest_ns=self.shortest_ns,
+        return TriggerRule(
+            QuadraticForm(empty_map(n), empty_map(n)),
+            longest_ns=self.longest_ns, shortest_ns=self.shortest_ns,
             forecast=forecast, weight=self.weight,
         )  # fmt: skip

@@ -19,7 +19,7 @@ from noack.core.linear_systems import Matrix, Vector, norm
 NEVER_NS = math.inf
 
 
-class Form(NamedTuple):
+class QuadraticForm(NamedTuple):
     """The quadratic form ‖P z‖² − ‖N z‖² of z = (x, e_s)."""
 
     up: Matrix
@@ -39,25 +39,25 @@ class Form(NamedTuple):
         return values
 
 
-class Reserve(NamedTuple):
+class DynamicVariable(NamedTuple):
     """What a dynamic rule has saved up: η̇ = −λη + ψ(z)."""
 
     decay_per_s: float
     """λ."""
-    gain: Form
+    gain: QuadraticForm
     """ψ."""
 
-    def after(self, dt_s: float, reserve: float, gain: float) -> float:
+    def after(self, dt_s: float, dynamic_variable: float, gain: float) -> float:
         """η after a time in which ψ stays as it is."""
         decay = self.decay_per_s
         gained = -math.expm1(-decay * dt_s) / decay if decay else dt_s
-        return reserve * math.exp(-decay * dt_s) + gained * gain
+        return dynamic_variable * math.exp(-decay * dt_s) + gained * gain
 
 
-class Guard(NamedTuple):
+class TriggerCondition(NamedTuple):
     """The rule between two events."""
 
-    form: Form
+    form: QuadraticForm
     level: float = 0.0
     """c ≥ 0."""
     rate_per_s: float = 0.0
@@ -70,42 +70,46 @@ class Guard(NamedTuple):
     latest_ns: float = NEVER_NS
     grid_ns: float = 0.0
     """Distance of the points at which the rule is looked at, from t = 0 on; 0: it always is."""
-    reserve: Reserve | None = None
+    dynamic_variable: DynamicVariable | None = None
 
     def threshold(self, t_ns: float) -> float:
         """max(c e^{−ρ(t−t₀)}, f)."""
         faded = self.level * math.exp(-self.rate_per_s * (t_ns - self.since_ns) * 1e-9)
         return max(faded, self.floor)
 
-    def sides(self, t_ns: float, x: Vector, e_s: Vector, reserve: float = 0.0) -> "Sides":
+    def sides(
+        self, t_ns: float, x: Vector, e_s: Vector, dynamic_variable: float = 0.0
+    ) -> "ComparisonSides":
         """Both sides of the rule's comparison, as square roots.
 
         Args:
             t_ns: time.
             x: the plant's state, shape (n,).
             e_s: the sensor's error, shape (n,).
-            reserve: η.
+            dynamic_variable: η.
         """
         z = np.concatenate([x, e_s])
         left, right = norm(self.form.up @ z), self.threshold(t_ns)
-        if len(self.form.down) or reserve > 0:
-            right = math.hypot(right, norm(self.form.down @ z), math.sqrt(max(reserve, 0.0)))
-        return Sides(left, right)
+        if len(self.form.down) or dynamic_variable > 0:
+            right = math.hypot(
+                right, norm(self.form.down @ z), math.sqrt(max(dynamic_variable, 0.0))
+            )
+        return ComparisonSides(left, right)
 
     def exceeds(
-        self, t_ns: NDArray[Any], z: Matrix, reserve: Vector | float = 0.0
+        self, t_ns: NDArray[Any], z: Matrix, dynamic_variable: Vector | float = 0.0
     ) -> NDArray[np.bool_]:
         """Whether the comparison holds at k times, whether it counts there or not.
 
         Args:
             t_ns: times, shape (k,).
             z: (x, e_s) at them, shape (k, 2n).
-            reserve: η at them.
+            dynamic_variable: η at them.
         """
         faded = self.level * np.exp(-self.rate_per_s * 1e-9 * (t_ns - self.since_ns))
         down = np.linalg.norm(z @ self.form.down.T, axis=1)
         right = np.hypot(np.maximum(faded, self.floor), down)
-        right = np.hypot(right, np.sqrt(np.maximum(reserve, 0.0)))
+        right = np.hypot(right, np.sqrt(np.maximum(dynamic_variable, 0.0)))
         found: NDArray[np.bool_] = np.linalg.norm(z @ self.form.up.T, axis=1) > right
         return found
 
@@ -114,29 +118,29 @@ class Guard(NamedTuple):
         return t_ns >= self.earliest_ns and (self.grid_ns == 0 or t_ns % self.grid_ns == 0)
 
 
-class Sides(NamedTuple):
+class ComparisonSides(NamedTuple):
     """What is compared: the sensor transmits if ``left`` exceeds ``right``."""
 
     left: float
     right: float
 
 
-def of_error(n: int, weight: Matrix | None = None) -> Matrix:
+def error_map(n: int, weight: Matrix | None = None) -> Matrix:
     """[0 W], which takes z to W e_s, shape (n, 2n)."""
     return np.hstack([np.zeros((n, n)), np.eye(n) if weight is None else weight])
 
 
-def of_state(n: int, weight: Matrix | None = None) -> Matrix:
+def state_map(n: int, weight: Matrix | None = None) -> Matrix:
     """[W 0], which takes z to W x, shape (n, 2n)."""
     return np.hstack([np.eye(n) if weight is None else weight, np.zeros((n, n))])
 
 
-def nothing(n: int) -> Matrix:
+def empty_map(n: int) -> Matrix:
     """No rows, for an N that is not there."""
     return np.zeros((0, 2 * n))
 
 
-def split(Q: Matrix) -> Form:
+def quadratic_form(Q: Matrix) -> QuadraticForm:
     """The form zᵀQz of a symmetric matrix, as the difference of two squares.
 
     Args:
@@ -144,4 +148,4 @@ def split(Q: Matrix) -> Form:
     """
     values, vectors = np.linalg.eigh(Q)
     rows = np.sqrt(np.abs(values))[:, None] * vectors.T
-    return Form(rows[values > 0], rows[values < 0])
+    return QuadraticForm(rows[values > 0], rows[values < 0])

@@ -11,13 +11,18 @@ import numpy as np
 
 from noack.core.linear_systems import Matrix, Vector, norm
 from noack.trigger.self_triggered_interval import Forecast, interval_ns
-from noack.trigger.trigger_condition import NEVER_NS, Form, Guard, Reserve
+from noack.trigger.trigger_condition import (
+    NEVER_NS,
+    DynamicVariable,
+    QuadraticForm,
+    TriggerCondition,
+)
 
 
-class Guards(NamedTuple):
-    """A policy's guards; :class:`noack.trigger.trigger_condition.Guard` has the names' meaning."""
+class TriggerRule(NamedTuple):
+    """How each event sets the condition of the next one; names as in ``TriggerCondition``."""
 
-    form: Form
+    form: QuadraticForm
     level: float = 0.0
     """c ≥ 0; it decays from t₀ = 0 on."""
     rate_per_s: float = 0.0
@@ -27,7 +32,7 @@ class Guards(NamedTuple):
     from_event: bool = False
     """Instead, t₀ is the event's time, and c is ‖P z‖ just after it."""
     grid_ns: float = 0.0
-    reserve: Reserve | None = None
+    dynamic_variable: DynamicVariable | None = None
     idle_ns: float = -math.inf
     """For so long after an event the comparison does not count."""
     longest_ns: float = NEVER_NS
@@ -43,7 +48,7 @@ class Guards(NamedTuple):
         """α of a threshold that decays from the run's start on; of others 0."""
         return 0.0 if self.from_event else self.rate_per_s
 
-    def after(self, t_ns: float, x: Vector) -> Guard:
+    def after(self, t_ns: float, x: Vector) -> TriggerCondition:
         """The guard after an event, or from the start on.
 
         Args:
@@ -59,7 +64,7 @@ class Guards(NamedTuple):
             due_ns = interval_ns(
                 self.forecast, size, t_ns * 1e-9, self.shortest_ns, self.longest_ns
             )
-        return Guard(
+        return TriggerCondition(
             self.form, level, self.rate_per_s, since_ns, self.floor,
-            t_ns + self.idle_ns, t_ns + due_ns, self.grid_ns, self.reserve,
+            t_ns + self.idle_ns, t_ns + due_ns, self.grid_ns, self.dynamic_variable,
         )  # fmt: skip

@@ -2,12 +2,12 @@
 
 import math
 
-from noack.config.plant_systems import CartPole
+from noack.config.plant_systems import CartPoleSettings
 from noack.core.linear_systems import Vector
 from plant_server.ode_integrator import OdeSystem
 
 
-def cart_pole(settings: CartPole, x0: Vector) -> OdeSystem:
+def cart_pole(settings: CartPoleSettings, x0: Vector) -> OdeSystem:
     """Return the system; its own state is x: position, velocity, angle from upright, its rate.
 
     With q the position and θ the angle, positive towards positive q:

@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from noack.config.plant_systems import Fmu
+from noack.config.plant_systems import FmuSettings
 from noack.config.system_files import unchanged
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
@@ -47,7 +47,7 @@ class FmuSystem:
         CallerError: FMPy is missing; the FMU is not what the settings say; it cannot be started.
     """
 
-    def __init__(self, settings: Fmu, x0: Vector) -> None:
+    def __init__(self, settings: FmuSettings, x0: Vector) -> None:
         settings.require_installed()
         path = unchanged(settings)
         self._place = f'plant.system.file = "{path.name}"'
@@ -134,7 +134,7 @@ class FmuSystem:
         hint = "; `fmpy compile` can make it of the sources that it has" if sources else ""
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
-    def _start(self, settings: Fmu, x0: Vector, description: Any) -> None:
+    def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
         """Set the start values, initialise."""
         fmu, variables = self._instance.fmu, _Variables(description)
         self._states = _Port(fmu, variables.readable("state_variables", settings.state_variables))

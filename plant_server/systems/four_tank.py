@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from noack.config.plant_systems import FourTank
+from noack.config.plant_systems import FourTankSettings
 from noack.core.linear_systems import Vector
 from plant_server.ode_integrator import OdeSystem
 
 
-def four_tank(settings: FourTank, x0: Vector) -> OdeSystem:
+def four_tank(settings: FourTankSettings, x0: Vector) -> OdeSystem:
     """Return the system; its own state is the levels h, and v the pumps' voltages.
 
     A₁ḣ₁ = −o₁ + o₃ + γ₁k₁v₁, A₂ḣ₂ = −o₂ + o₄ + γ₂k₂v₂, A₃ḣ₃ = −o₃ + (1−γ₂)k₂v₂ and

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from noack.config.plant_systems import Python
+from noack.config.plant_systems import PythonSettings
 from noack.config.system_files import unchanged
 from noack.core.errors import CallerError, one_line
 from noack.core.linear_systems import Vector
 from plant_server.ode_integrator import OdeSystem
-from plant_server.system import System, SystemFailedError
+from plant_server.system import PlantSystem, SystemFailedError
 
 GROUP = "noack.plants"
 """The group of entry points in which packages name their plants."""
@@ -42,7 +42,7 @@ class PythonSystem:
         CallerError: there is no such class, it cannot be made, or it is not as it must be.
     """
 
-    def __init__(self, settings: Python, x0: Vector, m: int) -> None:
+    def __init__(self, settings: PythonSettings, x0: Vector, m: int) -> None:
         self._place = f'plant.system.name = "{settings.name}"'
         self._recorded = len(settings.on_record)
         parameters = {
@@ -77,12 +77,12 @@ class PythonSystem:
                 raise
             raise SystemFailedError(self._said(error)) from None
 
-    def _look(self, system: System) -> None:
+    def _look(self, system: PlantSystem) -> None:
         self.x = _vector("x", system.x, len(self.x))
         if self._recorded:
             self.z = _vector("z", system.z, self._recorded)
 
-    def _system_of(self, plant: Any, x0: Vector, m: int) -> System:
+    def _system_of(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
             both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
             raise TypeError(f"it has {both} advance; one of them is needed")
@@ -154,7 +154,7 @@ def _vector(what: str, value: Any, size: int) -> Vector:
     return found
 
 
-def _found(settings: Python) -> tuple[Any, str]:
+def _found(settings: PythonSettings) -> tuple[Any, str]:
     """The class that the settings name, and what it is, in words."""
     if settings.file is not None:
         path = unchanged(settings)

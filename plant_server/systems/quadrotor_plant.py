@@ -2,12 +2,12 @@
 
 import math
 
-from noack.config.plant_systems import Quadrotor
+from noack.config.plant_systems import QuadrotorSettings
 from noack.core.linear_systems import Vector
 from plant_server.ode_integrator import OdeSystem
 
 
-def quadrotor(settings: Quadrotor, x0: Vector) -> OdeSystem:
+def quadrotor(settings: QuadrotorSettings, x0: Vector) -> OdeSystem:
     """Return the system; its own state is x: position, roll φ, pitch θ, yaw ψ, velocity, rates.
 
     With R = R_z(ψ) R_y(θ) R_x(φ) from body to world and thrust T = mg + u₁:

@@ -2,11 +2,18 @@
 
 import numpy as np
 
-from noack.config.plant_systems import CartPole, Fmu, FourTank, Python, Quadrotor, Vehicle
+from noack.config.plant_systems import (
+    CartPoleSettings,
+    FmuSettings,
+    FourTankSettings,
+    PythonSettings,
+    QuadrotorSettings,
+    VehicleSettings,
+)
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix
-from plant_server.system import System
+from plant_server.system import PlantSystem
 from plant_server.systems.linear_plant import LinearSystem
 
 
@@ -16,7 +23,7 @@ def prepare(settings: object) -> None:
     Raises:
         CallerError: what it is made of is not there.
     """
-    if isinstance(settings, Vehicle):
+    if isinstance(settings, VehicleSettings):
         settings.require_installed()
         from plant_server.systems import equations
 
@@ -24,7 +31,7 @@ def prepare(settings: object) -> None:
             equations.prepare(settings.library_model)
 
 
-def system_of(resolved: Scenario) -> System:
+def system_of(resolved: Scenario) -> PlantSystem:
     """Return the system of a resolved scenario's plant, at x(0).
 
     A linear one whose state is disturbed has w as further inputs, n of them: ẋ = Ax + [B I][u; w].
@@ -35,27 +42,27 @@ def system_of(resolved: Scenario) -> System:
     settings, x0 = resolved.plant.system, np.array(resolved.plant.initial_state)
     # Integrators take time to import and 40 MB, which linear plants need not.
     match settings:
-        case CartPole():
+        case CartPoleSettings():
             from plant_server.systems.cart_pole import cart_pole
 
             return cart_pole(settings, x0)
-        case FourTank():
+        case FourTankSettings():
             from plant_server.systems.four_tank import four_tank
 
             return four_tank(settings, x0)
-        case Quadrotor():
+        case QuadrotorSettings():
             from plant_server.systems.quadrotor_plant import quadrotor
 
             return quadrotor(settings, x0)
-        case Vehicle():
+        case VehicleSettings():
             from plant_server.systems.vehicle import vehicle
 
             return vehicle(settings, x0)
-        case Fmu():
+        case FmuSettings():
             from plant_server.systems.fmu import FmuSystem
 
             return FmuSystem(settings, x0)
-        case Python():
+        case PythonSettings():
             from plant_server.systems.python_plant import PythonSystem
 
             return PythonSystem(settings, x0, resolved.model.dimensions[1])

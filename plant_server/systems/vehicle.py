@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from noack.config.plant_systems import Vehicle
+from noack.config.plant_systems import VehicleSettings
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from plant_server.ode_integrator import OdeSystem
@@ -32,7 +32,7 @@ class _Model(NamedTuple):
     """Relative tolerance of the integration."""
 
 
-def vehicle(settings: Vehicle, x0: Vector) -> OdeSystem:
+def vehicle(settings: VehicleSettings, x0: Vector) -> OdeSystem:
     """Return the system, its steering straight; its own state is that of the library's model.
 
     The servo turns the wheels by (u − δ)/T within the limits of angle and rate, and the vehicle
@@ -72,7 +72,7 @@ def vehicle(settings: Vehicle, x0: Vector) -> OdeSystem:
 
 
 @cache
-def _parameters_of(settings: Vehicle) -> Any:
+def _parameters_of(settings: VehicleSettings) -> Any:
     number = _PARAMETERS[settings.parameters]
     parameters = library(f"parameters_vehicle{number}")()
     parameters.tire.p_dx1 *= settings.friction

@@ -23,7 +23,7 @@ from noack.protocol.record_tables import (
     PLANT_ACTUATION,
     SENSOR_MEASUREMENT,
 )
-from noack.protocol.topology import LEGS, LOOP_ROLES, SENDER
+from noack.protocol.topology import LOOP_ROLES, ROUTES, SENDER
 from noack.protocol.wire_format import Flow
 from noack.runtime.join_ticket import Ticket, loads
 from tests.attacks.kinds import Target
@@ -120,8 +120,8 @@ class Run:
         loop = loop_of(ticket.scenario)
         return [
             Target(
-                role, ports[role], ports[SENDER[role]], LEGS[role].receives,
-                loop.m if LEGS[role].receives is Flow.ACTUATION else loop.n,
+                role, ports[role], ports[SENDER[role]], ROUTES[role].receives,
+                loop.m if ROUTES[role].receives is Flow.ACTUATION else loop.n,
                 ticket.run_id, ticket.key,
             )
             for role in LOOP_ROLES

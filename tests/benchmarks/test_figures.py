@@ -19,7 +19,7 @@ NAMES = (
     "simulation", "batch", "campaign", "relays", "relay_delay", "relay_flows", "relay_soak",
 )  # fmt: skip
 ACCOUNT = {
-    "t_s": 0.0, "events": 1, "deliveries": 1, "longest_drop_run": 0, "x_norm": 1.0, "live": None,
+    "t_s": 0.0, "events": 1, "deliveries": 1, "longest_loss_burst": 0, "x_norm": 1.0, "live": None,
 }  # fmt: skip
 KERNEL = Kernel(12.0, 20.0, 60.0)
 ROOT = Path(__file__).parents[2]

@@ -150,7 +150,7 @@ def test_our_relays_counts_are_what_sender_and_sink_saw(tools: Built) -> None:
         totals = relay.totals()
     assert totals.arrived == 200
     assert totals.forwarded == found.received < 200
-    assert totals.longest_drop_run <= 2
+    assert totals.longest_loss_burst <= 2
     assert totals.lost_in_kernel == 0
     assert 198 <= found.decided <= 200
 

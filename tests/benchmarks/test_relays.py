@@ -271,12 +271,12 @@ def test_our_command_line() -> None:
         "-m netem --listen 127.0.0.1:0 --to 127.0.0.1:9001 loss 5% mansd 4 --engine plain "
         "--realtime --segment --one-way --json"
     )
-    assert "--one-way" not in command_of(Ours("delay 10ms", way_back=True), 9001)
+    assert "--one-way" not in command_of(Ours("delay 10ms", reverse=True), 9001)
 
 
 def test_totals_that_are_not_there_are_an_error() -> None:
     forward = {
-        "arrived": 9, "forwarded": 8, "longest_run": 1, "unintended": {"lost_in_kernel": 0},
+        "arrived": 9, "forwarded": 8, "longest_loss_burst": 1, "unintended": {"lost_in_kernel": 0},
     }  # fmt: skip
     text = json.dumps({"links": [{"forward": forward}], "more": 1})
     assert totals_of(f'{{"ready": []}}\n{text}') == Totals(9, 8, 1, 0)

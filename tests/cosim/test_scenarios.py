@@ -19,8 +19,8 @@ from cosim.analysis.run_summary import summarise
 from cosim.output.certificate_report import with_weight
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.plant_systems import FourTank, Quadrotor
-from noack.config.resolution import Loop, loop_of, resolve
+from noack.config.plant_systems import FourTankSettings, QuadrotorSettings
+from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix
@@ -55,7 +55,7 @@ def test_a_shipped_scenario_keeps_what_it_assumes_and_settles(name: str) -> None
     assert summary["lost_outside_netem"] == 0
     assert summary["assumption_violations"] == []
     assert summary["watchdog"]["trips"] == 0
-    assert summary["longest_drop_run"] <= summary["mansd"]
+    assert summary["longest_loss_burst"] <= summary["mansd"]
     shrunk = summary["final_state_norm"] / summary["initial_state_norm"]
     assert shrunk < ENDS_BELOW.get(name, 0.1)
     internal = record.scenario.plant.system.internal_names
@@ -63,11 +63,11 @@ def test_a_shipped_scenario_keeps_what_it_assumes_and_settles(name: str) -> None
         assert record[PLANT_STEP]["z"].shape[1] == len(internal)
 
 
-def loop(name: str) -> Loop:
+def loop(name: str) -> LoopMatrices:
     return loop_of(shipped(name))
 
 
-def closed(found: Loop) -> Matrix:
+def closed(found: LoopMatrices) -> Matrix:
     poles: Matrix = np.linalg.eigvals(found.A_model + found.B_model @ found.K)
     return poles
 
@@ -76,7 +76,7 @@ def closed(found: Loop) -> Matrix:
 
 
 def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
-    settings = FourTank(kind="four_tank", **given)
+    settings = FourTankSettings(kind="four_tank", **given)
     return linearise(lambda x0: four_tank(settings, x0), 4, 2)
 
 
@@ -116,7 +116,7 @@ def test_the_four_tank_scenarios_model_is_the_linearisation_of_its_plant() -> No
 
 
 def test_a_tank_that_runs_dry_stays_empty() -> None:
-    settings = FourTank(kind="four_tank")
+    settings = FourTankSettings(kind="four_tank")
     system = four_tank(settings, np.array([0.0, 0.0, -1.0, -1.0]))
     for step in range(600):
         system.advance(np.array([-5.0, -5.0]), step * 10**9, 10**9)  # a pump does not draw
@@ -164,7 +164,7 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
 
 
 def linear_quadrotor() -> tuple[Matrix, Matrix]:
-    settings = Quadrotor(kind="quadrotor")
+    settings = QuadrotorSettings(kind="quadrotor")
     return linearise(lambda x0: quadrotor(settings, x0), 12, 4)
 
 
@@ -184,7 +184,7 @@ def test_the_quadrotors_gain_is_the_regulator_that_its_scenario_names() -> None:
 
 def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_reports() -> None:
     """From 1 m and 10° of each angle, by his PD gains (2.5, 1.5 of height; 1.75, 6 of angles)."""
-    settings = Quadrotor(kind="quadrotor")
+    settings = QuadrotorSettings(kind="quadrotor")
     K = np.zeros((4, 12))
     K[0, [2, 8]] = np.array([-1.5, -2.5]) * settings.mass_kg
     for axis, inertia in enumerate(settings.inertia_kg_m2):
@@ -200,7 +200,7 @@ def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_re
 
 
 def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_momentum() -> None:
-    settings = Quadrotor(kind="quadrotor", drag_kg_per_s=(0.0, 0.0, 0.0))
+    settings = QuadrotorSettings(kind="quadrotor", drag_kg_per_s=(0.0, 0.0, 0.0))
     inertia = np.array(settings.inertia_kg_m2)
     start = np.array([0, 0, 0, 0.3, -0.2, 0.1, 1.0, -2.0, 3.0, 1.0, 1.5, -0.7])
     system = quadrotor(settings, start)

@@ -111,7 +111,7 @@ class FakePlane:
     def announce(self, content: Any) -> None:
         self.announced.append(json.loads(json.dumps(content)))
 
-    def say_kept(self, role: str, content: Any) -> None:
+    def acknowledge_rows(self, role: str, content: Any) -> None:
         self.kept[role] = json.loads(json.dumps(content))
 
     def request_stop(self, reason: str) -> None:

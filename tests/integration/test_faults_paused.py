@@ -54,7 +54,7 @@ def test_each_process_may_stand_still_and_the_run_catches_up(start: Start) -> No
     assert summary["replay"]["bit_exact"]
     assert summary["replay"]["complete"]
     assert summary["identity_residual_relative"] < 1e-11
-    assert summary["longest_drop_run"] <= summary["mansd"]
+    assert summary["longest_loss_burst"] <= summary["mansd"]
     for role in ("plant", "sensor", "controller"):  # netem may have had nothing to do
         assert summary["lateness_us"][role]["max"] > 0.9e6 * PAUSE_S
     # No certificate allows inputs of that age: void, since when and for what.

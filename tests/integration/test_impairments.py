@@ -73,7 +73,7 @@ def test_the_run_ends_well_and_replays_to_the_bit(finished: Finished) -> None:
     assert summary["replay"]["complete"]
     assert summary["lost_outside_netem"] == 0
     assert summary["missing_samples"] == 0
-    assert summary["longest_drop_run"] <= MANSD
+    assert summary["longest_loss_burst"] <= MANSD
     assert "Traceback" not in finished.stderr
     logs = [log.read_text() for log in (finished.run_dir / "logs").iterdir()]
     assert not any("Traceback" in log for log in logs)

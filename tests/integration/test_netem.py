@@ -93,7 +93,7 @@ def test_it_serves_any_udp_program(words: str, run: int, engine: str) -> None:
         "delivered": 0 if run else 40, "dropped": 30 if run else 0, "forced": 10 if run else 0,
         "corrupted": 0, "overflowed": 0, "blacked_out": 0,
     }  # fmt: skip
-    assert told["longest_run"] == run
+    assert told["longest_loss_burst"] == run
     assert set(told["unintended"].values()) == {0}
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.record.align import join_all
 from cosim.record.run_record import Rows, load_record
 from noack.config.resolution import tables_of
 from noack.config.scenario_file import load
-from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.machine_interface import GENERATION
 from noack.runtime.spool import read_chunks
 from tests.integration.conftest import (
     AT_RATE,
@@ -46,7 +46,7 @@ def spooled(running: Running, table: str) -> Rows:
 
 def is_whole(running: Running, table: str) -> bool:
     """Whether there are no gaps in a table."""
-    inputs = spooled(running, table)["sequence"] % INCARNATION
+    inputs = spooled(running, table)["sequence"] % GENERATION
     return bool((np.diff(np.unique(inputs)) == 1).all())
 
 
@@ -56,7 +56,7 @@ def goes_on(running: Running, role: str) -> bool:
     if role == "recorder":
         written = (running.runs / "latest" / "spool").glob("plant_step.*")
         return sum(path.stat().st_size > 0 for path in written) > 1
-    return bool((spooled(running, KEEPS[role])["input"] >= INCARNATION).any())
+    return bool((spooled(running, KEEPS[role])["input"] >= GENERATION).any())
 
 
 def let_run(running: Running, simulated_s: float) -> None:
@@ -110,7 +110,7 @@ def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None
     restarts = {one["process"]: one for one in restarted.summary["restarts"]}
     assert restarts.keys() == set(RESTARTED)
     for role, one in restarts.items():
-        assert one["incarnation"] == 1
+        assert one["generation"] == 1
         assert one["what"] == f"started anew: {role} died: killed by SIGKILL"
         assert role == "recorder" or one["last_s"] < one["first_s"]
     for role in RESTARTED:
@@ -132,7 +132,7 @@ def test_a_restarted_sensor_transmits_its_first_measurement(restarted: Finished)
     record = load_record(restarted.run_dir)
     _, again = record.lives("sensor")
     first = again.rows["sensor_measurement"][0]
-    assert first["event"] == INCARNATION
+    assert first["event"] == GENERATION
     assert np.array_equal(first["x"], first["x_s"])
 
 
@@ -154,7 +154,7 @@ def test_a_restarted_controller_puts_out_nothing_until_it_knows_a_state(
     assert not ticks["u"][waiting].any()
     assert (ticks["u"][~waiting] != 0).any()
     assert (
-        ticks["sequence"][0] % INCARNATION
+        ticks["sequence"][0] % GENERATION
         == ticks["t_ns"][0] // record.scenario.controller_period_ns
     )
 
@@ -175,7 +175,7 @@ def test_the_loop_converges_again_and_its_identity_holds(restarted: Finished) ->
 
 
 def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
-    claims = Claims(load_record(restarted.run_dir)).judge()
+    claims = ClaimEvaluation(load_record(restarted.run_dir)).judge()
     assert {claim.verdict for claim in claims} == {"void"}
     gone_s = min(one["last_s"] or np.inf for one in restarted.summary["restarts"])
     assert all(claim.since_s <= gone_s + 0.1 for claim in claims if claim.since_s is not None)

@@ -10,7 +10,7 @@ import pytest
 import rerun.chunk
 from scipy.linalg import expm
 
-from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.output.viewer import blueprint
 from cosim.record.align import identity_residual, join_all
@@ -26,7 +26,7 @@ from tests.integration.conftest import Finished, run_scenario, settings
 
 SUMMARY_KEYS = {
     "scenario", "mode", "mansd", "events", "deliveries", "drops", "forced_deliveries",
-    "longest_drop_run", "assumption_violations", "missing_samples", "lost_outside_netem",
+    "longest_loss_burst", "assumption_violations", "missing_samples", "lost_outside_netem",
     "inter_event_min_s", "final_state_norm", "lateness_us", "latency_us", "realtime", "exit",
     "kind", "replay", "fidelity", "claims", "conditions",
 }  # fmt: skip
@@ -298,7 +298,7 @@ def test_no_claim_that_needs_no_ideal_world_is_violated(finished: Finished) -> N
 
 def test_the_recording_shows_the_bounds(finished: Finished, record: RunRecord) -> None:
     """The recorder's curves, drawn while the run went on, are those judged at its end."""
-    envelopes = Claims(record).envelopes()
+    envelopes = ClaimEvaluation(record).envelopes()
     (identity,) = [e.values for e in envelopes if e.label == "bound from (I1)"]
     certified = [e.values for e in envelopes if e.label == "certified for the scenario's plant"]
     chunks = read(finished.run_dir / "recording.rrd")

@@ -36,7 +36,7 @@ def test_a_run_is_changed_twice_from_another_process(
     wait_for(lambda: run_registry.ask(run, {})["t_s"] > 0)
     first = said("loss.p", "0.5", "mansd=2")
     second = said("setpoint", "[0.0, 0.0, 0.0, 1.0]")
-    assert second["knobs"]["network.mansd"] == 2
+    assert second["runtime_parameters"]["network.mansd"] == 2
     refused = said("loss.p", "1.5")
     assert refused["exit"]["status"] == 2
     assert "should be less than or equal to 1" in refused["error"]

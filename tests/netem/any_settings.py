@@ -28,20 +28,20 @@ gilbert_elliott = st.one_of(
     st.fixed_dictionaries(
         {"mean_loss": st.floats(0, 1, exclude_max=True), "mean_burst": st.floats(1, 1e17)}
     ).filter(_valid_gilbert_elliott),
-).map(lambda table: imp.GilbertElliott(**table))
+).map(lambda table: imp.GilbertElliottLoss(**table))
 
 
 @st.composite
-def four_states(draw: st.DrawFn) -> imp.FourState:
+def four_states(draw: st.DrawFn) -> imp.FourStateLoss:
     pairs = st.tuples(probabilities, probabilities).filter(lambda pair: sum(pair) <= 1)
     (p31, p32), (p13, p14) = draw(pairs), draw(pairs)
-    return imp.FourState(p13=p13, p31=p31, p32=p32, p23=draw(probabilities), p14=p14)
+    return imp.FourStateLoss(p13=p13, p31=p31, p32=p32, p23=draw(probabilities), p14=p14)
 
 
 @st.composite
-def periodic(draw: st.DrawFn) -> imp.Periodic:
+def periodic(draw: st.DrawFn) -> imp.PeriodicLoss:
     period = draw(counts)
-    return imp.Periodic(
+    return imp.PeriodicLoss(
         period=period,
         burst=draw(st.integers(0, period)),
         first=draw(st.integers(0, 2**40)),
@@ -49,23 +49,23 @@ def periodic(draw: st.DrawFn) -> imp.Periodic:
 
 
 @st.composite
-def scripted(draw: st.DrawFn) -> imp.Scripted:
+def scripted(draw: st.DrawFn) -> imp.ScriptedLoss:
     lost = sorted(draw(st.sets(st.integers(0, 2**40 - 1), max_size=20)))
     least = lost[-1] + 1 if lost else 0
-    return imp.Scripted(
+    return imp.ScriptedLoss(
         lost=tuple(lost), repeat_every=draw(st.one_of(st.just(0), st.integers(least, 2**40)))
     )
 
 
 losses: st.SearchStrategy[imp.Loss] = st.one_of(
-    st.just(imp.Lossless()),
-    st.builds(imp.Bernoulli, probability=probabilities, correlation=correlations),
+    st.just(imp.NoLoss()),
+    st.builds(imp.BernoulliLoss, probability=probabilities, correlation=correlations),
     gilbert_elliott,
     four_states(),
     periodic(),
     scripted(),
-    st.builds(imp.Trace, file=files, repeat=st.booleans()),
-    st.just(imp.WorstCase()),
+    st.builds(imp.TraceLoss, file=files, repeat=st.booleans()),
+    st.just(imp.WorstCaseLoss()),
 )
 
 
@@ -132,7 +132,7 @@ def _goes_together(chain: list[imp.Impairment]) -> bool:
     scored = False
     for one in chain:
         if isinstance(one, imp.LossOf):
-            scored = isinstance(one.loss, imp.Bernoulli | imp.GilbertElliott)
+            scored = isinstance(one.loss, imp.BernoulliLoss | imp.GilbertElliottLoss)
         elif isinstance(one, imp.Delay) and one.loss_correlation and not scored:
             return False
     return True

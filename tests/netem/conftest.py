@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import Decision, Verdict, dtype_of
-from netem.rules.link_rules import State
+from netem.rule_records import PacketDecision, RecordedDecision, dtype_of
+from netem.rules.link_rules import LinkMemory
 from noack.config.impairments import Impairment, LinkSettings
 
 MOST = 1_000_000
@@ -23,7 +23,7 @@ class Decided(NamedTuple):
     verdicts: NDArray[Any]
     flows: NDArray[np.int64]
     arrivals_ns: NDArray[np.int64]
-    state: State
+    state: LinkMemory
 
     @property
     def fates(self) -> NDArray[np.int64]:
@@ -60,7 +60,7 @@ def decide(compiled_admit_many: Any) -> Decide:
         flows: ArrayLike = 0,
         sizes_bytes: ArrayLike = 100,
         arrivals_ns: ArrayLike | None = None,
-        decisions: Sequence[Sequence[Decision]] = (),
+        decisions: Sequence[Sequence[RecordedDecision]] = (),
     ) -> Decided:
         if not isinstance(settings, LinkSettings):
             settings = LinkSettings(impairments=tuple(settings), limit=MOST)
@@ -74,7 +74,7 @@ def decide(compiled_admit_many: Any) -> Decide:
         state = compiled_state(program, empty_state(program), many, recent_width(program))
         for flow in range(many):
             set_flow(state, flow, flow, settings.first_delivered)
-        verdicts = np.zeros(count, dtype_of(Verdict))
+        verdicts = np.zeros(count, dtype_of(PacketDecision))
         compiled_admit_many(
             compiled_program(program), state, np.array(all_flows), sizes, arrivals, verdicts
         )

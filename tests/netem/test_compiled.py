@@ -11,40 +11,40 @@ from hypothesis import strategies as st
 
 from netem.engine.many_decisions import admit_many
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import Decision, Verdict, dtype_of
-from netem.rules.link_rules import State
+from netem.rule_records import PacketDecision, RecordedDecision, dtype_of
+from netem.rules.link_rules import LinkMemory
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     LossOf,
-    Periodic,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    WorstCase,
+    ScriptedLoss,
+    WorstCaseLoss,
 )
 
 chances = st.floats(0, 1)
 correlations = st.just(0.0) | st.floats(0, 0.999)
 times_s = st.floats(0, 100.0)
 losses = st.one_of(
-    st.just(WorstCase()),
-    st.builds(Bernoulli, probability=chances, correlation=correlations),
+    st.just(WorstCaseLoss()),
+    st.builds(BernoulliLoss, probability=chances, correlation=correlations),
     st.builds(
-        GilbertElliott, good_to_bad=chances, bad_to_good=chances, loss_in_good=chances,
+        GilbertElliottLoss, good_to_bad=chances, bad_to_good=chances, loss_in_good=chances,
         loss_in_bad=chances,
     ),
-    st.builds(FourState, p13=st.floats(0, 0.5), p31=st.floats(0, 0.5), p32=st.floats(0, 0.5),
+    st.builds(FourStateLoss, p13=st.floats(0, 0.5), p31=st.floats(0, 0.5), p32=st.floats(0, 0.5),
               p23=chances, p14=st.floats(0, 0.5)),
-    st.builds(Periodic, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
-    st.sets(st.integers(0, 30)).map(lambda names: Scripted(lost=tuple(sorted(names)))),
+    st.builds(PeriodicLoss, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
+    st.sets(st.integers(0, 30)).map(lambda names: ScriptedLoss(lost=tuple(sorted(names)))),
 ).map(lambda loss: LossOf(loss=loss))  # fmt: skip
 impairments: st.SearchStrategy[Impairment] = st.one_of(
     losses,
@@ -73,7 +73,7 @@ def aware(loss: LossOf, correlation: float, of_loss: float) -> tuple[Impairment,
 
 pairs = st.builds(
     aware,
-    losses.filter(lambda one: isinstance(one.loss, Bernoulli | GilbertElliott)),
+    losses.filter(lambda one: isinstance(one.loss, BernoulliLoss | GilbertElliottLoss)),
     correlations,
     st.floats(-1, 1),
 )
@@ -87,7 +87,7 @@ links = st.builds(
     limit=st.sampled_from([1, 10, 10_000]),
 )  # fmt: skip
 decisions = st.builds(
-    Decision, fate=st.integers(0, 5), delay_ns=st.integers(-1, 10**7),
+    RecordedDecision, fate=st.integers(0, 5), delay_ns=st.integers(-1, 10**7),
     copy_delay_ns=st.just(-1) | st.integers(0, 10**7), bit=st.integers(-1, 9),
     copy_bit=st.integers(-1, 9),
 )  # fmt: skip
@@ -95,8 +95,8 @@ decisions = st.builds(
 
 def plain(
     of: LinkSettings, flows: Any, sizes: Any, arrivals: Any, seed: int,
-    recorded: Sequence[Sequence[Decision]] = (),
-) -> tuple[list[Verdict], State]:  # fmt: skip
+    recorded: Sequence[Sequence[RecordedDecision]] = (),
+) -> tuple[list[PacketDecision], LinkMemory]:  # fmt: skip
     program = program_of(of, seed, "test", decisions=recorded)
     many = max(flows) + 1
     state = empty_state(program)._replace(
@@ -104,7 +104,7 @@ def plain(
         memory=[new_memory(program) for _ in range(many)],
         recent_ns=[[-1] * recent_width(program) for _ in range(many)],
     )
-    verdicts = [Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0) for _ in flows]
+    verdicts = [PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0) for _ in flows]
     admit_many(program, state, flows, sizes, arrivals, verdicts)
     return verdicts, state
 
@@ -113,7 +113,7 @@ def rows(records: Sequence[Any]) -> Any:
     return np.array([astuple(one) for one in records], dtype_of(type(records[0])))
 
 
-def assert_equal(decided: Any, verdicts: Any, state: State) -> None:
+def assert_equal(decided: Any, verdicts: Any, state: LinkMemory) -> None:
     """Verdicts, and all that is remembered."""
     np.testing.assert_array_equal(decided.verdicts, rows(verdicts))
     np.testing.assert_array_equal(decided.state.flows, rows(state.flows))
@@ -154,7 +154,7 @@ def test_any_link_decides_the_same(
 
 EVERYTHING = LinkSettings(
     impairments=(
-        LossOf(loss=GilbertElliott(good_to_bad=0.1, bad_to_good=0.2, loss_in_bad=0.9)),
+        LossOf(loss=GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.2, loss_in_bad=0.9)),
         Duplicate(probability=0.1),
         Corrupt(probability=0.1, correlation=0.5),
         Delay(delay_s=0.005, jitter_s=0.003, distribution="paretonormal", loss_correlation=0.5),
@@ -192,7 +192,7 @@ def test_a_record_is_repeated_exactly(decide: Any) -> None:
     delays = np.where(past["release_ns"] >= 0, past["release_ns"] - arrivals[:recorded], -1)
     copies = np.where(past["copy_ns"] >= 0, past["copy_ns"] - arrivals[:recorded], -1)
     taken = [
-        Decision(*row)
+        RecordedDecision(*row)
         for row in zip(
             past["fate"].tolist(), delays.tolist(), copies.tolist(), past["bit"].tolist(),
             past["copy_bit"].tolist(), strict=True,
@@ -201,7 +201,7 @@ def test_a_record_is_repeated_exactly(decide: Any) -> None:
     again = decide(EVERYTHING, count, seed=2, arrivals_ns=arrivals, decisions=[taken])
     for field in ("fate", "packet", "run", "release_ns", "copy_ns", "bit", "copy_bit"):
         np.testing.assert_array_equal(again.verdicts[field][:recorded], past[field])
-    assert (again.verdicts["held_ns"][:recorded] == 0).all()
+    assert (again.verdicts["hold_back_ns"][:recorded] == 0).all()
     assert (again.fates[recorded:] != first.fates[recorded:]).any()
 
 

@@ -9,20 +9,20 @@ from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link, update_link_of
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
     LossOf,
     Rate,
     Reorder,
-    WorstCase,
+    WorstCaseLoss,
 )
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -36,11 +36,11 @@ from noack.protocol.record_tables import (
 )
 
 MS = 1_000_000
-BERNOULLI = Bernoulli(probability=0.6)
-BURSTS = GilbertElliott(good_to_bad=0.3, bad_to_good=0.2)
-CORRELATED = Bernoulli(probability=0.4, correlation=0.7)
-STATES = FourState(p13=0.3, p31=0.2, p32=0.3, p23=0.5, p14=0.2)
-ALL = WorstCase()
+BERNOULLI = BernoulliLoss(probability=0.6)
+BURSTS = GilbertElliottLoss(good_to_bad=0.3, bad_to_good=0.2)
+CORRELATED = BernoulliLoss(probability=0.4, correlation=0.7)
+STATES = FourStateLoss(p13=0.3, p31=0.2, p32=0.3, p23=0.5, p14=0.2)
+ALL = WorstCaseLoss()
 LOSSES = [BERNOULLI, BURSTS, CORRELATED, STATES, ALL]
 JITTER = Delay(delay_s=0.01, jitter_s=0.005, distribution="normal", correlation=0.3)
 TIMELESS: tuple[Impairment, ...] = (
@@ -117,7 +117,7 @@ def test_nor_do_bits_copies_and_delays(arrivals: list[tuple[int, int]], mansd: i
 
     def decision(of: Link, flow: int, now_ns: int) -> tuple[int, ...]:
         verdict = of.decide(flow, 100, now_ns)
-        wish = verdict.release_ns - verdict.held_ns - now_ns if verdict.bit < 0 else -1
+        wish = verdict.release_ns - verdict.hold_back_ns - now_ns if verdict.bit < 0 else -1
         return verdict.fate, verdict.run, verdict.bit, verdict.copy_bit, max(wish, -1)
 
     for flow, now_ns in arrivals:
@@ -140,7 +140,7 @@ def test_every_seed_name_and_flow_has_a_stream_of_its_own(loss: Loss) -> None:
 
 def test_two_impairments_of_a_kind_are_independent() -> None:
     """Both lose with probability 1/2 each: together they lose three in four."""
-    half = LossOf(loss=Bernoulli(probability=0.5))
+    half = LossOf(loss=BernoulliLoss(probability=0.5))
     lost = np.array(fates(new_link(half, half, mansd=None), 0, 4000)) == Fate.DROPPED
     assert abs(lost.mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / 4000)
 
@@ -161,7 +161,7 @@ def test_adding_an_impairment_does_not_change_what_is_lost(
 
 
 CHANGES: dict[str, tuple[dict[str, Any], str]] = {
-    "loss": ({"loss": Bernoulli(probability=0.1)}, "lost"),
+    "loss": ({"loss": BernoulliLoss(probability=0.1)}, "lost"),
     "duplicate": ({"probability": 0.8}, "copied"),
     "corrupt": ({"probability": 0.9}, "bit"),
     "delay": ({"delay_s": 0.02}, "delay_ns"),
@@ -278,7 +278,7 @@ def test_what_is_under_way_leaves_in_the_order_of_time_and_then_of_arrival(
         found += [(now_ns, datagram.data) for datagram in sent(outputs)]
     found += [(due, sent(outputs)[0].data) for due, outputs in drain(link)]
     assert found == sorted(expected, key=lambda leaving: leaving[0])  # stable: ties as they came
-    assert link._state.link.under_way == 0
+    assert link._state.link.in_flight == 0
 
 
 def test_an_overdue_datagram_is_not_overtaken_by_one_that_comes_later() -> None:
@@ -296,7 +296,7 @@ def test_a_stale_datagram_is_recorded_as_such() -> None:
     ((due, outputs),) = drain(link)
     (row,) = rows_of(outputs, NETEM_RELEASE)
     assert (due, row["stale"]) == (10 * MS, 1)
-    assert (link.counters.overtaken, link.counters.longest_run) == (1, 1)
+    assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
 
 
 def test_a_copy_leaves_too_and_says_so() -> None:
@@ -328,7 +328,7 @@ def test_no_more_are_delayed_than_the_limit_lets(copies: bool) -> None:
     link = new_link(*impairments, Delay(delay_s=0.01), mansd=None, limit=5)
     found = fates(link, 0, 20)
     assert found.count(Fate.OVERFLOWED) == (17 if copies else 15)
-    assert link.counters.most_under_way == 5
+    assert link.counters.most_in_flight == 5
     assert len(drain(link)) == 5
     assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
 
@@ -338,7 +338,7 @@ def test_copies_of_what_leaves_at_once_keep_to_the_limit_too() -> None:
     for k in range(20):
         link.handle(Datagram(0, b"x"), k)
     assert link.counters.delivered == 20
-    assert link.counters.most_under_way == 5
+    assert link.counters.most_in_flight == 5
 
 
 @given(st.lists(st.integers(0, 2), max_size=60), st.none() | st.integers(0, 3))

@@ -16,26 +16,26 @@ from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import Decision, FlowState, Verdict
+from netem.rule_records import FlowState, PacketDecision, RecordedDecision
 from netem.rules import mansd as rule
 from netem.rules.link_rules import DELIVERED, settle
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    WorstCase,
+    ScriptedLoss,
+    WorstCaseLoss,
 )
 
 MS = 1_000_000
@@ -43,13 +43,13 @@ MS = 1_000_000
 probabilities = st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0])
 correlations = st.sampled_from([0.0, 0.8])
 losses = st.one_of(
-    st.just(Lossless()),
-    st.just(WorstCase()),
-    st.builds(Bernoulli, probability=probabilities, correlation=correlations),
-    st.builds(GilbertElliott, good_to_bad=probabilities, bad_to_good=probabilities),
-    st.just(FourState(p13=0.3, p31=0.2, p32=0.3, p23=0.5, p14=0.2)),
-    st.builds(Periodic, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
-    st.sets(st.integers(0, 30)).map(lambda names: Scripted(lost=tuple(sorted(names)))),
+    st.just(NoLoss()),
+    st.just(WorstCaseLoss()),
+    st.builds(BernoulliLoss, probability=probabilities, correlation=correlations),
+    st.builds(GilbertElliottLoss, good_to_bad=probabilities, bad_to_good=probabilities),
+    st.just(FourStateLoss(p13=0.3, p31=0.2, p32=0.3, p23=0.5, p14=0.2)),
+    st.builds(PeriodicLoss, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
+    st.sets(st.integers(0, 30)).map(lambda names: ScriptedLoss(lost=tuple(sorted(names)))),
 )
 delays = st.one_of(
     st.builds(
@@ -120,7 +120,7 @@ class Observer:
             if not counted or number > counted[-1]:
                 counted.append(number)
 
-    def longest_run(self, flow: int, sent: int, since: int = 0) -> int:
+    def longest_loss_burst(self, flow: int, sent: int, since: int = 0) -> int:
         """Of the datagrams from number ``since`` on, with what was sent and never came."""
         counted = [number for number in self.counted.get(flow, ()) if number >= since]
         borders = [since - 1, *counted, sent]
@@ -152,16 +152,16 @@ def send_all(
 
 def assert_kept(settings: LinkSettings, link: Link, observer: Observer, sent: Any) -> None:
     assert settings.mansd is not None
-    assert max(observer.longest_run(*of_flow) for of_flow in sent.items()) <= settings.mansd
+    assert max(observer.longest_loss_burst(*of_flow) for of_flow in sent.items()) <= settings.mansd
     in_force = 0
     for flow, count in sent.items():
         of_flow = link.flow(flow)
         assert of_flow is not None
-        assert of_flow.longest_run == observer.longest_run(flow, count, of_flow.since)
-        in_force = max(in_force, of_flow.longest_run)
+        assert of_flow.longest_loss_burst == observer.longest_loss_burst(flow, count, of_flow.since)
+        in_force = max(in_force, of_flow.longest_loss_burst)
         if settings.first_delivered:
             assert observer.counted[flow][0] == 0
-    assert link.counters.longest_run == in_force
+    assert link.counters.longest_loss_burst == in_force
 
 
 @settings(max_examples=150)
@@ -203,7 +203,7 @@ def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count
     while link.next_deadline_ns() is not None:
         observer.see(link.on_timer(0))
     for flow, of_flow in enumerate(sent):
-        assert observer.longest_run(flow, of_flow) <= (settings.mansd or 0)
+        assert observer.longest_loss_burst(flow, of_flow) <= (settings.mansd or 0)
 
 
 @settings(max_examples=100)
@@ -236,7 +236,7 @@ def test_another_cap_holds_from_when_it_is_in_force(
 
     def change() -> None:
         if rng.random() < 0.1:
-            assert link.counters.longest_run <= (in_force[-1].mansd or 0)
+            assert link.counters.longest_loss_burst <= (in_force[-1].mansd or 0)
             in_force.append(stages[int(rng.integers(len(stages)))])
             link.change(in_force[-1])
 
@@ -246,12 +246,16 @@ def test_another_cap_holds_from_when_it_is_in_force(
     for flow, count in sent.items():
         of_flow = link.flow(flow)
         assert of_flow is not None
-        assert of_flow.longest_run == observer.longest_run(flow, count, of_flow.since) <= cap
-    assert link.counters.longest_run <= cap
+        assert (
+            of_flow.longest_loss_burst
+            == observer.longest_loss_burst(flow, count, of_flow.since)
+            <= cap
+        )
+    assert link.counters.longest_loss_burst <= cap
 
 
 decisions = st.builds(
-    Decision,
+    RecordedDecision,
     fate=st.integers(0, 5),
     delay_ns=st.sampled_from([-1, 0, 1, MS, 5 * MS]),
     copy_delay_ns=st.sampled_from([-1, -1, 5 * MS]),
@@ -265,11 +269,11 @@ decisions = st.builds(
     st.booleans(),
 )  # fmt: skip
 def test_nor_when_anything_is_repeated(
-    recorded: list[Decision], gaps: list[int], mansd: int, first: bool
+    recorded: list[RecordedDecision], gaps: list[int], mansd: int, first: bool
 ) -> None:
     """A record may hold decisions that no link would take, and times may differ."""
     settings = LinkSettings(
-        impairments=(LossOf(loss=WorstCase()),), mansd=mansd, first_delivered=first
+        impairments=(LossOf(loss=WorstCaseLoss()),), mansd=mansd, first_delivered=first
     )
     link = Link(settings, 1, "a")
     link._program = program_of(settings, 1, "a", decisions=[recorded])
@@ -295,7 +299,7 @@ def test_without_a_cap_the_first_is_still_delivered(
 @pytest.mark.parametrize("first", [False, True])
 def test_all_is_lost_that_may_be_lost(decide: Any, mansd: int, first: bool) -> None:
     for impairment in (
-        LossOf(loss=WorstCase()),
+        LossOf(loss=WorstCaseLoss()),
         Corrupt(probability=1.0),
         Blackout(intervals_s=((0.0, 1e9),)),
     ):
@@ -327,7 +331,7 @@ def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
     state = empty_state(program)._replace(
         flows=[flow], memory=[new_memory(program)], recent_ns=[[-1] * width]
     )
-    verdict = Verdict(0, 0, 0, 0, 0, 0, 0, 0, 0)
+    verdict = PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0)
     releases: list[int | None] = []
     for packet, wish in enumerate(wishes):
         if wish is None and rule.must_pass(flow, mansd):
@@ -340,7 +344,7 @@ def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
             alternatives = sorted({wish, *(t for t in releases if t is not None and t > wish)})
             least = next(t for t in alternatives if longest_run_of([*releases, t]) <= mansd)
             assert verdict.release_ns == least
-            assert verdict.held_ns == least - wish
+            assert verdict.hold_back_ns == least - wish
             releases.append(least)
         assert longest_run_of(releases) <= mansd
 
@@ -364,7 +368,7 @@ def test_flows_never_share_a_counter(order: list[int], mansd: int, settings: Lin
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
     """Copies change neither which datagrams are forced nor the runs."""
-    worst = LossOf(loss=WorstCase())
+    worst = LossOf(loss=WorstCaseLoss())
     alone = decide(LinkSettings(impairments=(worst,), mansd=3), 1000)
     doubled = decide(LinkSettings(impairments=(worst, Duplicate(probability=1.0)), mansd=3), 1000)
     np.testing.assert_array_equal(alone.fates, doubled.fates)
@@ -376,11 +380,11 @@ def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
 
 HARSH: dict[str, tuple[Impairment, ...]] = {
     "losses and jitter": (
-        LossOf(loss=Bernoulli(probability=0.7, correlation=0.8)),
+        LossOf(loss=BernoulliLoss(probability=0.7, correlation=0.8)),
         Delay(delay_s=0.001, jitter_s=0.01, distribution="pareto"),
     ),
     "everything": (
-        LossOf(loss=GilbertElliott(good_to_bad=0.1, bad_to_good=0.05, loss_in_bad=0.95)),
+        LossOf(loss=GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.05, loss_in_bad=0.95)),
         Duplicate(probability=0.5),
         Corrupt(probability=0.6),
         Delay(delay_s=0.005, jitter_s=0.02, distribution="normal", loss_correlation=-0.9),

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from netem.link_machine import Link
-from netem.rule_records import Decision
+from netem.rule_records import RecordedDecision
 from netem.rules.mansd import NEVER_NS
 from netem.words.words_to_settings import settings_of
 from noack.protocol.record_tables import Fate
@@ -35,13 +35,15 @@ def test_the_example_is_what_the_link_decides(words: str, column: int) -> None:
     for k, comes, wish, *_ in rows:
         lost = k in ("3", "4")  # as the text says
         delay_ns = NEVER_NS if wish == NEVER else ns(wish) - ns(comes)
-        decisions.append(Decision(Fate.DROPPED if lost else Fate.DELIVERED, delay_ns, -1, -1, -1))
+        decisions.append(
+            RecordedDecision(Fate.DROPPED if lost else Fate.DELIVERED, delay_ns, -1, -1, -1)
+        )
     link = Link(settings_of(words), 0, "test", decisions=[decisions])
     leaves_ns, held, forced = [], [], []
     for row in rows:
         verdict = link.decide(0, 100, ns(row[1]))
         leaves_ns.append(verdict.release_ns)
-        held.append(verdict.held_ns > 0)
+        held.append(verdict.hold_back_ns > 0)
         forced.append(verdict.fate == Fate.FORCED)
     assert leaves_ns == [ns(row[column]) for row in rows]
     if column == 3:

@@ -11,7 +11,7 @@ from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.loss_prediction import predict, predicted_loss
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import Verdict, dtype_of
+from netem.rule_records import PacketDecision, dtype_of
 from netem.rules.mansd import NEVER_NS
 from netem.words.words_to_settings import settings_of
 from noack.config.impairments import LinkSettings
@@ -29,7 +29,7 @@ def not_delivered(settings: LinkSettings, seed: int) -> NDArray[np.bool_]:
     """Which of a million datagrams of a flow are not effectively delivered."""
     program = program_of(settings, seed, "test")
     state = compiled_state(program, empty_state(program), 1, recent_width(program))
-    verdicts = np.zeros(DECISIONS, dtype_of(Verdict))
+    verdicts = np.zeros(DECISIONS, dtype_of(PacketDecision))
     flows = np.zeros(DECISIONS, np.int64)
     compile_rule(admit_many)(
         compiled_program(program), state, flows, flows + 100, np.arange(DECISIONS), verdicts
@@ -159,10 +159,10 @@ QUEUE, OVERTAKEN = "as long as no queue overflows", "not counting what is overta
 )
 def test_what_is_not_counted_is_said(words: str, note: str) -> None:
     assert predict(settings_of(words)).note == note
-    assert overtakes(settings_of(words)) == (OVERTAKEN in note)
+    assert makes_stale(settings_of(words)) == (OVERTAKEN in note)
 
 
-def overtakes(settings: LinkSettings) -> bool:
+def makes_stale(settings: LinkSettings) -> bool:
     """Whether one of some datagrams, 10 µs apart, leaves before one that came before it."""
     link = Link(settings, 1, "test")
     leaves_ns = []

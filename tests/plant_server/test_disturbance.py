@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-from noack.config.disturbances import Gaussian, Step, Uniform
+from noack.config.disturbances import GaussianDisturbance, StepDisturbance, UniformDisturbance
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
@@ -15,7 +15,7 @@ from noack.core.random_streams import normals
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import disturbance_of
-from plant_server.measurement import Measuring, measuring_of
+from plant_server.measurement import MeasurementModel, measurement_model_of
 from plant_server.plant import Plant, plant_of
 
 STEPS = 4000
@@ -151,17 +151,17 @@ def test_measurements_carry_the_inputs_of_every_step_since_the_last(
 
 def test_noise_is_distributed_as_it_says() -> None:
     C = np.array([[1.0, 2.0]])
-    measuring = Measuring(C, np.array([0.5]), np.array([0.0]), seed=7)
+    measuring = MeasurementModel(C, np.array([0.5]), np.array([0.0]), seed=7)
     y = np.array([measuring(np.array([1.0, 3.0]), k)[0] for k in range(STEPS)])
     assert kstest((y - 7.0) / 0.5, "norm").pvalue > 1e-3
-    measuring = Measuring(C, np.array([0.0]), np.array([0.2]), seed=7)
+    measuring = MeasurementModel(C, np.array([0.0]), np.array([0.2]), seed=7)
     y = np.array([measuring(np.zeros(2), k)[0] for k in range(STEPS)])
     assert kstest(y, "uniform", (-0.2, 0.4)).pvalue > 1e-3
 
 
 def test_exact_measurements_are_the_state_itself(content: dict[str, Any]) -> None:
     content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
-    assert measuring_of(resolved(content)) is None
+    assert measurement_model_of(resolved(content)) is None
 
 
 def test_normal_numbers_are_finite_at_the_ends_and_found_at_once() -> None:
@@ -171,6 +171,6 @@ def test_normal_numbers_are_finite_at_the_ends_and_found_at_once() -> None:
 
 
 def test_variances_are_those_of_the_distributions() -> None:
-    assert Uniform(kind="uniform", bound=(3.0,)).variance.tolist() == [3.0]
-    assert Gaussian(kind="gaussian", std=(3.0,)).variance.tolist() == [9.0]
-    assert Step(kind="step", amplitude=(3.0,)).variance.tolist() == [0.0]
+    assert UniformDisturbance(kind="uniform", bound=(3.0,)).variance.tolist() == [3.0]
+    assert GaussianDisturbance(kind="gaussian", std=(3.0,)).variance.tolist() == [9.0]
+    assert StepDisturbance(kind="step", amplitude=(3.0,)).variance.tolist() == [0.0]

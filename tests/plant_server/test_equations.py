@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plant_systems import FourTank, Vehicle
+from noack.config.plant_systems import FourTankSettings, VehicleSettings
 from plant_server.systems import equations as compiled
 from plant_server.systems.equations import equations, library
 from plant_server.systems.system_from_settings import prepare
@@ -90,9 +90,9 @@ def test_they_are_compiled_before_a_run_once(monkeypatch: pytest.MonkeyPatch) ->
     made: list[str] = []
     monkeypatch.setattr(compiled, "prepare", made.append)
     monkeypatch.setattr(compiled, "kept", lambda model: model == "st")
-    prepare(Vehicle(kind="vehicle"))
-    prepare(Vehicle(kind="vehicle", model="multi_body"))
-    prepare(Vehicle(kind="vehicle", model="kinematic", parameters="truck"))
-    prepare(FourTank(kind="four_tank"))
+    prepare(VehicleSettings(kind="vehicle"))
+    prepare(VehicleSettings(kind="vehicle", model="multi_body"))
+    prepare(VehicleSettings(kind="vehicle", model="kinematic", parameters="truck"))
+    prepare(FourTankSettings(kind="four_tank"))
     prepare(None)
     assert made == ["mb", "kst"]

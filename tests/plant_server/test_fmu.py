@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plant_systems import Fmu
+from noack.config.plant_systems import FmuSettings
 from noack.config.system_files import read_system
 from noack.core.errors import CallerError
 from plant_server.ode_integrator import OdeSystem
@@ -35,10 +35,10 @@ def own_folder_for_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     return folder
 
 
-def settings(path: Path, **more: Any) -> Fmu:
+def settings(path: Path, **more: Any) -> FmuSettings:
     given = {"state_variables": ("x0", "x1"), "input_variables": ("u",)} | more
-    loaded = read_system(Fmu(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
-    assert isinstance(loaded, Fmu)
+    loaded = read_system(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
+    assert isinstance(loaded, FmuSettings)
     return loaded
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plant_systems import Python
+from noack.config.plant_systems import PythonSettings
 from noack.config.system_files import read_system
 from noack.core.errors import CallerError
 from plant_server.system import SystemFailedError
@@ -43,11 +43,13 @@ STEPPING = """
 """
 
 
-def settings(folder: Path, code: str, name: str, **more: Any) -> Python:
+def settings(folder: Path, code: str, name: str, **more: Any) -> PythonSettings:
     path = folder / "mine.py"
     path.write_text(dedent(code))
-    loaded = read_system(Python(kind="python", name=name, file=str(path), **more), Path(), "s.toml")
-    assert isinstance(loaded, Python)
+    loaded = read_system(
+        PythonSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml"
+    )
+    assert isinstance(loaded, PythonSettings)
     return loaded
 
 
@@ -122,14 +124,14 @@ def test_a_shipped_system_is_a_plant_by_entry_point_and_by_module(
     (folder / "entry_points.txt").write_text("[noack.plants]\nswing = installed_plants:Pendulum\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "installed_plants", raising=False)
-    by_entry = PythonSystem(Python(kind="python", name="swing"), X0, 1)
+    by_entry = PythonSystem(PythonSettings(kind="python", name="swing"), X0, 1)
     assert by_entry.about == "class installed_plants:Pendulum, installed-plants 1.2"
-    by_module = PythonSystem(Python(kind="python", name="installed_plants:Pendulum"), X0, 1)
+    by_module = PythonSystem(PythonSettings(kind="python", name="installed_plants:Pendulum"), X0, 1)
     for system in (by_entry, by_module):
         system.advance(np.zeros(1), 0, H_NS)
     assert by_entry.x.tobytes() == by_module.x.tobytes()
     with pytest.raises(CallerError, match=r"no installed package has .*there are: .*swing"):
-        PythonSystem(Python(kind="python", name="swung"), X0, 1)
+        PythonSystem(PythonSettings(kind="python", name="swung"), X0, 1)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from noack.config.plant_systems import CartPole
+from noack.config.plant_systems import CartPoleSettings
 from plant_server.ode_integrator import OdeSystem
 from plant_server.plant_linearisation import linearise
 from plant_server.systems.cart_pole import cart_pole
@@ -22,7 +22,7 @@ def run(system: OdeSystem, inputs: list[float], h_ns: int = H_NS) -> np.ndarray:
     return np.array(states)
 
 
-def energy(settings: CartPole, x: np.ndarray) -> float:
+def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
     _, v, angle, rate = x.tolist()
     m, length = settings.pole_kg, settings.length_m
     along, up = v + length * rate * math.cos(angle), -length * rate * math.sin(angle)
@@ -31,7 +31,7 @@ def energy(settings: CartPole, x: np.ndarray) -> float:
 
 
 def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
-    settings = CartPole(kind="cart_pole", friction_n_s_per_m=0.0)
+    settings = CartPoleSettings(kind="cart_pole", friction_n_s_per_m=0.0)
     states = run(cart_pole(settings, np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 1000)
     assert np.ptp(states[:, 2]) > 1.0  # it has fallen
     energies = [energy(settings, x) for x in states]
@@ -42,7 +42,7 @@ def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
 
 
 def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
-    settings = CartPole(kind="cart_pole")
+    settings = CartPoleSettings(kind="cart_pole")
     force, h_ns = 0.7, 500_000
     states = run(cart_pole(settings, np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns)
     power = force * states[:, 1] - settings.friction_n_s_per_m * states[:, 1] ** 2
@@ -53,7 +53,7 @@ def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
 
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
     """Open loop, by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041, 5.5651."""
-    A, B = linearise(lambda x0: cart_pole(CartPole(kind="cart_pole"), x0), 4, 1)
+    A, B = linearise(lambda x0: cart_pole(CartPoleSettings(kind="cart_pole"), x0), 4, 1)
     poles = np.sort(np.linalg.eigvals(A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
     np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
@@ -73,11 +73,11 @@ def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
 
 
 def test_the_same_steps_give_the_same_bits_whatever_was_integrated_before() -> None:
-    first = cart_pole(CartPole(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
+    first = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
     expected = run(first, [0.3, -0.1, 2.0] * 20)
-    other = cart_pole(CartPole(kind="cart_pole"), np.array([0.5, 0.0, -1.0, 3.0]))
+    other = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.5, 0.0, -1.0, 3.0]))
     run(other, [9.0] * 50)
-    second = cart_pole(CartPole(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
+    second = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
     assert run(second, [0.3, -0.1, 2.0] * 20).tobytes() == expected.tobytes()
 
 

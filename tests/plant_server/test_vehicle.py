@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from noack.config.named_models import single_track_lane
-from noack.config.plant_systems import Vehicle
+from noack.config.plant_systems import VehicleSettings
 from noack.core.errors import CallerError
 from plant_server.ode_integrator import OdeSystem
 from plant_server.plant_linearisation import linearise
@@ -21,8 +21,8 @@ CARS = ("ford_escort", "bmw_320i", "vw_vanagon")
 MODELS = ("kinematic", "single_track", "drift", "multi_body")
 
 
-def settings(**given: Any) -> Vehicle:
-    return Vehicle(kind="vehicle", **given)
+def settings(**given: Any) -> VehicleSettings:
+    return VehicleSettings(kind="vehicle", **given)
 
 
 def parameters(car: str) -> Any:

@@ -17,7 +17,7 @@ from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
 from sensor_node.sensor import sensor_of
-from sensor_node.state_observer import Following, KalmanObserver, LuenbergerObserver
+from sensor_node.state_observer import AppliedInputTracker, KalmanObserver, LuenbergerObserver
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])
@@ -84,7 +84,7 @@ def test_the_kalman_filter_is_the_conditional_mean() -> None:
     rng = np.random.default_rng(1)
     x0, P0 = np.array([0.3, -0.2]), np.diag([0.5, 0.2])
     u, y = rng.normal(size=(12, 1)), rng.normal(size=13)
-    following = Following(KalmanObserver(model(), x0, P0), 1, 1, H_NS, None)
+    following = AppliedInputTracker(KalmanObserver(model(), x0, P0), 1, 1, H_NS, None)
     for k in range(13):
         inputs = u[k - 1] if k else np.zeros(1)
         x = following.take(k * H_NS, y[k : k + 1], inputs)
@@ -114,7 +114,7 @@ def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
     error_matrix = (np.eye(2) - L @ C) @ Ad_T
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(error_matrix)), np.sort(poles), rtol=1e-9)
     x, x_hat = np.array([0.4, -1.0]), np.array([0.0, 0.5])
-    following = Following(LuenbergerObserver(model(steps), L, x_hat), 1, 1, H_NS, 0)
+    following = AppliedInputTracker(LuenbergerObserver(model(steps), L, x_hat), 1, 1, H_NS, 0)
     error = following.take(0, C @ x, np.zeros(steps)) - x
     rng = np.random.default_rng(2)
     Ad, Bd, *_ = model()
@@ -145,7 +145,9 @@ def test_what_does_not_show_is_told_by_its_eigenvalue() -> None:
 
 
 def test_missing_measurements_are_bridged_by_the_first_input_that_is_known() -> None:
-    one = Following(LuenbergerObserver(model(2), np.zeros((2, 1)), np.ones(2)), 1, 1, H_NS, 0)
+    one = AppliedInputTracker(
+        LuenbergerObserver(model(2), np.zeros((2, 1)), np.ones(2)), 1, 1, H_NS, 0
+    )
     x = one.take(5 * H_NS, np.zeros(1), np.array([0.7, -0.4]))
     Ad, Bd, *_ = model()
     expected = np.ones(2)

@@ -9,11 +9,11 @@ from rich.table import Table
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.tightness import Worst
 from noack.config.scenario import Scenario
-from noack.theory.scenario_certificates import Certificate
+from noack.theory.scenario_certificates import ScenarioCertificate
 
 
 def document(
-    found: Sequence[Worst], resolved: Scenario, certificate: Certificate
+    found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
 ) -> dict[str, Any]:
     """The results as JSON."""
     return {
@@ -27,7 +27,7 @@ def document(
 
 
 def print_worst(
-    console: Console, found: Sequence[Worst], resolved: Scenario, certificate: Certificate
+    console: Console, found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
 ) -> None:
     """Print the results, and the patterns that led to them."""
     table = Table(
@@ -53,7 +53,7 @@ def print_worst(
     console.print("[dim]D delivered, · lost; --json tells the times of the events[/]")
 
 
-def _quantity(objective: Objective, certificate: Certificate) -> str:
+def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
     rate = certificate.alpha_per_s
     if certificate.constants is not None:
         rate = certificate.constants.rate_per_s

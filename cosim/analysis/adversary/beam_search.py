@@ -11,11 +11,11 @@ import numpy as np
 
 from cosim.analysis.adversary.search_nodes import (
     Best,
-    Found,
+    DecisionLog,
     Indices,
-    Log,
     Nodes,
     Report,
+    WorstPatternFound,
     branches,
     root,
     together,
@@ -37,7 +37,7 @@ def search_beam(
     *,
     known: float = -np.inf,
     report: Report = lambda nodes, value: None,
-) -> Found:
+) -> WorstPatternFound:
     """Look for a large value among patterns with at most ``mansd`` dropouts in a row.
 
     Args:
@@ -51,7 +51,7 @@ def search_beam(
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    log, best, choice = Log(), Best(flow, known), _Choice(flow, width, window_s)
+    log, best, choice = DecisionLog(), Best(flow, known), _Choice(flow, width, window_s)
     waiting, visited, until_s = root(flow), 0, 0.0
     while len(waiting.t_s) and best.value < np.inf:
         until_s = max(until_s, float(waiting.t_s.min())) + window_s

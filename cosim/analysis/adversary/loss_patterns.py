@@ -4,7 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cosim.analysis.adversary.search_nodes import Found, Log, after_events, root, together
+from cosim.analysis.adversary.search_nodes import (
+    DecisionLog,
+    WorstPatternFound,
+    after_events,
+    root,
+    together,
+)
 from cosim.analysis.adversary.segments import SegmentFlow
 from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEventsError
 from noack.core.linear_systems import Vector
@@ -30,7 +36,7 @@ def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
     Raises:
         TooManyEventsError: a run has more than 100,000 events, or two at the same time.
     """
-    count, log = len(patterns), Log()
+    count, log = len(patterns), DecisionLog()
     longest = max(map(len, patterns), default=0)
     wanted = np.ones((count, longest + 1), dtype=bool)
     for row, pattern in zip(wanted, patterns, strict=True):
@@ -72,7 +78,7 @@ def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Patter
 
 def improve(
     flow: SegmentFlow, mansd: int, pattern: Pattern, value: float, most_nodes: int
-) -> Found:
+) -> WorstPatternFound:
     """Change single decisions as long as that makes a pattern worse for the loop.
 
     Args:
@@ -94,7 +100,7 @@ def improve(
         if not tried.value[top] > value:
             break
         value, pattern = float(tried.value[top]), tried.patterns[top]
-    return Found(value, pattern, visited, complete=False)
+    return WorstPatternFound(value, pattern, visited, complete=False)
 
 
 def _changed(pattern: Pattern, i: int) -> Pattern:

@@ -6,10 +6,10 @@ import numpy as np
 
 from cosim.analysis.adversary.search_nodes import (
     Best,
-    Found,
-    Log,
+    DecisionLog,
     Nodes,
     Report,
+    WorstPatternFound,
     branches,
     root,
     together,
@@ -31,7 +31,7 @@ def search_tree(
     known: float = -np.inf,
     ceiling: Ceiling | None = None,
     report: Report = lambda nodes, value: None,
-) -> Found:
+) -> WorstPatternFound:
     """Look for the largest value over all patterns with at most ``mansd`` dropouts in a row.
 
     Args:
@@ -45,7 +45,7 @@ def search_tree(
     Raises:
         TooManyEventsError: two events at the same time.
     """
-    log, best, pile = Log(), Best(flow, known), [root(flow)]
+    log, best, pile = DecisionLog(), Best(flow, known), [root(flow)]
     visited = 0
     while pile and best.value < np.inf:
         nodes = _top(pile)

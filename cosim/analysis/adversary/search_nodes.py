@@ -59,7 +59,7 @@ def together(parts: Sequence[Nodes]) -> Nodes:
     return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-class Log:
+class DecisionLog:
     """Decisions, each with the one before it."""
 
     def __init__(self) -> None:
@@ -86,7 +86,7 @@ class Log:
         return tuple(reversed(found))
 
 
-class Found(NamedTuple):
+class WorstPatternFound(NamedTuple):
     """What a search came to."""
 
     value: float
@@ -120,14 +120,19 @@ class Best:
             self.value, self.entry = float(candidates[top]), int(nodes.entry[top])
         return value
 
-    def found(self, log: Log, nodes: int, *, complete: bool) -> Found:
+    def found(self, log: DecisionLog, nodes: int, *, complete: bool) -> WorstPatternFound:
         """What was found in the end."""
         decisions = None if self.entry is None else log.decisions(self.entry)
-        return Found(self.value, decisions, nodes, complete)
+        return WorstPatternFound(self.value, decisions, nodes, complete)
 
 
 def after_events(
-    nodes: Nodes, segments: Segments, value: Vector, these: Indices, delivered: Flags, log: Log
+    nodes: Nodes,
+    segments: Segments,
+    value: Vector,
+    these: Indices,
+    delivered: Flags,
+    log: DecisionLog,
 ) -> Nodes:
     """The runs ``these`` after the events that ended their segments.
 
@@ -158,7 +163,9 @@ def after_events(
     )
 
 
-def branches(nodes: Nodes, segments: Segments, value: Vector, mansd: int, log: Log) -> Nodes:
+def branches(
+    nodes: Nodes, segments: Segments, value: Vector, mansd: int, log: DecisionLog
+) -> Nodes:
     """All runs that can follow: each update lost, if ``mansd`` allows, and delivered."""
     events = np.flatnonzero(segments.is_event)
     losable = events[nodes.dropouts[events] < mansd]

@@ -20,7 +20,7 @@ _CLOSE = 0.95
 """A sampled |y|² is within 5 % of its maximum."""
 
 
-class Worth(Protocol):
+class SegmentObjective(Protocol):
     """How a stretch is valued.
 
     Args:
@@ -45,7 +45,7 @@ class Supremum:
         self._curve = _OutputCurve(taylor, _POINTS)
 
     def __call__(self, z: Matrix, u: Vector, known: Vector) -> Vector:
-        """See :class:`Worth`."""
+        """See :class:`SegmentObjective`."""
         squares = self._curve.squares(z, u)
         highest = np.asarray(squares.max(axis=1))
         worth_it = _CLOSE * np.maximum(highest, np.maximum(known, 0.0) ** 2)
@@ -72,7 +72,7 @@ class SquareIntegral:
         self._weights = width_s * weights / 2
 
     def __call__(self, z: Matrix, u: Vector, known: Vector) -> Vector:
-        """See :class:`Worth`."""
+        """See :class:`SegmentObjective`."""
         return np.asarray(u * (self._curve.squares(z, u) @ self._weights))
 
 

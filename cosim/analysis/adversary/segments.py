@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from cosim.analysis.adversary.objective import Measure
 from cosim.analysis.adversary.polynomial_curves import curve_stack, powers
-from cosim.analysis.adversary.segment_objective import SquareIntegral, Supremum, Worth, columns
+from cosim.analysis.adversary.segment_objective import (
+    SegmentObjective,
+    SquareIntegral,
+    Supremum,
+    columns,
+)
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.exact_flow import DEGREE, taylor_terms
 from noack.core.linear_systems import Matrix, Vector
@@ -112,7 +117,7 @@ class _Phase:
         self._error = columns(error)
         self._control = columns(np.tensordot(self._curves.from_taylor, error, 1))
         self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=0).max()), 1.0)
-        self._worth: Worth | None = None
+        self._worth: SegmentObjective | None = None
         if measure.output is not None:
             terms = taylor_terms(generator + rate_per_s * identity, self._width_s)
             output = measure.output @ terms

@@ -10,7 +10,7 @@ from cosim.analysis.adversary.loss_patterns import Pattern
 from cosim.analysis.adversary.objective import Measure, Objective
 from cosim.analysis.adversary.pattern_evaluation import Valued
 from noack.theory.certificate import Constants
-from noack.theory.scenario_certificates import Certificate
+from noack.theory.scenario_certificates import ScenarioCertificate
 
 _BREACH = 1 + 1e-9
 
@@ -90,7 +90,7 @@ def shown(value: float, objective: Objective) -> float | None:
 
 
 def certified(
-    certificate: Certificate, measure: Measure, horizon_s: float, valued: Valued
+    certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
 ) -> float | None:
     """What the certificate says of the same quantity, at the same time."""
     first, late = certificate.constants, certificate.floor_constants

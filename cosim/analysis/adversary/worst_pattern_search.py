@@ -19,7 +19,7 @@ from cosim.analysis.adversary.loss_patterns import Pattern, candidates, follow, 
 from cosim.analysis.adversary.objective import Measure, Objective, measure_of
 from cosim.analysis.adversary.pattern_evaluation import evaluate
 from cosim.analysis.adversary.pattern_tree import search_tree
-from cosim.analysis.adversary.search_nodes import Found
+from cosim.analysis.adversary.search_nodes import WorstPatternFound
 from cosim.analysis.adversary.segments import SegmentFlow
 from cosim.analysis.adversary.tightness import Worst, certified, shown
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
@@ -28,7 +28,7 @@ from cosim.simulation.continuous.network_fates import network_fates
 from noack.config.scenario import Scenario
 from noack.core.random_streams import stream
 from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import Certificate, certify
+from noack.theory.scenario_certificates import ScenarioCertificate, certify
 
 NODES = 500_000
 BEAM = 512
@@ -57,7 +57,7 @@ def find_worst(
     most_nodes: int = NODES,
     beam: int = BEAM,
     seed: int = 0,
-    certificate: Certificate | None = None,
+    certificate: ScenarioCertificate | None = None,
     report: SearchReport = lambda what, nodes, value: None,
 ) -> Worst:
     """Find the pattern, with at most M − 1 updates lost in a row, that is worst for the loop.
@@ -192,7 +192,7 @@ class _Search:
         if found.value > self.known.value or not self.known.pattern:
             self.known = _Known(found.value, found.decisions or ())
 
-    def _take(self, found: Found) -> None:
+    def _take(self, found: WorstPatternFound) -> None:
         self.visited += found.nodes
         if found.decisions is not None:
             self.known = _Known(found.value, found.decisions)

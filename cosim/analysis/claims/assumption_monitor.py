@@ -1,8 +1,8 @@
 """Watches over the conditions of a run's claims while it goes on.
 
-What it says is what :mod:`cosim.analysis.claims.claim_evaluation` says after the run, from the same
-limits and the same :class:`~cosim.analysis.claims.condition_reader.Observer`: as soon as the rows
-that show it are in.
+It reports what :mod:`cosim.analysis.claims.claim_evaluation` reports after the run, from the same
+limits and with the same :class:`~cosim.analysis.claims.condition_reader.ConditionReader`, as soon
+as the rows that show it are in.
 """
 
 import math
@@ -10,8 +10,14 @@ from collections.abc import Collection
 
 import numpy as np
 
-from cosim.analysis.claims.condition_reader import Observer
-from cosim.analysis.claims.observed_conditions import CAUSES, Departure, Left, Observed, earliest
+from cosim.analysis.claims.condition_reader import ConditionReader
+from cosim.analysis.claims.observed_conditions import (
+    CAUSES,
+    AssumptionViolation,
+    Left,
+    ObservedConditions,
+    earliest,
+)
 from cosim.record.run_record import Rows
 from noack.config.scenario import Scenario
 from noack.theory.run_conditions import allowed_conditions
@@ -20,7 +26,7 @@ _MOST_WAITING = 100_000
 """Minutes of rows that wait for a process that says nothing: then nobody should keep them."""
 
 
-class Guard:
+class AssumptionMonitor:
     """Says when a run leaves the conditions of its claims, once for each way of leaving them.
 
     Args:
@@ -28,11 +34,11 @@ class Guard:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._observer = Observer(scenario)
+        self._observer = ConditionReader(scenario)
         self._conditions = allowed_conditions(scenario)
         self._causes = causes_of(scenario)
         self._run = 0
-        self._found: dict[str, Departure] = {}
+        self._found: dict[str, AssumptionViolation] = {}
         self._until_s = math.inf
         self.blind: str | None = None
         """Why it can say no more; None as long as it can."""
@@ -53,7 +59,7 @@ class Guard:
         """
         self._until_s = min(self._until_s, t_s)
 
-    def advance(self) -> list[Departure]:
+    def advance(self) -> list[AssumptionViolation]:
         """In which respects the run has now left the conditions for the first time."""
         if self.blind is not None:
             return []
@@ -62,7 +68,7 @@ class Guard:
             self.give_up("a process has not been heard of for too long")
         return found
 
-    def end(self) -> list[Departure]:
+    def end(self) -> list[AssumptionViolation]:
         """The same, of what was still waiting for rows; no more come."""
         return [] if self.blind is not None else self._judge(self._observer.end())
 
@@ -77,7 +83,7 @@ class Guard:
         return self._observer.waiting
 
     @np.errstate(all="ignore")  # a run may diverge
-    def _judge(self, seen: Observed) -> list[Departure]:
+    def _judge(self, seen: ObservedConditions) -> list[AssumptionViolation]:
         new = []
         for one in seen.departures(self._conditions, self._causes, self._run):
             if one.t_s >= self._until_s:

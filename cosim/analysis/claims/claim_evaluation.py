@@ -11,22 +11,22 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.condition_reader import observe
-from cosim.analysis.claims.observed_conditions import Left, Observed, Series
+from cosim.analysis.claims.condition_reader import read_conditions
+from cosim.analysis.claims.observed_conditions import Left, ObservedConditions, SampledSeries
 from cosim.analysis.claims.theorem_one import theorem_one
-from cosim.record.align import Joined, identity_residual, in_common, join_all
+from cosim.record.align import AlignedRun, identity_residual, in_common, join_all
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import row_norms, transition
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
-from noack.theory.certificate import Conditions
+from noack.theory.certificate import NetworkConditions
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import (
     OWN_PLANT,
-    Certificate,
+    ScenarioCertificate,
     certify,
     certify_box,
     outside_box,
@@ -39,7 +39,7 @@ Reals = NDArray[np.float64]
 _ROUNDING = 1e-9
 _IDENTITY, _LARGEST_IDENTITY = 1e-9, 1e-6
 _LONG_S = 1e300  # finite: what never came took longer
-_ANY = Conditions(sys.maxsize, *[_LONG_S] * 5)
+_ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)
 
 
 class ClaimVerdict(StrEnum):
@@ -96,7 +96,7 @@ class Envelope(NamedTuple):
     """What it rests on: a certificate, identity (I1), or a formula printed in the paper."""
 
 
-class Part(NamedTuple):
+class RunPart(NamedTuple):
     """What part of a run a record is of that is judged as a run of its own."""
 
     whole: RunRecord
@@ -112,7 +112,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Claims:
+class ClaimEvaluation:
     """The claims about one run; everything is computed when it is asked for, and once.
 
     Args:
@@ -121,15 +121,15 @@ class Claims:
     """
 
     record: RunRecord
-    part: Part | None = None
+    part: RunPart | None = None
 
     @cached_property
-    def joined(self) -> Joined:
+    def joined(self) -> AlignedRun:
         """The run's samples."""
         return join_all(self.record)
 
     @cached_property
-    def certificates(self) -> list[Certificate]:
+    def certificates(self) -> list[ScenarioCertificate]:
         """The certificates of the run's scenario under its schedule."""
         if self.part is None:
             return scheduled_certificates(self.record.scenario)
@@ -180,12 +180,12 @@ class Claims:
         return min(filter(None, (lost, self._unknown)), default=None)
 
     @cached_property
-    def _schedule(self) -> Conditions:
+    def _schedule(self) -> NetworkConditions:
         return nominal_conditions(self.record.scenario)
 
     @cached_property
-    def _observed(self) -> Observed:
-        found = observe(self.record)
+    def _observed(self) -> ObservedConditions:
+        found = read_conditions(self.record)
         if self.part is None or self.part.start_error is None:
             return found
         # What the plant felt until its new start, the certificate takes into account otherwise.
@@ -193,14 +193,14 @@ class Claims:
         kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
         return found._replace(
             start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
-            safe_input=Series(safe.t_s[kept], safe.value[kept]),
-            restarts=Series(restarts.t_s[again], restarts.value[again]),
+            safe_input=SampledSeries(safe.t_s[kept], safe.value[kept]),
+            restarts=SampledSeries(restarts.t_s[again], restarts.value[again]),
         )
 
     @property
     def started_s(self) -> float:
         """When the plant began to feel the controller; infinite if never."""
-        return observe(self.record).start_s
+        return read_conditions(self.record).start_s
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict."""
@@ -463,7 +463,7 @@ def _upper(
 
 def scheduled_certificates(
     scenario: Scenario, start_error: float | None = None
-) -> list[Certificate]:
+) -> list[ScenarioCertificate]:
     """The certificates of a resolved scenario under its own schedule, with its allowance.
 
     There are none of what is beyond the theory.

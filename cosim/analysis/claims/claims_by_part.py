@@ -7,7 +7,7 @@ the controller has: there x_s = x, and x_c is reset to it. In between nothing is
 Such a run begins with another input than none. Until the plant feels the first update, u is what
 the controller's older knowledge made of it; how far from Kx that was is on record, and a
 certificate holds if it is of input errors no smaller than that
-(:class:`noack.theory.scenario_certificates.Scope`).
+(:class:`noack.theory.scenario_certificates.CertificateScope`).
 """
 
 import math
@@ -17,15 +17,21 @@ from functools import cached_property
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import Claim, Claims, ClaimVerdict, Envelope, Part
+from cosim.analysis.claims.claim_evaluation import (
+    Claim,
+    ClaimEvaluation,
+    ClaimVerdict,
+    Envelope,
+    RunPart,
+)
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
 from cosim.analysis.claims.observed_conditions import Left
-from cosim.record.recorded_changes import NEVER_NS, Made, changes_of
+from cosim.record.recorded_changes import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.runtime_parameters import text_of
 from noack.config.scenario import Scenario
-from noack.config.triggers import Decaying
+from noack.config.triggers import DecayingSettings
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
 from noack.protocol.record_tables import (
@@ -66,20 +72,20 @@ class RunClaims:
         return None if end_ns is None else end_ns / NS_PER_S
 
     @cached_property
-    def _changes(self) -> list[Made]:
+    def _changes(self) -> list[RecordedChange]:
         return [made for made in changes_of(self._judged) if made.touches_claims]
 
     @cached_property
-    def parts(self) -> list[Claims | Claim]:
+    def parts(self) -> list[ClaimEvaluation | Claim]:
         """The claims of each part; where nothing can be claimed, the word on it."""
         record, changes = self._judged, self._changes
         at_0 = setpoint_of(record.scenario)
         if not changes and at_0 is None:
-            return [Claims(record)]
+            return [ClaimEvaluation(record)]
         first_ns = changes[0].first_ns if changes else NEVER_NS
-        part = Part(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
+        part = RunPart(record, 0.0, _seconds(first_ns), None, _void(record, record.scenario))
         own = record if at_0 is None else _part_of(record, record.scenario, 0, None)
-        found: list[Claims | Claim] = [Claims(own, part)]
+        found: list[ClaimEvaluation | Claim] = [ClaimEvaluation(own, part)]
         for made, after in zip(changes, [*changes[1:], None], strict=True):
             until_ns = NEVER_NS if after is None else after.first_ns
             found.append(self._after(made, until_ns))
@@ -88,16 +94,16 @@ class RunClaims:
     @property
     def conditions(self) -> dict[str, float | None]:
         """Largest observed value of each condition, over the whole run."""
-        return Claims(self._judged).conditions
+        return ClaimEvaluation(self._judged).conditions
 
     @property
     def beyond_mansd(self) -> Left:
         """When more than M − 1 updates in a row had been lost, whoever lost them."""
         if not self._changes:
-            return Claims(self._judged).beyond_mansd
+            return ClaimEvaluation(self._judged).beyond_mansd
         found: list[Left] = []
         for one in self.parts:
-            if isinstance(one, Claims) and one.part is not None:
+            if isinstance(one, ClaimEvaluation) and one.part is not None:
                 left = one.beyond_mansd
                 if left is not None and left[0] < one.part.until_s:
                     found.append((left[0] + one.part.from_s, left[1]))
@@ -135,7 +141,7 @@ class RunClaims:
             found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
         return found
 
-    def _after(self, made: Made, until_ns: int) -> Claims | Claim:
+    def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
         """The claims of the run of its own that follows a change."""
         record, text = self._judged, text_of(made.change.settings)
         at_s, end_s = made.first_ns / NS_PER_S, until_ns / NS_PER_S
@@ -154,14 +160,14 @@ class RunClaims:
         else:
             origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
             own = _part_of(record, made.scenario, origin_ns, sequence)
-            part = Part(
+            part = RunPart(
                 record,
                 origin_ns / NS_PER_S,
                 _seconds(until_ns) - origin_ns / NS_PER_S,
-                _start_error(own, Claims(own).started_s),
+                _start_error(own, ClaimEvaluation(own).started_s),
                 _void(record, made.scenario),
             )
-            return Claims(own, part)
+            return ClaimEvaluation(own, part)
         until_s = None if until_ns == NEVER_NS else end_s
         return Claim(
             "what is claimed after a change", "claims", "none", None, None, None,
@@ -221,7 +227,7 @@ def _part_of(
     }
     if sequence is not None:
         update["network"] = scenario.network.model_copy(update={"initial_sync": "first_packet"})
-    if isinstance(trigger := scenario.trigger, Decaying):
+    if isinstance(trigger := scenario.trigger, DecayingSettings):
         faded = math.exp(-trigger.alpha_per_s * origin_ns / NS_PER_S)
         beta = max(trigger.beta * faded, _LEAST_BETA)
         update["trigger"] = trigger.model_copy(update={"beta": beta})
@@ -257,7 +263,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
     bend = dt_s**2 / 8 * grown * row_norms(speed @ (loop.K @ loop.A).T)
     trigger = own.scenario.trigger
-    alpha = trigger.alpha_per_s if isinstance(trigger, Decaying) else 0.0
+    alpha = trigger.alpha_per_s if isinstance(trigger, DecayingSettings) else 0.0
     return float(((ends + bend) * np.exp(alpha * steps["t_ns"][1:] * 1e-9)).max())
 
 

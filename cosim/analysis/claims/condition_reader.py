@@ -1,8 +1,8 @@
 """Reads the conditions of a run off its rows, as they come in or all at once.
 
 Each process's rows come in their order, but one process's may come long after another's. What
-depends on rows that are still to come waits for them; only :meth:`Observer.end` says that there
-are none, and that what is not known is late. Only what waits is kept.
+depends on rows that are still to come waits for them. Only :meth:`ConditionReader.end` says that
+there are none, and that what is not known is late. Only what waits is kept.
 """
 
 from collections import deque
@@ -12,11 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.analysis.claims.observed_conditions import Losses, Observed, Series
+from cosim.analysis.claims.observed_conditions import (
+    ObservedConditions,
+    PacketLosses,
+    SampledSeries,
+)
 from cosim.record.run_record import Rows, RunRecord, updates_in
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
-from noack.protocol.machine_interface import INCARNATION
+from noack.protocol.machine_interface import GENERATION
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -39,15 +43,15 @@ _NEVER = 2**63 - 1
 _NO_TIMES: Times = np.zeros(0, np.int64)
 
 
-def observe(record: RunRecord) -> Observed:
+def read_conditions(record: RunRecord) -> ObservedConditions:
     """Read the conditions off the record of a run, complete or not: what is not known is late."""
-    observer = Observer(record.scenario)
+    observer = ConditionReader(record.scenario)
     for table in record.tables:
         observer.take(table, record[table])
     return observer.end()
 
 
-class Observer:
+class ConditionReader:
     """Finds out under which conditions a run takes place.
 
     Args:
@@ -75,14 +79,14 @@ class Observer:
         if len(rows) and table in self._takes:
             self._takes[table](rows)
 
-    def observed(self) -> Observed:
+    def observed(self) -> ObservedConditions:
         """What has been found out since it was asked for last.
 
         As long as the plant has not felt the controller, ``start_s`` is how far that is known.
         """
         return self._observed(None)
 
-    def end(self) -> Observed:
+    def end(self) -> ObservedConditions:
         """The rest of it; no more rows come."""
         return self._observed(max(self._inputs.newest_ns, self._gaps.newest_ns))
 
@@ -93,20 +97,20 @@ class Observer:
 
     def _measured(self, rows: Rows) -> None:
         self._gaps.measurements(rows["t_ns"])
-        self._sensors.measurements(rows["input"] // INCARNATION, rows["t_ns"])
+        self._sensors.measurements(rows["input"] // GENERATION, rows["t_ns"])
         events = rows[rows["event"] != NO_SEQUENCE]
         self._updates.events(events["event"], events["t_ns"])
 
-    def _observed(self, end_ns: int | None) -> Observed:
+    def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None
         self._inputs.learn(self._ticks.told(ended=ended), self._ticks.newest, ended=ended)
         hold, watchdog, safe_input = self._inputs.judged(ended=ended)
-        self._updates.deliveries(self._inputs.felt(ended=ended))
+        self._updates.deliveries(self._inputs.applied_input(ended=ended))
         start_s = self._inputs.start_ns * 1e-9 if self._inputs.started else np.inf
         losses, delay = self._updates.resolved(start_s, end_ns)
         if not self._inputs.started and not ended:
             start_s = self._inputs.judged_ns * 1e-9
-        return Observed(
+        return ObservedConditions(
             losses, self._gaps.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
             self._sensors.restarts(), self._timeout_s,
         )  # fmt: skip
@@ -123,7 +127,7 @@ class _Gaps:
         self._times.append(np.append(self.newest_ns, t_ns))
         self.newest_ns = int(t_ns[-1])
 
-    def gaps(self, end_ns: int | None) -> Series:
+    def gaps(self, end_ns: int | None) -> SampledSeries:
         times = [*self._times]
         if end_ns is not None:
             times.append(np.array([self.newest_ns, end_ns]))
@@ -131,7 +135,7 @@ class _Gaps:
         since_ns = np.concatenate([_NO_TIMES, *(t_ns[:-1] for t_ns in times)])
         gaps_ns = np.concatenate([_NO_TIMES, *map(np.diff, times)])
         kept = gaps_ns > 0
-        return Series(since_ns[kept] * 1e-9, gaps_ns[kept] * 1e-9)
+        return SampledSeries(since_ns[kept] * 1e-9, gaps_ns[kept] * 1e-9)
 
 
 class _Sensors:
@@ -147,10 +151,10 @@ class _Sensors:
         if len(first):
             self._found.append((t_ns[first], of[first]))
 
-    def restarts(self) -> Series:
+    def restarts(self) -> SampledSeries:
         t_ns, of = _columns(self._found, 2)
         self._found = []
-        return Series(t_ns * 1e-9, of * 1.0)
+        return SampledSeries(t_ns * 1e-9, of * 1.0)
 
 
 class _Told(NamedTuple):
@@ -192,8 +196,8 @@ class _Ticks:
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
         tick = np.append(ticks, _NEVER)[first[:known]]
         # What a controller took that died before its next tick, its successor does not know.
-        of = taken[:known] // INCARNATION
-        kept = (tick == _NEVER) | (tick // INCARNATION == of)
+        of = taken[:known] // GENERATION
+        kept = (tick == _NEVER) | (tick // GENERATION == of)
         return _Told(sequence[:known][kept], model_ns[:known][kept], tick[kept])
 
 
@@ -206,7 +210,7 @@ class _Inputs:
         self._replaces = scenario.plant.watchdog.policy != "hold"
         known = scenario.network.initial_sync == "known_state"
         self._knowing: dict[int, int] = {0: 0} if known else {}
-        """Of each incarnation of the controller, the first tick that knew a state."""
+        """Of each generation of the controller, the first tick that knew a state."""
         self._ticked = NO_SEQUENCE
         self._steps: _Batches = []
         self._actuations: _Batches = []
@@ -236,12 +240,12 @@ class _Inputs:
 
     def learn(self, told: _Told, ticked: int, *, ended: bool) -> None:
         """Take what became known of the controller: updates, and its newest tick."""
-        for tick in told.tick[np.diff(told.tick // INCARNATION, prepend=-1) > 0].tolist():
-            self._knowing.setdefault(tick // INCARNATION, tick)
+        for tick in told.tick[np.diff(told.tick // GENERATION, prepend=-1) > 0].tolist():
+            self._knowing.setdefault(tick // GENERATION, tick)
         self._told.append(told)
         self._ticked = _NEVER if ended else ticked
 
-    def judged(self, *, ended: bool) -> tuple[Series, Series, Series]:
+    def judged(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
         """Of the steps that can be judged: ages of inputs, of what the watchdog replaced, and
         sizes of safe inputs."""  # noqa: D205, D209
         t_ns, newest, sizes = _columns(self._steps, 3)
@@ -269,14 +273,14 @@ class _Inputs:
         safe = there & ~feels & (began | ~(sizes == 0))
         step_s, kept = t_ns * 1e-9, feels & ~replaced
         return (
-            Series(step_s[kept], age_ns[kept] * 1e-9),
-            Series(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
-            Series(step_s[safe], sizes[safe]),
+            SampledSeries(step_s[kept], age_ns[kept] * 1e-9),
+            SampledSeries(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
+            SampledSeries(step_s[safe], sizes[safe]),
         )
 
     def _knows_from(self, ticks: Times) -> Times:
-        """The first tick, of the same incarnation of the controller, that knew a state."""
-        of, which = np.unique(ticks // INCARNATION, return_inverse=True)
+        """The first tick, of the same generation of the controller, that knew a state."""
+        of, which = np.unique(ticks // GENERATION, return_inverse=True)
         first = [self._knowing.get(number, _NEVER) for number in of.tolist()]
         return np.array(first, dtype=np.int64)[which]
 
@@ -291,7 +295,7 @@ class _Inputs:
         self._actuations = [(sequence[used:], t_ns[used:])]
         return model_ns
 
-    def felt(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
+    def applied_input(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
         """Updates that the plant felt since the last time, in order.
 
         Returns:
@@ -331,14 +335,14 @@ class _Updates:
             self._passed[sequence] = self._passed.get(sequence, False) or passed
             self._newest_packet = max(self._newest_packet, sequence)
 
-    def deliveries(self, felt: list[tuple[int, int, int | None]]) -> None:
-        self._taken.extend(felt)
+    def deliveries(self, applied_input: list[tuple[int, int, int | None]]) -> None:
+        self._taken.extend(applied_input)
 
     @property
     def waiting(self) -> int:
         return len(self._events) + len(self._taken) + len(self._passed)
 
-    def resolved(self, start_s: float, end_ns: int | None) -> tuple[Losses, Series]:
+    def resolved(self, start_s: float, end_ns: int | None) -> tuple[PacketLosses, SampledSeries]:
         """What became of the events since the last time, in their order."""
         losses: list[tuple[int, float]] = []
         delays: list[tuple[int, int]] = []
@@ -356,8 +360,8 @@ class _Updates:
             del self._passed[sequence]
         lost, late = np.array(losses).reshape(-1, 2), np.array(delays).reshape(-1, 2)
         return (
-            Losses(lost[:, 0] * 1e-9, lost[:, 1]),
-            Series(late[:, 0] * 1e-9, late[:, 1] * 1e-9),
+            PacketLosses(lost[:, 0] * 1e-9, lost[:, 1]),
+            SampledSeries(late[:, 0] * 1e-9, late[:, 1] * 1e-9),
         )
 
     def _fate(

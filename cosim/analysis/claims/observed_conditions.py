@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.theory.certificate import Conditions
+from noack.theory.certificate import NetworkConditions
 
 _TOLERANCE_S = 1e-9
 
@@ -30,7 +30,7 @@ CAUSES = {
 """How conditions can be left, and how that is said, of the worst value and the limit."""
 
 
-class Series(NamedTuple):
+class SampledSeries(NamedTuple):
     """A condition's value over time: k values, each known from its time on."""
 
     t_s: Reals
@@ -41,7 +41,7 @@ class Series(NamedTuple):
         return float(self.value.max()) if len(self.value) else None
 
 
-class Losses(NamedTuple):
+class PacketLosses(NamedTuple):
     """The events, and which of their updates never came."""
 
     t_s: Reals
@@ -50,7 +50,7 @@ class Losses(NamedTuple):
     """(k,) After which time the plant felt a newer update instead: infinite if the update was
     dropped, 0 if it came or was still to come; in between if it was overtaken."""
 
-    def runs(self, delay_s: float, before: int = 0) -> Series:
+    def runs(self, delay_s: float, before: int = 0) -> SampledSeries:
         """Successive losses at every event; what was overtaken within ``delay_s`` is not lost.
 
         Args:
@@ -62,10 +62,10 @@ class Losses(NamedTuple):
             lost = made_up_s == np.inf or made_up_s > delay_s + _TOLERANCE_S
             run = run + 1 if lost else 0
             runs.append(run)
-        return Series(self.t_s, np.array(runs, dtype=np.float64))
+        return SampledSeries(self.t_s, np.array(runs, dtype=np.float64))
 
 
-class Departure(NamedTuple):
+class AssumptionViolation(NamedTuple):
     """How a run left the conditions in one respect."""
 
     t_s: float
@@ -81,32 +81,32 @@ class Departure(NamedTuple):
         return CAUSES[self.cause].format(self.worst, self.limit)
 
 
-class Observed(NamedTuple):
-    """What :class:`noack.theory.certificate.Conditions` presupposes, as it was."""
+class ObservedConditions(NamedTuple):
+    """What :class:`noack.theory.certificate.NetworkConditions` presupposes, as it was."""
 
-    losses: Losses
+    losses: PacketLosses
     """Updates that the controller never took."""
-    sampling: Series
+    sampling: SampledSeries
     """Time since the measurement before, in seconds, at every measurement."""
-    delay: Series
+    delay: SampledSeries
     """From an event until the controller had its update and the plant felt it, at the event."""
-    hold: Series
+    hold: SampledSeries
     """How far the model's time behind the input was from now at most, at every step."""
     start_s: float
     """When the plant began to feel the controller; infinite if never."""
-    watchdog: Series
+    watchdog: SampledSeries
     """Age of the newest actuation at every step whose input was the watchdog's instead."""
-    safe_input: Series
+    safe_input: SampledSeries
     """Largest entry of the input at every step whose input was of a controller without a state:
     one other than 0 before the plant felt the controller, and any after that."""
-    restarts: Series
-    """At the first measurement of every sensor that took another's place: its incarnation."""
+    restarts: SampledSeries
+    """At the first measurement of every sensor that took another's place: its generation."""
     timeout_s: float
     """Age at which the watchdog acts."""
 
     def departures(
-        self, conditions: Conditions, causes: Collection[str] = tuple(CAUSES), run: int = 0
-    ) -> list[Departure]:
+        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES), run: int = 0
+    ) -> list[AssumptionViolation]:
         """In which respects the conditions were left.
 
         Args:
@@ -114,8 +114,8 @@ class Observed(NamedTuple):
             causes: which respects count.
             run: updates that were lost in a row before.
         """
-        start = Series(np.zeros(1), np.array([self.start_s]))
-        every: dict[str, tuple[Series, float]] = {
+        start = SampledSeries(np.zeros(1), np.array([self.start_s]))
+        every: dict[str, tuple[SampledSeries, float]] = {
             "dropouts": (self.losses.runs(conditions.delay_s, run), conditions.dropouts),
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
@@ -130,10 +130,10 @@ class Observed(NamedTuple):
             beyond = np.flatnonzero(series.value > limit + _TOLERANCE_S)
             if cause in causes and len(beyond):
                 first_s, worst = float(series.t_s[beyond[0]]), float(series.value.max())
-                found.append(Departure(first_s, cause, worst, limit))
+                found.append(AssumptionViolation(first_s, cause, worst, limit))
         return found
 
-    def left(self, conditions: Conditions, causes: Collection[str] = tuple(CAUSES)) -> Left:
+    def left(self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES)) -> Left:
         """When and how the run first left the conditions; None if it never did."""
         return earliest(self.departures(conditions, causes))
 
@@ -148,6 +148,6 @@ class Observed(NamedTuple):
         }
 
 
-def earliest(departures: Collection[Departure]) -> Left:
+def earliest(departures: Collection[AssumptionViolation]) -> Left:
     """When and how the conditions were first left; None if they were not."""
     return min(((one.t_s, one.text) for one in departures), default=None)

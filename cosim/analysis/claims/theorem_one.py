@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.record.align import Joined
+from cosim.record.align import AlignedRun
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Propagator, spectral_abscissa
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
@@ -15,7 +15,7 @@ from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
 Indices = NDArray[np.int64]
 
 
-def theorem_one(record: RunRecord, joined: Joined, until_s: float = math.inf) -> float | None:
+def theorem_one(record: RunRecord, joined: AlignedRun, until_s: float = math.inf) -> float | None:
     """The largest Δ over all stretches between two deliveries; None if there is none to be had.
 
     Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this. Nor does it
@@ -72,7 +72,7 @@ def _decay(record: RunRecord) -> float:
 
 
 def _intervals(
-    record: RunRecord, joined: Joined, starts: Indices, ends: Sequence[int]
+    record: RunRecord, joined: AlignedRun, starts: Indices, ends: Sequence[int]
 ) -> list[Interval]:
     """From every event of ``starts`` to the next."""
     propagate = Propagator(record.loop.H)

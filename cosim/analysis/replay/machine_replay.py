@@ -8,14 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller_node.controller import controller_of
-from cosim.analysis.replay.replay_result import Difference, ProcessReplay, difference, rows_differ
+from cosim.analysis.replay.replay_result import (
+    ProcessReplay,
+    ReplayDifference,
+    difference,
+    rows_differ,
+)
 from cosim.record.run_record import Life, Rows, RunRecord
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram
-from noack.config.parameter_changes import Change, settings_of
+from noack.config.parameter_changes import ParameterChange, settings_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
-from noack.protocol.machine_interface import INCARNATION, Machine, Notice, Record, Start
+from noack.protocol.machine_interface import GENERATION, Machine, Notice, Record, Start
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
     CONTROLLER_STEP,
@@ -26,7 +31,7 @@ from noack.protocol.record_tables import (
     SENSOR_ACKNOWLEDGEMENT,
     SETTINGS,
 )
-from noack.protocol.topology import LEGS
+from noack.protocol.topology import ROUTES
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
@@ -43,7 +48,7 @@ _MOST_BYTES = 65_535
 
 
 @dataclass(frozen=True)
-class Replayed:
+class MachineReplay:
     """The replay of a role's machines: the account of each, and the messages that they emitted."""
 
     accounts: tuple[ProcessReplay, ...]
@@ -60,23 +65,23 @@ def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
     if table == SENSOR_ACKNOWLEDGEMENT:
         return ()
     names = rows.dtype.names or ()
-    if LEGS[OWNER[table]].receives is Flow.ACTUATION:
+    if ROUTES[OWNER[table]].receives is Flow.ACTUATION:
         return tuple(column for column in ("u", "x_c") if column in names)
     return ("y", "u_felt") if "y" in names else ("x",)
 
 
-def replay_machine(role: str, record: RunRecord) -> Replayed:
+def replay_machine(role: str, record: RunRecord) -> MachineReplay:
     """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows.
 
     If others took the place of the process, so do theirs.
     """
     sent: list[Any] = []
     accounts = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
-    return Replayed(tuple(accounts), sent)
+    return MachineReplay(tuple(accounts), sent)
 
 
 def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> ProcessReplay:
-    owned, first = life.rows, life.incarnation * INCARNATION
+    owned, first = life.rows, life.generation * GENERATION
     inputs = _inputs(owned, life.report, first)
     run = _Run(_MACHINES[role](scenario, _start(life)), owned)
     compared = 0
@@ -87,7 +92,7 @@ def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> 
     found = [one for one in (run.difference, inputs.damage) if one is not None]
     sent += run.sent
     return ProcessReplay(
-        f"{role} ({life.incarnation + 1})" if life.incarnation else role,
+        f"{role} ({life.generation + 1})" if life.generation else role,
         sum(map(len, owned.values())),
         compared,
         inputs.missing_from,
@@ -101,10 +106,10 @@ def _start(life: Life) -> Start:
 
     If it died before that, what it took says so.
     """
-    if not life.incarnation or CONTROLLER_STEP not in life.rows:
-        return Start(life.incarnation)
+    if not life.generation or CONTROLLER_STEP not in life.rows:
+        return Start(life.generation)
     ticks, taken = life.rows[CONTROLLER_STEP]["t_ns"], life.rows[CONTROLLER_DELIVERY]["model_t_ns"]
-    return Start(life.incarnation, int(min((*ticks[:1], *taken[:1]), default=0)))
+    return Start(life.generation, int(min((*ticks[:1], *taken[:1]), default=0)))
 
 
 class _Inputs(NamedTuple):
@@ -112,7 +117,7 @@ class _Inputs(NamedTuple):
     """Table and row of each input, up to the first gap."""
     missing_from: int | None
     end_known: bool
-    damage: Difference | None
+    damage: ReplayDifference | None
 
 
 def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: int) -> _Inputs:
@@ -150,7 +155,7 @@ class _Run:
 
     def __init__(self, machine: Machine[Any], owned: Mapping[str, Rows]) -> None:
         self.sent: list[Any] = []
-        self.difference: Difference | None = None
+        self.difference: ReplayDifference | None = None
         self._machine = machine
         self._rows = {table: np.ascontiguousarray(rows) for table, rows in owned.items()}
         self._recorded = {table: rows.tobytes() for table, rows in self._rows.items()}
@@ -166,7 +171,7 @@ class _Run:
             self._differs(table, row, "time runs backward", "now_ns", now_ns, self._before_ns)
         self._before_ns = now_ns
         try:
-            if isinstance(message, Change):
+            if isinstance(message, ParameterChange):
                 outputs = self._machine.announce(message, now_ns)  # type: ignore[attr-defined]
             elif message is None:
                 due_ns = self._machine.next_deadline_ns()
@@ -205,7 +210,7 @@ class _Run:
             self.difference = difference(table, row, now_ns, what, *values)
 
 
-def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Change | None]:
+def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | ParameterChange | None]:
     """Yield what the machine took at each row; None for its timer."""
     if table in _TIMERS:
         yield from itertools.repeat(None, len(rows))
@@ -213,7 +218,7 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Change | 
         for number, t_ns, data in zip(
             rows["sequence"].tolist(), rows["t_ns"].tolist(), rows["change"].tolist(), strict=True
         ):
-            yield Change(number, t_ns, _settings(data))
+            yield ParameterChange(number, t_ns, _settings(data))
     elif table == NETEM_PACKET:
         for flow, size, head in zip(
             rows["flow"].tolist(), rows["size_bytes"].tolist(), rows["head"].tolist(), strict=True
@@ -221,7 +226,7 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Change | 
             size_bytes = min(max(size, 0), _MOST_BYTES)
             yield Datagram(flow, head.ljust(size_bytes, b"\0")[:size_bytes])
     else:
-        flow, columns = LEGS[OWNER[table]].receives, vector_columns(table, rows)
+        flow, columns = ROUTES[OWNER[table]].receives, vector_columns(table, rows)
         if not columns:
             for sequence, t_ns in zip(
                 rows["sequence"].tolist(), rows["t_ns"].tolist(), strict=True

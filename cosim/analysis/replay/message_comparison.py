@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from cosim.analysis.replay.machine_replay import Replayed, vector_columns
+from cosim.analysis.replay.machine_replay import MachineReplay, vector_columns
 from cosim.analysis.replay.replay_result import MessagesReplay, difference, first_entry
 from cosim.record.run_record import Rows, RunRecord
 from netem.link_machine import Datagram
@@ -29,7 +29,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message
 
 
 def check_messages(
-    record: RunRecord, replayed: Mapping[str, Replayed]
+    record: RunRecord, replayed: Mapping[str, MachineReplay]
 ) -> tuple[MessagesReplay, ...]:
     """Compare the messages of every leg of the loop."""
     plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
@@ -81,7 +81,7 @@ class _Received:
     """The messages of one leg, as they were received and as they are sent in the replay."""
 
     def __init__(
-        self, leg: str, table: str, record: RunRecord, sender: Replayed, flow: Flow
+        self, leg: str, table: str, record: RunRecord, sender: MachineReplay, flow: Flow
     ) -> None:
         self._leg = leg
         self._table = table
@@ -155,7 +155,7 @@ class _Received:
             if flow != 0:
                 self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
 
-    def compare_with_survivors(self, network: Replayed) -> None:
+    def compare_with_survivors(self, network: MachineReplay) -> None:
         """Look whether the network let through what was received."""
         if not network.whole:
             return

@@ -13,7 +13,7 @@ Value = float | int | str | None
 
 
 @dataclass(frozen=True)
-class Difference:
+class ReplayDifference:
     """A place where the record and the replay part.
 
     Floating-point values come with ``float.hex()``, which shows every bit; one that is not finite
@@ -51,13 +51,13 @@ def difference(
     column: str = "",
     recorded: object = None,
     replayed: object = None,
-) -> Difference:
+) -> ReplayDifference:
     """Return a difference with its values made presentable."""
     (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
-    return Difference(table, row, column, first, first_hex, second, second_hex, what, now_ns)
+    return ReplayDifference(table, row, column, first, first_hex, second, second_hex, what, now_ns)
 
 
-def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> Difference:
+def rows_differ(table: str, row: int, recorded: np.void, replayed: np.void) -> ReplayDifference:
     """Name the first column in which two rows of a table differ in any bit."""
     now_ns = int(recorded["now_ns"])
     for name in recorded.dtype.names or ():
@@ -107,7 +107,7 @@ class ProcessReplay:
     """Number of the first input whose row the record lacks: the replay went up to there."""
     end_known: bool
     """Whether the process left a report of how many rows there are."""
-    difference: Difference | None
+    difference: ReplayDifference | None
 
     @property
     def whole(self) -> bool:
@@ -135,7 +135,7 @@ class MessagesReplay:
     """Messages in the receiver's record."""
     compared: int
     """Those whose sender was replayed that far."""
-    difference: Difference | None
+    difference: ReplayDifference | None
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class Replay:
         return sum(process.compared for process in self.processes)
 
     @property
-    def first_difference(self) -> Difference | None:
+    def first_difference(self) -> ReplayDifference | None:
         """The earliest difference by the recorded time; of a message before that of a row."""
         found = [messages.difference for messages in self.messages]
         found += [process.difference for process in self.processes]

@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.replay.replay_result import Difference, Replay
+from cosim.analysis.replay.replay_result import Replay, ReplayDifference
 
 
 def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:
@@ -57,7 +57,7 @@ def _counts(recorded: int, compared: int) -> tuple[str, str]:
     return f"{recorded:,}", f"{compared:,}"
 
 
-def _verdict(compared: int, difference: Difference | None) -> str:
+def _verdict(compared: int, difference: ReplayDifference | None) -> str:
     if difference is not None:
         place = f"{difference.table}[{difference.row}].{difference.column}".rstrip(".")
         return f"[red]≠[/] {escape(place)}"

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 from cosim.analysis.fidelity import is_against, percent
-from cosim.analysis.replay.replay_result import Difference
+from cosim.analysis.replay.replay_result import ReplayDifference
 
 FIDELITY, REPLAY = "Fidelity", "Replay"
 
@@ -17,7 +17,7 @@ _EFFECTS = {
 """As ``noack fidelity`` adds them to the ideal loop, one after the other."""
 
 
-class Finding(NamedTuple):
+class ReportFinding(NamedTuple):
     """A section of the report."""
 
     heading: str
@@ -27,12 +27,12 @@ class Finding(NamedTuple):
     """Effect, what it is, its share of the difference."""
 
 
-def findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
+def findings(summary: Mapping[str, Any]) -> Iterator[ReportFinding]:
     """Return the sections of what there is of the two."""
     if fidelity := summary.get("fidelity"):
-        yield Finding(FIDELITY, list(_fidelity(fidelity)), list(_effects(fidelity)))
+        yield ReportFinding(FIDELITY, list(_fidelity(fidelity)), list(_effects(fidelity)))
     if replay := summary.get("replay"):
-        yield Finding(REPLAY, list(_replay(replay)), [])
+        yield ReportFinding(REPLAY, list(_replay(replay)), [])
 
 
 def _fidelity(found: Mapping[str, Any]) -> Iterator[str]:
@@ -88,7 +88,7 @@ def _replay(found: Mapping[str, Any]) -> Iterator[str]:
     else:
         yield (
             "Fed its recorded inputs again, a machine did something else than is on record: "
-            f"{Difference(**found['first_difference'])}."
+            f"{ReplayDifference(**found['first_difference'])}."
         )
     if not found.get("complete", True):
         yield "The record has gaps; what lies in them could not be compared."

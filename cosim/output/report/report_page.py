@@ -122,7 +122,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "loss", f"{model} ({details})" if details else model
     if scenario.is_acknowledged:
         timeout_ms = 1e-6 * scenario.acknowledgement_timeout_ns
-        back = network.way_back.loss.model_dump()
+        back = network.reverse.loss.model_dump()
         lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in back.items())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
     yield "start", network.initial_sync.replace("_", " ")

@@ -11,7 +11,7 @@ from cosim.analysis.run_summary import latency_us, lateness_us
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.decimate import Reals
-from cosim.record.align import Joined, join_all
+from cosim.record.align import AlignedRun, join_all
 from cosim.record.estimation_error import true_states
 from cosim.record.packet_outcomes import crossing
 from cosim.record.run_record import RunRecord
@@ -31,7 +31,7 @@ Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKin
 """A bound: label, what it bounds, times in s (k,), values (k,), what it rests on."""
 
 
-class Picture(NamedTuple):
+class RunFigure(NamedTuple):
     """A figure and what is said about it."""
 
     name: str
@@ -47,14 +47,14 @@ BOUNDED = ("errors", "state-norm", "inter-event")
 
 def run_figures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool = True
-) -> Iterator[Picture]:
+) -> Iterator[RunFigure]:
     """Draw the figures of a run, as :func:`pictures` lists them."""
     return (draw() for draw in pictures(record, envelopes, timed=timed).values())
 
 
 def pictures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
-) -> dict[str, Callable[[], Picture]]:
+) -> dict[str, Callable[[], RunFigure]]:
     """List the figures of a run by name; each is drawn when it is called.
 
     Args:
@@ -64,7 +64,7 @@ def pictures(
     """
 
     @cache
-    def joined() -> Joined:
+    def joined() -> AlignedRun:
         with np.errstate(all="ignore"):  # a run that diverged has figures, too
             return join_all(record)
 
@@ -88,7 +88,7 @@ def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
     ]
 
 
-def _states(record: RunRecord, joined: Joined) -> Picture:
+def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
     crossed = crossing(record)
     measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
     events = measurements[measurements["event"] != NO_SEQUENCE]
@@ -110,7 +110,7 @@ def _states(record: RunRecord, joined: Joined) -> Picture:
         forced=forced,
         title=scenario.name,
     )
-    return Picture(
+    return RunFigure(
         "states",
         figure,
         "States, and the time between broadcasts and between receptions. "
@@ -138,9 +138,9 @@ def _known(scenario: Scenario) -> str:
     return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
 
 
-def _errors(record: RunRecord, joined: Joined, bounds: list[Bound]) -> Picture:
+def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFigure:
     t_s = _seconds(joined.t_ns)
-    return Picture(
+    return RunFigure(
         "errors",
         signal_figures.error_figure(
             t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
@@ -160,11 +160,11 @@ def _errors(record: RunRecord, joined: Joined, bounds: list[Bound]) -> Picture:
     )
 
 
-def _state_norm(record: RunRecord, bounds: list[Bound]) -> Picture:
+def _state_norm(record: RunRecord, bounds: list[Bound]) -> RunFigure:
     steps = record[PLANT_STEP]
     with np.errstate(all="ignore"):
         x_norm = np.linalg.norm(steps["x"], axis=1)
-    return Picture(
+    return RunFigure(
         "state-norm",
         signal_figures.state_norm_figure(_seconds(steps["t_ns"]), x_norm, bounds),
         "Norm of the plant's state." + _dashed(bounds),
@@ -173,9 +173,9 @@ def _state_norm(record: RunRecord, bounds: list[Bound]) -> Picture:
     )
 
 
-def _input(record: RunRecord) -> Picture:
+def _input(record: RunRecord) -> RunFigure:
     steps, names = record[CONTROLLER_STEP], record.loop.input_names
-    return Picture(
+    return RunFigure(
         "input",
         signal_figures.input_figure(_seconds(steps["t_ns"]), steps["u"], names),
         "Control input u = K x_c, held from one tick of the controller to the next. Inputs that "
@@ -184,10 +184,10 @@ def _input(record: RunRecord) -> Picture:
     )
 
 
-def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> Picture:
+def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
     measurements = record[SENSOR_MEASUREMENT]
     event_s = _seconds(measurements["t_ns"][measurements["event"] != NO_SEQUENCE])
-    return Picture(
+    return RunFigure(
         "inter-event",
         signal_figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
         "Time between successive transmissions, over time and as a histogram."
@@ -197,12 +197,12 @@ def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> Picture:
     )
 
 
-def _lateness(record: RunRecord) -> Picture:
+def _lateness(record: RunRecord) -> RunFigure:
     scenario = record.scenario
     period_us = scenario.plant_period_ns / (1e3 * scenario.speed)
     late_us = {role: lateness_us(record, role) for role in LOOP_ROLES}
     longest = ", ".join(f"{role} {_largest(late)} µs" for role, late in late_us.items())
-    return Picture(
+    return RunFigure(
         "lateness",
         signal_figures.lateness_figure(late_us, period_us),
         "Share of its steps in which a process acted at least so late. Plant and controller count "
@@ -212,9 +212,9 @@ def _lateness(record: RunRecord) -> Picture:
     )
 
 
-def _latency(record: RunRecord) -> Picture:
+def _latency(record: RunRecord) -> RunFigure:
     event_ns, taken_us = latency_us(record)
-    return Picture(
+    return RunFigure(
         "latency",
         signal_figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
         "Wall time from the sensor's event to the controller's update, one way.",

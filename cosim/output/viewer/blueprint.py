@@ -46,7 +46,7 @@ from cosim.output.palette import (
 )
 from cosim.output.palette import FORCED as FORCED_COLOUR
 from cosim.output.viewer.colour_key import ColourKey, input_colour
-from cosim.output.viewer.pictures.network_picture import Diagram
+from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Picture, panel
 
 ABOUT = "about"
@@ -143,7 +143,7 @@ def layout(
     horizon_s: float,
     *,
     picture: Picture | None = None,
-    diagram: Diagram | None = None,
+    diagram: NetworkDiagram | None = None,
 ) -> rrb.Blueprint:
     """Lay out the panels: picture and packets on the left, above words; curves on the right.
 

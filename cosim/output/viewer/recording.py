@@ -16,7 +16,7 @@ import rerun as rr
 from cosim.output.viewer import blueprint as bp
 from cosim.output.viewer.colour_key import COLOUR_KEY, ColourKey
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.pictures.network_picture import DIAGRAM, Diagram
+from cosim.output.viewer.pictures.network_picture import DIAGRAM, NetworkDiagram
 from cosim.output.viewer.pictures.picture import PICTURE, TIMELINE, Frames, Picture, joined
 from noack.core.clock import NS_PER_S
 from noack.core.errors import MachineError
@@ -76,7 +76,7 @@ class RunView:
         processes: Sequence[str],
         horizon_s: float,
         picture: Picture | None = None,
-        diagram: Diagram | None = None,
+        diagram: NetworkDiagram | None = None,
         live: LiveView | None = None,
         indexed: bool = True,
     ) -> None:
@@ -189,7 +189,7 @@ class RunView:
         *,
         back: bool = False,
     ) -> None:
-        """Add packets (p,) to the network's diagram; see :meth:`Diagram.add`."""
+        """Add packets (p,) to the network's diagram; see :meth:`NetworkDiagram.add`."""
         if self._diagram is not None:
             self._diagram.add(t_ns, release_ns, fate, back=back)
 

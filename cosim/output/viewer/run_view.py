@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.pictures.network_picture import LEG_S, Diagram
+from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
 from cosim.output.viewer.pictures.picture_choice import picture_of
 from cosim.output.viewer.recording import RunView
 from cosim.output.viewer.table_feed import ViewFeed
@@ -40,7 +40,7 @@ def open_view(
         processes=LOOP_ROLES if kind == "live" else (),
         horizon_s=scenario.horizon_s,
         picture=picture_of(scenario),
-        diagram=Diagram(acknowledged=scenario.is_acknowledged),
+        diagram=NetworkDiagram(acknowledged=scenario.is_acknowledged),
         live=live,
         indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )

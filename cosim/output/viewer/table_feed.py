@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cosim.output.viewer.pictures.picture import Frames
 from cosim.output.viewer.recording import RunView
 from cosim.record.align import (
+    AlignedRun,
     ControllerTrack,
-    Joined,
     controller_track,
     in_common,
     initial_track,
@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.wire_format import Flow
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.run_conditions import allowed_conditions
-from noack.theory.scenario_certificates import Certificate, certify
+from noack.theory.scenario_certificates import ScenarioCertificate, certify
 from noack.trigger.policy_from_settings import policy_of
 
 _LAG_S = 0.2
@@ -197,7 +197,7 @@ class ViewFeed:
         self._track = self._track.since(keep)
 
     @cached_property
-    def _certificate(self) -> Certificate | None:
+    def _certificate(self) -> ScenarioCertificate | None:
         """The certificate of the run, made when the run is under way: it takes its time.
 
         None of what is beyond the theory.
@@ -217,7 +217,7 @@ class ViewFeed:
         bound = getattr(self._certificate, what)(t_s)
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
-    def _bounds(self, rows: Rows, joined: Joined) -> NDArray[np.float64]:
+    def _bounds(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
         """The bound of ‖e_c‖ that (I1) gives, (k,); none where updates are acknowledged."""
         if self._scenario.is_acknowledged:
             return np.full(len(rows), np.nan)

@@ -16,7 +16,7 @@ from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
 from netem.rule_program import empty_state, program_of, stream_names
-from netem.rule_records import Verdict, dtype_of
+from netem.rule_records import PacketDecision, dtype_of
 from noack.config.impairments import LinkSettings
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
@@ -162,8 +162,8 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
 
     _check(setting, population)
     n, m = len(setting.H), len(setting.K)
-    guards, terms = setting.trigger.guards(n), HIGHEST + 1
-    system = batch_run.System(
+    rule, terms = setting.trigger.trigger_rule(n), HIGHEST + 1
+    system = batch_run.BatchSystem(
         H=_columns(setting.H),
         K=_columns(setting.K),
         weight=_columns(setting.trigger.weight),
@@ -171,8 +171,8 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         R=_columns(setting.R),
         inverse=np.append(0.0, 1.0 / np.arange(1.0, 2 * terms + 1)),
         H_k=np.empty((terms + 1) * n * n),
-        rule=rule_of(guards),
-        fading_per_s=float(guards.fading_per_s),
+        rule=rule_of(rule),
+        fading_per_s=float(rule.fading_per_s),
         horizon_s=float(setting.horizon_s),
         known_start=bool(setting.known_start),
         first_delivered=setting.link.first_delivered,
@@ -187,7 +187,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         A=_columns(population.A), B=_columns(population.B), x0=_flat(population.x0), keys=keys
     )
     states = ("x_c", "e_c", "d", "x", "error", "weighted", "x_scaled")
-    space = batch_run.Space(
+    space = batch_run.BatchMemory(
         E=np.empty(n * n),
         A_k=np.empty((terms + 1) * n * n),
         X_k=np.empty((terms + 1) * n * n),
@@ -200,7 +200,7 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
         **{name: np.empty(terms * max(n, m)) for name in states},
     )
     rows = np.zeros(len(population.A), ROW)
-    log = batch_run.Log(np.empty(room), np.empty(room, np.bool_))
+    log = batch_run.EventLog(np.empty(room), np.empty(room, np.bool_))
     _compiled()(
         vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
         squares_of(setting.trigger, n), rows, log,
@@ -210,13 +210,13 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
 
 def _network(link: LinkSettings) -> Any:
     """The link's rules, compiled, with room for one flow."""
-    from cosim.simulation.batch.batch_run import Network
+    from cosim.simulation.batch.batch_run import LossTable
     from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
 
     program = program_of(link, 0, UPDATE_LINK)
     state = compiled_state(program, empty_state(program), 1, 1)
     set_flow(state, 0, 0, link.first_delivered)
-    return Network(compiled_program(program), state, np.zeros(1, dtype_of(Verdict)))
+    return LossTable(compiled_program(program), state, np.zeros(1, dtype_of(PacketDecision)))
 
 
 @cache
@@ -273,14 +273,14 @@ def _check(setting: Setting, population: Population) -> None:
             "network.impairments: a batch knows losses and corruption only; "
             "leave out what takes time"
         )
-    guards = setting.trigger.guards(n)
-    for form in (guards.form, *([guards.reserve.gain] if guards.reserve else [])):
+    rule = setting.trigger.trigger_rule(n)
+    for form in (rule.form, *([rule.dynamic_variable.gain] if rule.dynamic_variable else [])):
         for part in form:
             if part.shape[1] != 2 * n:
                 raise ValueError(f"trigger: expected {2 * n} columns, found {part.shape[1]}")
-    if guards.from_event or guards.rate_per_s == 0 or guards.floor >= _SMALLEST_THRESHOLD:
+    if rule.from_event or rule.rate_per_s == 0 or rule.floor >= _SMALLEST_THRESHOLD:
         return
-    vanishes_s = math.log(guards.level / _SMALLEST_THRESHOLD) / guards.rate_per_s
+    vanishes_s = math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s
     if vanishes_s < setting.horizon_s:
         raise CallerError(
             f"trigger: from {vanishes_s:g} s on the threshold is below "

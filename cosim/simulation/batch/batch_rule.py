@@ -1,13 +1,13 @@
 """When a policy looks at its comparison, and against what: its guards' times and thresholds.
 
-The numbers are those of :class:`noack.trigger.trigger_rule.Guards`, and so are the meanings.
+The numbers are those of :class:`noack.trigger.trigger_rule.TriggerRule`, and so are the meanings.
 """
 
 import math
 from typing import NamedTuple
 
 from noack.trigger.self_triggered_interval import Forecast, interval_ns
-from noack.trigger.trigger_rule import Guards
+from noack.trigger.trigger_rule import TriggerRule
 
 _GRID_SLACK = 1e-9
 """Of a period: rounding of an event's time on the grid, as in ``continuous_loop``."""
@@ -32,20 +32,20 @@ class Rule(NamedTuple):
     forecast: Forecast
 
 
-def rule_of(guards: Guards) -> Rule:
+def rule_of(rule: TriggerRule) -> Rule:
     """Return the numbers of a policy's guards."""
     return Rule(
-        compares=len(guards.form.up) > 0,
-        level=float(guards.level),
-        rate_per_s=float(guards.rate_per_s),
-        floor=float(guards.floor),
-        from_event=guards.from_event,
-        grid_s=guards.grid_ns * _NS,
-        idle_ns=float(guards.idle_ns),
-        longest_ns=float(guards.longest_ns),
-        shortest_ns=float(guards.shortest_ns),
-        forecasts=guards.forecast is not None,
-        forecast=Forecast(*map(float, guards.forecast or (0.0,) * len(Forecast._fields))),
+        compares=len(rule.form.up) > 0,
+        level=float(rule.level),
+        rate_per_s=float(rule.rate_per_s),
+        floor=float(rule.floor),
+        from_event=rule.from_event,
+        grid_s=rule.grid_ns * _NS,
+        idle_ns=float(rule.idle_ns),
+        longest_ns=float(rule.longest_ns),
+        shortest_ns=float(rule.shortest_ns),
+        forecasts=rule.forecast is not None,
+        forecast=Forecast(*map(float, rule.forecast or (0.0,) * len(Forecast._fields))),
     )
 
 

@@ -16,7 +16,7 @@ from cosim.simulation.batch.piece_measures import (
 )
 from cosim.simulation.batch.quadratic_crossing import (
     SLOWEST,
-    Squares,
+    QuadraticCurves,
     compare,
     first_event,
     first_look,
@@ -27,7 +27,7 @@ from cosim.simulation.batch.quadratic_crossing import (
 )
 from cosim.simulation.batch.taylor import Array, degree_for, driven, powers, reaches, value
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load, store, times
-from netem.rules.link_rules import DELIVERED, FORCED, Program, State, admit
+from netem.rules.link_rules import DELIVERED, FORCED, LinkMemory, LinkProgram, admit
 from netem.rules.mansd import NEVER_NS
 
 _LARGEST = 1e100
@@ -38,7 +38,7 @@ _AHEAD = 1.25
 """A first look goes so many times as far as the error at its first speed needs."""
 
 
-class System(NamedTuple):
+class BatchSystem(NamedTuple):
     """What all runs share; matrices by columns, one number after the other."""
 
     H: Array
@@ -73,7 +73,7 @@ class Draws(NamedTuple):
     """Keys of the random streams, (runs, stages, 2)."""
 
 
-class Space(NamedTuple):
+class BatchMemory(NamedTuple):
     """Scratch, written before it is read."""
 
     E: Array
@@ -100,16 +100,16 @@ class Space(NamedTuple):
     sizes: Array
 
 
-class Network(NamedTuple):
+class LossTable(NamedTuple):
     """The compiled rules of the link, and what they remember."""
 
-    program: Program
-    state: State
+    program: LinkProgram
+    state: LinkMemory
     verdicts: Any
-    """One, of :class:`netem.rule_records.Verdict`."""
+    """One, of :class:`netem.rule_records.PacketDecision`."""
 
 
-class Log(NamedTuple):
+class EventLog(NamedTuple):
     """Where events go, as far as there is room."""
 
     event_s: Array
@@ -117,8 +117,8 @@ class Log(NamedTuple):
 
 
 def run_many(
-    n: Width, m: Width, system: System, draws: Draws, network: Network, space: Space,
-    squares: Squares | None, rows: Any, log: Log,
+    n: Width, m: Width, system: BatchSystem, draws: Draws, network: LossTable, space: BatchMemory,
+    squares: QuadraticCurves | None, rows: Any, log: EventLog,
 ) -> None:  # fmt: skip
     """Run k draws; each fills a row.
 
@@ -132,7 +132,7 @@ def run_many(
         follow(n, m, system, draws, network, space, squares, run, rows[run], log)
 
 
-def renew(network: Network, keys: Any, run: int, first_delivered: bool) -> None:
+def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> None:
     """Let the link be that of a run: before its first update, with the run's random streams."""
     flow = network.state.flows[0]
     flow.packets = 0
@@ -142,7 +142,7 @@ def renew(network: Network, keys: Any, run: int, first_delivered: bool) -> None:
     flow.score = 0.0
     flow.newest = -1
     flow.since = 0
-    flow.longest_run = 0
+    flow.longest_loss_burst = 0
     for stage in range(len(network.program.stages)):
         network.program.stages[stage].key0 = keys[run, stage, 0]
         network.program.stages[stage].key1 = keys[run, stage, 1]
@@ -150,14 +150,16 @@ def renew(network: Network, keys: Any, run: int, first_delivered: bool) -> None:
         network.state.memory[0][stage].score = 0.0
 
 
-def arrives(network: Network) -> bool:
+def arrives(network: LossTable) -> bool:
     """Whether the next update does."""
     admit(network.program, network.state, 0, 1, 0, network.verdicts[0])
     fate = network.verdicts[0].fate
     return fate in (DELIVERED, FORCED)
 
 
-def prepare(n: Width, m: Width, system: System, draws: Draws, space: Space, run: int) -> None:
+def prepare(
+    n: Width, m: Width, system: BatchSystem, draws: Draws, space: BatchMemory, run: int
+) -> None:
     """Make a plant's tables."""
     size, inputs = len(n), len(m)
     A, B = run * size * size, run * size * inputs
@@ -176,7 +178,8 @@ def prepare(n: Width, m: Width, system: System, draws: Draws, space: Space, run:
 
 
 def expand(
-    n: Width, m: Width, system: System, space: Space, squares: Squares | None, factor: float,
+    n: Width, m: Width, system: BatchSystem, space: BatchMemory,
+    squares: QuadraticCurves | None, factor: float,
     x_c: Lanes, e_c: Lanes, d: Lanes, begin: int, end: int,
 ) -> None:  # fmt: skip
     """Write the coefficients of degree ``begin`` to ``end``; ``squares``' are times a factor."""
@@ -204,8 +207,8 @@ def expand(
 
 
 def follow(
-    n: Width, m: Width, system: System, draws: Draws, network: Network, space: Space,
-    squares: Squares | None, run: int, row: Any, log: Log,
+    n: Width, m: Width, system: BatchSystem, draws: Draws, network: LossTable, space: BatchMemory,
+    squares: QuadraticCurves | None, run: int, row: Any, log: EventLog,
 ) -> None:  # fmt: skip
     """Follow one run to its end."""
     size, rule = len(n), system.rule
@@ -221,9 +224,9 @@ def follow(
     cost, best, above = 0.0, 0.0, start > settled
     fresh, looked, agree = True, False, True
     span, point = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0
-    reserve, scale, level, degree, first_degree = 0.0, 1.0, 0.0, 0, 1
+    dynamic_variable, scale, level, degree, first_degree = 0.0, 1.0, 0.0, 0, 1
     if squares is not None:
-        reserve, first_degree = squares.first_reserve, 2
+        dynamic_variable, first_degree = squares.initial_dynamic_variable, 2
         if squares.decay_per_s > 0.0:
             farthest_s = min(farthest_s, SLOWEST / squares.decay_per_s)
     if not system.known_start:
@@ -276,7 +279,7 @@ def follow(
         window_s = farthest_s
         if squares is not None:
             size_now = dot(x_c, x_c) + dot(e_c, e_c) + dot(d, d)
-            scale = scale_of(math.sqrt(size_now), threshold, reserve)
+            scale = scale_of(math.sqrt(size_now), threshold, dynamic_variable)
             level = (threshold / scale) * (threshold / scale)
         expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, 0, first_degree)
         if phase.compares and not looked:
@@ -289,7 +292,7 @@ def follow(
                 if speed * window_s > _AHEAD * threshold:
                     window_s = _AHEAD * threshold / speed
             else:
-                soon_s = first_look(squares, level, 2.0 * rate, reserve / (scale * scale))
+                soon_s = first_look(squares, level, 2.0 * rate, dynamic_variable / (scale * scale))
                 window_s = min(window_s, max(_AHEAD * soon_s, point * rule.grid_s - t_s))
             looked = True
         closes = window_s >= until_s - t_s
@@ -299,7 +302,7 @@ def follow(
         expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, first_degree + 1, p)
         found_s = NONE
         if squares is not None and (phase.compares or len(squares.gain) > 0):
-            degree = compare(squares, p, reserve / (scale * scale))
+            degree = compare(squares, p, dynamic_variable / (scale * scale))
         if phase.compares:
             if squares is None:
                 found_s = first_exit(
@@ -315,7 +318,7 @@ def follow(
         event = found_s != NONE
         spent_s = found_s if event else window_s
         if squares is not None:
-            reserve = reserve_at(squares, p, spent_s) * (scale * scale)
+            dynamic_variable = reserve_at(squares, p, spent_s) * (scale * scale)
         p = degree_for(space.reach_s, spent_s)
         x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
         d = value(space.d, p, spent_s, n)

@@ -27,7 +27,7 @@ from cosim.simulation.batch.level_crossing import estimate, first_root, number_a
 from cosim.simulation.batch.norm_crossing import NONE
 from cosim.simulation.batch.taylor import HIGHEST, Array, squared
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, load, store, times, width
-from noack.trigger.trigger_condition import Form, of_error
+from noack.trigger.trigger_condition import QuadraticForm, error_map
 from noack.trigger.trigger_policy import Policy
 
 _MORE = 20
@@ -39,7 +39,7 @@ SLOWEST = 2.0
 """λs on a piece."""
 
 
-class Squares(NamedTuple):
+class QuadraticCurves(NamedTuple):
     """The comparison's form, and that of its reserve; matrices by columns."""
 
     rows: Width
@@ -52,7 +52,7 @@ class Squares(NamedTuple):
     gain_signs: Array
     decay_per_s: float
     """λ."""
-    first_reserve: float
+    initial_dynamic_variable: float
     y: Array
     """Scratch: coefficients of [P; N] z."""
     w: Array
@@ -63,32 +63,36 @@ class Squares(NamedTuple):
     """Scratch: of η."""
 
 
-def squares_of(policy: Policy, n: int) -> Squares | None:
+def squares_of(policy: Policy, n: int) -> QuadraticCurves | None:
     """Return a policy's comparison; None if it has none, or that of ‖W e_s‖ with a threshold.
 
     Args:
         policy: the policy.
         n: how many states.
     """
-    guards = policy.guards(n)
-    form, reserve = guards.form, guards.reserve
+    rule = policy.trigger_rule(n)
+    form, dynamic_variable = rule.form, rule.dynamic_variable
     if not len(form.up):
         return None
-    plain = np.array_equal(form.up, of_error(n, policy.weight)) and not len(form.down)
-    if plain and reserve is None and not guards.from_event and not guards.grid_ns:
+    plain = np.array_equal(form.up, error_map(n, policy.weight)) and not len(form.down)
+    if plain and dynamic_variable is None and not rule.from_event and not rule.grid_ns:
         return None
-    gain = Form(form.up[:0], form.down[:0]) if reserve is None else reserve.gain
+    gain = (
+        QuadraticForm(form.up[:0], form.down[:0])
+        if dynamic_variable is None
+        else dynamic_variable.gain
+    )
     rows = max(2 * n, *(len(one.up) + len(one.down) for one in (form, gain)))
     both, signs = _stacked(form, rows)
     gains, gain_signs = _stacked(gain, rows)
-    return Squares(
+    return QuadraticCurves(
         rows=width(rows),
         form=both,
         form_signs=signs,
-        gain=np.empty(0) if reserve is None else gains,
+        gain=np.empty(0) if dynamic_variable is None else gains,
         gain_signs=gain_signs,
-        decay_per_s=0.0 if reserve is None else float(reserve.decay_per_s),
-        first_reserve=float(policy.first_reserve),
+        decay_per_s=0.0 if dynamic_variable is None else float(dynamic_variable.decay_per_s),
+        initial_dynamic_variable=float(policy.initial_dynamic_variable),
         y=np.empty((HIGHEST + 1) * rows),
         w=np.empty((HIGHEST + 1) * rows),
         g=np.empty(MOST_TERMS),
@@ -96,7 +100,7 @@ def squares_of(policy: Policy, n: int) -> Squares | None:
     )
 
 
-def _stacked(form: Form, rows: int) -> tuple[Array, Array]:
+def _stacked(form: QuadraticForm, rows: int) -> tuple[Array, Array]:
     """[P; N] by columns, filled up with zeros, and the signs of its rows."""
     signs = np.zeros(rows)
     signs[: len(form.up)], signs[len(form.up) :] = 1.0, -1.0
@@ -106,12 +110,12 @@ def _stacked(form: Form, rows: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(filled_up.T).ravel(), signs
 
 
-def scale_of(largest: float, threshold: float, reserve: float) -> float:
+def scale_of(largest: float, threshold: float, dynamic_variable: float) -> float:
     """A number of the size of what is compared."""
-    return max(largest, threshold, math.sqrt(abs(reserve)), _LEAST_SCALE)
+    return max(largest, threshold, math.sqrt(abs(dynamic_variable)), _LEAST_SCALE)
 
 
-def put(squares: Squares, k: int, x: Lanes, e_s: Lanes, factor: float) -> None:
+def put(squares: QuadraticCurves, k: int, x: Lanes, e_s: Lanes, factor: float) -> None:
     """Take a coefficient of the state, times a factor."""
     size, area = len(squares.rows), len(squares.form) // 2
     y = times(squares.form, 0, x, squares.rows) + times(squares.form, area, e_s, squares.rows)
@@ -121,13 +125,13 @@ def put(squares: Squares, k: int, x: Lanes, e_s: Lanes, factor: float) -> None:
         store(squares.w, k * size, w * factor)
 
 
-def compare(squares: Squares, p: int, reserve: float) -> int:
+def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
     """Make the comparison's coefficients of those of the state, up to degree p.
 
     Args:
         squares: the forms.
         p: the degree.
-        reserve: η at the start, over the square of the scale.
+        dynamic_variable: η at the start, over the square of the scale.
 
     Returns:
         Their degree.
@@ -140,7 +144,7 @@ def compare(squares: Squares, p: int, reserve: float) -> int:
     signs = load(squares.gain_signs, 0, squares.rows)
     squared(squares.w, p, signs, squares.eta, squares.rows)
     # From the gain's coefficients to those of η, in the same place.
-    last = reserve
+    last = dynamic_variable
     for k in range(degree + 1 + _MORE):
         gain = squares.eta[k] if k <= degree else 0.0
         squares.eta[k] = last
@@ -153,27 +157,29 @@ def compare(squares: Squares, p: int, reserve: float) -> int:
     return degree + 1 + _MORE
 
 
-def left_side(squares: Squares, x: Lanes) -> float:
+def left_side(squares: QuadraticCurves, x: Lanes) -> float:
     """‖P z‖ where e_s = 0."""
     y = times(squares.form, 0, x, squares.rows)
     return math.sqrt(max(dot(y * load(squares.form_signs, 0, squares.rows), y), 0.0))
 
 
-def first_look(squares: Squares, level: float, rate: float, reserve: float) -> float:
+def first_look(
+    squares: QuadraticCurves, level: float, rate: float, dynamic_variable: float
+) -> float:
     """About when the comparison may hold, from the first three coefficients of the state.
 
     Args:
         squares: the forms.
         level: squared threshold, over the square of the scale.
         rate: at which it decays, per second.
-        reserve: η, over the square of the scale.
+        dynamic_variable: η, over the square of the scale.
     """
-    compare(squares, 2, reserve)
+    compare(squares, 2, dynamic_variable)
     return estimate(squares.g, level, rate)
 
 
 def first_event(
-    squares: Squares, rule: Rule, degree: int, level: float, rate: float, point: int,
+    squares: QuadraticCurves, rule: Rule, degree: int, level: float, rate: float, point: int,
     t_s: float, end_s: float,
 ) -> tuple[float, int]:  # fmt: skip
     """When the comparison first holds on a piece, as seconds from its start; or NONE.
@@ -207,7 +213,7 @@ def first_event(
     return NONE, point
 
 
-def reserve_at(squares: Squares, p: int, s: float) -> float:
+def reserve_at(squares: QuadraticCurves, p: int, s: float) -> float:
     """η, over the square of the scale."""
     if len(squares.gain) == 0:
         return 0.0

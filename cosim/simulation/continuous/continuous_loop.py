@@ -33,19 +33,19 @@ import numpy as np
 
 from cosim.simulation.continuous.event_detector import (
     LARGEST,
-    BallWatch,
+    DetectedEvent,
     DivergedError,
-    FormWatch,
-    Reached,
+    NormEventDetector,
+    QuadraticEventDetector,
 )
-from cosim.simulation.continuous.exact_flow import Flow, growth_rate
-from noack.config.resolution import Loop, loop_of
+from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.policy_from_settings import policy_of
-from noack.trigger.trigger_condition import Form, Guard
+from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 
 _SMALLEST_THRESHOLD = 1e-200
@@ -92,7 +92,7 @@ class ContinuousLoop:
         trigger: the event-triggering policy; its weight is W.
     """
 
-    def __init__(self, loop: Loop, trigger: Policy) -> None:
+    def __init__(self, loop: LoopMatrices, trigger: Policy) -> None:
         self.loop = loop
         self.trigger = trigger
         n, H, BK = loop.n, loop.H, loop.B @ loop.K
@@ -106,14 +106,14 @@ class ContinuousLoop:
         self.generator[n : 2 * n, 2 * n :] = -BK
         self.generator[2 * n :, :n] = -mismatch
         self.generator[2 * n :, 2 * n :] = H - BK
-        self._guards = trigger.guards(n)
-        guard = self._guards.after(0.0, loop.x0)
-        scaled = self.generator + guard.rate_per_s * np.eye(3 * n)
+        self._rule = trigger.trigger_rule(n)
+        condition = self._rule.after(0.0, loop.x0)
+        scaled = self.generator + condition.rate_per_s * np.eye(3 * n)
         rate_per_s = max(growth_rate(self.generator), growth_rate(scaled))
-        if guard.reserve is not None:
-            rate_per_s = max(rate_per_s, guard.reserve.decay_per_s)
-        self.flow = Flow(self.generator, 1.0 / max(rate_per_s, 1.0 / _LONGEST_CELL_S))
-        self._watches: dict[tuple[bytes, float], BallWatch | FormWatch] = {}
+        if condition.dynamic_variable is not None:
+            rate_per_s = max(rate_per_s, condition.dynamic_variable.decay_per_s)
+        self.flow = ExactFlow(self.generator, 1.0 / max(rate_per_s, 1.0 / _LONGEST_CELL_S))
+        self._watches: dict[tuple[bytes, float], NormEventDetector | QuadraticEventDetector] = {}
 
     @property
     def decaying(self) -> DecayingTrigger:
@@ -137,15 +137,15 @@ class ContinuousLoop:
         return norms
 
     def next_event(
-        self, state: LoopState, until_s: float, guard: Guard | None = None
+        self, state: LoopState, until_s: float, condition: TriggerCondition | None = None
     ) -> LoopState | None:
         """The state just before the reset at the next event in [``state.t_s``, ``until_s``].
 
         Args:
             state: where the loop is.
             until_s: how far to look.
-            guard: the rule until then; if ``state`` is just after an event, or at the start, the
-                policy's unless given.
+            condition: the rule until then; by default the policy's, if ``state`` is just after an
+                event or at the start.
 
         Returns:
             None if there is no event until then. A state that is beyond the rule's threshold
@@ -155,96 +155,113 @@ class ContinuousLoop:
             DivergedError: the state outgrows what can be computed with before.
             CallerError: the threshold decays below 1e-200 before, where nothing is left to resolve.
         """
-        found = self.next_crossing(state, until_s, guard or self.guard(state))
+        found = self.next_crossing(state, until_s, condition or self.condition(state))
         return None if found is None else found[0]
 
-    def guard(self, state: LoopState) -> Guard:
+    def condition(self, state: LoopState) -> TriggerCondition:
         """The rule after an event at a state."""
-        return self._guards.after(state.t_s * 1e9, state.x)
+        return self._rule.after(state.t_s * 1e9, state.x)
 
     @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
     def next_crossing(
-        self, state: LoopState, until_s: float, guard: Guard, reserve: float = 0.0
+        self,
+        state: LoopState,
+        until_s: float,
+        condition: TriggerCondition,
+        dynamic_variable: float = 0.0,
     ) -> tuple[LoopState, float] | None:
         """The same as :meth:`next_event`, with the η that a dynamic policy has there.
 
         Args:
             state: where the loop is.
             until_s: how far to look.
-            guard: the rule until then.
-            reserve: η at ``state``.
+            condition: the rule until then.
+            dynamic_variable: η at ``state``.
 
         Raises:
             DivergedError: with the time of the passing.
         """
         try:
-            found = self._next_crossing(state, until_s, guard, reserve)
+            found = self._next_crossing(state, until_s, condition, dynamic_variable)
         except DivergedError as error:
-            raise DivergedError(self._passed_s(state, error.t_s, guard)) from None
+            raise DivergedError(self._passed_s(state, error.t_s, condition)) from None
         end = self.propagate(state, max(until_s, state.t_s)) if found is None else found[0]
-        if not self._is_within(end, guard):
-            raise DivergedError(self._passed_s(state, end.t_s, guard))
+        if not self._is_within(end, condition):
+            raise DivergedError(self._passed_s(state, end.t_s, condition))
         return found
 
-    def _is_within(self, state: LoopState, guard: Guard) -> bool:
+    def _is_within(self, state: LoopState, condition: TriggerCondition) -> bool:
         """Whether a state is one that can be computed with."""
-        threshold, begins_ns = 0.0, min(guard.earliest_ns, guard.latest_ns)
-        if len(guard.form.up) and state.t_s * 1e9 >= begins_ns:
-            threshold = guard.threshold(state.t_s * 1e9)
+        threshold, begins_ns = 0.0, min(condition.earliest_ns, condition.latest_ns)
+        if len(condition.form.up) and state.t_s * 1e9 >= begins_ns:
+            threshold = condition.threshold(state.t_s * 1e9)
         limit = LARGEST * (min(threshold, 1.0) if threshold > 0 else 1.0)
         return float(np.linalg.norm(np.concatenate(state[1:]))) < limit
 
-    def _passed_s(self, state: LoopState, until_s: float, guard: Guard) -> float:
+    def _passed_s(self, state: LoopState, until_s: float, condition: TriggerCondition) -> float:
         """When the loop passes what can be computed with, for it has at ``until_s``."""
         low_s, high_s = state.t_s, until_s
-        if not self._is_within(state, guard):
+        if not self._is_within(state, condition):
             return low_s
         for _ in range(_BISECTIONS):
             middle_s = (low_s + high_s) / 2
-            if self._is_within(self.propagate(state, middle_s), guard):
+            if self._is_within(self.propagate(state, middle_s), condition):
                 low_s = middle_s
             else:
                 high_s = middle_s
         return high_s
 
     def _next_crossing(
-        self, state: LoopState, until_s: float, guard: Guard, reserve: float
+        self, state: LoopState, until_s: float, condition: TriggerCondition, dynamic_variable: float
     ) -> tuple[LoopState, float] | None:
         t_s, z = state.t_s, np.concatenate(state[1:])
-        latest_s = guard.latest_ns * 1e-9
-        begin_s = min(guard.earliest_ns * 1e-9, latest_s)
+        latest_s = condition.latest_ns * 1e-9
+        begin_s = min(condition.earliest_ns * 1e-9, latest_s)
         end_s = max(min(until_s, latest_s), t_s)
         if begin_s > t_s:
             if begin_s > until_s:
                 return None
-            z, reserve = self._advance(z, begin_s - t_s, guard, reserve)
+            z, dynamic_variable = self._advance(z, begin_s - t_s, condition, dynamic_variable)
             t_s = begin_s
-        if len(guard.form.up):
-            if guard.grid_ns:
-                found = self._on_grid(z, t_s, state.t_s, end_s, guard)
+        if len(condition.form.up):
+            if condition.grid_ns:
+                found = self._on_grid(z, t_s, state.t_s, end_s, condition)
             else:
-                found = self._exit(z, t_s, end_s, guard, reserve)
+                found = self._exit(z, t_s, end_s, condition, dynamic_variable)
             if found.exceeds:
-                return self._state(t_s + found.after_s, found.z), found.reserve
-            z, reserve = found.z, found.reserve
+                return self._state(t_s + found.after_s, found.z), found.dynamic_variable
+            z, dynamic_variable = found.z, found.dynamic_variable
         else:
-            z, reserve = self._advance(z, end_s - t_s, guard, reserve)
-        return (self._state(end_s, z), reserve) if latest_s <= until_s else None
+            z, dynamic_variable = self._advance(z, end_s - t_s, condition, dynamic_variable)
+        return (self._state(end_s, z), dynamic_variable) if latest_s <= until_s else None
 
-    def _exit(self, z: Vector, t_s: float, end_s: float, guard: Guard, reserve: float) -> Reached:
+    def _exit(
+        self,
+        z: Vector,
+        t_s: float,
+        end_s: float,
+        condition: TriggerCondition,
+        dynamic_variable: float,
+    ) -> DetectedEvent:
         """Follow the loop until the comparison holds, or to ``end_s``; first decay, then floor."""
-        begin_s, since_s = t_s, guard.since_ns * 1e-9
+        begin_s, since_s = t_s, condition.since_ns * 1e-9
         floor_from_s, vanishes_s = -math.inf, math.inf
-        if guard.level > guard.floor and guard.rate_per_s > 0:
-            rate = guard.rate_per_s
+        if condition.level > condition.floor and condition.rate_per_s > 0:
+            rate = condition.rate_per_s
             floor_from_s = vanishes_s = math.inf
-            if guard.floor > 0:
-                floor_from_s = since_s + math.log(guard.level / guard.floor) / rate
-            vanishes_s = since_s + max(math.log(guard.level / _SMALLEST_THRESHOLD) / rate, 0.0)
+            if condition.floor > 0:
+                floor_from_s = since_s + math.log(condition.level / condition.floor) / rate
+            vanishes_s = since_s + max(math.log(condition.level / _SMALLEST_THRESHOLD) / rate, 0.0)
         if t_s < floor_from_s:
             phase_s = min(end_s, floor_from_s, vanishes_s)
             found = self._watched(
-                z, t_s, guard.threshold(t_s * 1e9), phase_s - t_s, guard.rate_per_s, guard, reserve
+                z,
+                t_s,
+                condition.threshold(t_s * 1e9),
+                phase_s - t_s,
+                condition.rate_per_s,
+                condition,
+                dynamic_variable,
             )
             if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
                 return found
@@ -254,9 +271,11 @@ class ContinuousLoop:
                     f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
                     "give trigger.floor or a shorter horizon"
                 )
-            z, reserve, t_s = found.z, found.reserve, floor_from_s
-        level = guard.floor if guard.rate_per_s > 0 else max(guard.floor, guard.level)
-        found = self._watched(z, t_s, level, end_s - t_s, 0.0, guard, reserve)
+            z, dynamic_variable, t_s = found.z, found.dynamic_variable, floor_from_s
+        level = (
+            condition.floor if condition.rate_per_s > 0 else max(condition.floor, condition.level)
+        )
+        found = self._watched(z, t_s, level, end_s - t_s, 0.0, condition, dynamic_variable)
         return found._replace(after_s=found.after_s + t_s - begin_s)
 
     def _watched(
@@ -266,52 +285,58 @@ class ContinuousLoop:
         threshold: float,
         span_s: float,
         rate_per_s: float,
-        guard: Guard,
-        reserve: float,
-    ) -> Reached:
-        form = guard.form
-        plain = threshold > 0 and not len(form.down) and guard.reserve is None
+        condition: TriggerCondition,
+        dynamic_variable: float,
+    ) -> DetectedEvent:
+        form = condition.form
+        plain = threshold > 0 and not len(form.down) and condition.dynamic_variable is None
         if not plain and threshold == 0:
             rate_per_s = 0.0
         key = (form.up.tobytes() + form.down.tobytes() + bytes([plain]), rate_per_s)
         watch = self._watches.get(key)
         if watch is None:
-            watch = self._watches[key] = self._watch(guard, rate_per_s, plain=plain)
-        if isinstance(watch, FormWatch):
-            return watch.first_exit(z, t_s, threshold, span_s, reserve)
+            watch = self._watches[key] = self._watch(condition, rate_per_s, plain=plain)
+        if isinstance(watch, QuadraticEventDetector):
+            return watch.first_exit(z, t_s, threshold, span_s, dynamic_variable)
         exit_at = watch.first_exit(z, t_s, threshold, span_s)
         if exit_at is not None:
-            return Reached(exit_at[0], exit_at[1], reserve, exceeds=True)
-        return Reached(span_s, self.flow.advance(z, span_s), reserve, exceeds=False)
+            return DetectedEvent(exit_at[0], exit_at[1], dynamic_variable, exceeds=True)
+        return DetectedEvent(span_s, self.flow.advance(z, span_s), dynamic_variable, exceeds=False)
 
-    def _watch(self, guard: Guard, rate_per_s: float, *, plain: bool) -> BallWatch | FormWatch:
+    def _watch(
+        self, condition: TriggerCondition, rate_per_s: float, *, plain: bool
+    ) -> NormEventDetector | QuadraticEventDetector:
         if plain:
-            output = np.zeros((len(guard.form.up), len(self.generator)))
-            output[:, : guard.form.up.shape[1]] = guard.form.up
-            return BallWatch(self.flow, self.generator, output, rate_per_s)
-        gain = None if guard.reserve is None else guard.reserve.gain
-        decay = 0.0 if guard.reserve is None else guard.reserve.decay_per_s
-        return FormWatch(self.flow, self.generator, guard.form, rate_per_s, gain, decay)
+            output = np.zeros((len(condition.form.up), len(self.generator)))
+            output[:, : condition.form.up.shape[1]] = condition.form.up
+            return NormEventDetector(self.flow, self.generator, output, rate_per_s)
+        gain = None if condition.dynamic_variable is None else condition.dynamic_variable.gain
+        decay = (
+            0.0 if condition.dynamic_variable is None else condition.dynamic_variable.decay_per_s
+        )
+        return QuadraticEventDetector(
+            self.flow, self.generator, condition.form, rate_per_s, gain, decay
+        )
 
     def _advance(
-        self, z: Vector, dt_s: float, guard: Guard, reserve: float
+        self, z: Vector, dt_s: float, condition: TriggerCondition, dynamic_variable: float
     ) -> tuple[Vector, float]:
         """State and η after a time in which the comparison does not count."""
-        if guard.reserve is None:
-            return self.flow.advance(z, dt_s), reserve
-        nothing = np.zeros((0, guard.form.up.shape[1]))
-        idle = FormWatch(
-            self.flow, self.generator, Form(nothing, nothing), 0.0, guard.reserve.gain,
-            guard.reserve.decay_per_s,
+        if condition.dynamic_variable is None:
+            return self.flow.advance(z, dt_s), dynamic_variable
+        nothing = np.zeros((0, condition.form.up.shape[1]))
+        idle = QuadraticEventDetector(
+            self.flow, self.generator, QuadraticForm(nothing, nothing), 0.0,
+            condition.dynamic_variable.gain, condition.dynamic_variable.decay_per_s,
         )  # fmt: skip
-        found = idle.first_exit(z, 0.0, 0.0, dt_s, reserve)
-        return found.z, found.reserve
+        found = idle.first_exit(z, 0.0, 0.0, dt_s, dynamic_variable)
+        return found.z, found.dynamic_variable
 
     def _on_grid(
-        self, z: Vector, t_s: float, event_s: float, end_s: float, guard: Guard
-    ) -> Reached:
+        self, z: Vector, t_s: float, event_s: float, end_s: float, condition: TriggerCondition
+    ) -> DetectedEvent:
         """Look at the comparison at the grid's points from ``t_s`` on, later than ``event_s``."""
-        grid_s = guard.grid_ns * 1e-9
+        grid_s = condition.grid_ns * 1e-9
         first = max(
             math.ceil(t_s / grid_s - _GRID_SLACK), math.floor(event_s / grid_s + _GRID_SLACK) + 1
         )
@@ -323,13 +348,13 @@ class ContinuousLoop:
             beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
             known = len(states) if not len(beyond) else int(beyond[0])
             seen = states[:known, : 2 * n]
-            exceeds = np.flatnonzero(guard.exceeds(points_s[:known] * 1e9, seen))
+            exceeds = np.flatnonzero(condition.exceeds(points_s[:known] * 1e9, seen))
             if len(exceeds):
                 k = int(exceeds[0])
-                return Reached(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
+                return DetectedEvent(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)
             if len(beyond):
                 raise DivergedError(float(points_s[beyond[0]]))
-        return Reached(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
+        return DetectedEvent(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
         """The state at ``t_s`` ≥ ``state.t_s``, no event happening in between."""

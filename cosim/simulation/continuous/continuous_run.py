@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, LoopState, Samples, reset
 from cosim.simulation.continuous.event_detector import DivergedError
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
 from noack.trigger.trigger_policy import Policy
@@ -86,7 +86,7 @@ class ContinuousRun:
 
 
 def simulate_continuous(
-    loop: Loop | ContinuousLoop,
+    loop: LoopMatrices | ContinuousLoop,
     trigger: Policy | None = None,
     *,
     horizon_s: float,
@@ -122,7 +122,7 @@ def simulate_continuous(
     fates: list[bool] = []
     diverged_at_s = None
     event = None if known_start else start
-    reserve = system.trigger.first_reserve
+    dynamic_variable = system.trigger.initial_dynamic_variable
     while True:
         if event is not None:
             fates.append(bool(arrives(len(before))))
@@ -130,8 +130,10 @@ def simulate_continuous(
             before.append(event)
             after.append(state)
         try:
-            crossing = system.next_crossing(state, horizon_s, system.guard(state), reserve)
-            event, reserve = (None, 0.0) if crossing is None else crossing
+            crossing = system.next_crossing(
+                state, horizon_s, system.condition(state), dynamic_variable
+            )
+            event, dynamic_variable = (None, 0.0) if crossing is None else crossing
         except DivergedError as error:
             diverged_at_s = error.t_s
             break

@@ -1,4 +1,4 @@
-"""When a guard's comparison first holds, while the loop follows ``dz/dt = G z``.
+"""When a condition's comparison first holds, while the loop follows ``dz/dt = G z``.
 
 Nothing is sampled: time is cut into cells of a width on which a polynomial of degree 18 equals z to
 rounding (:mod:`cosim.simulation.continuous.exact_flow`), and the roots of the comparison's
@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.simulation.continuous.bernstein import curve_basis
-from cosim.simulation.continuous.exact_flow import CELLS, DEGREE, Flow, taylor_terms
+from cosim.simulation.continuous.exact_flow import CELLS, DEGREE, ExactFlow, taylor_terms
 from noack.core.linear_systems import Matrix, Vector
-from noack.trigger.trigger_condition import Form
+from noack.trigger.trigger_condition import QuadraticForm
 
 LARGEST = 1e100
 """Beyond, a state is said to have diverged: squares and ratios must stay finite."""
@@ -28,7 +28,7 @@ class DivergedError(ArithmeticError):
         self.t_s = t_s
 
 
-class BallWatch:
+class NormEventDetector:
     """Finds where an output of the loop, over a threshold that decays, leaves the unit ball.
 
     Args:
@@ -38,7 +38,9 @@ class BallWatch:
         rate_per_s: rate at which the threshold decays; 0 for a constant one.
     """
 
-    def __init__(self, flow: Flow, generator: Matrix, output: Matrix, rate_per_s: float) -> None:
+    def __init__(
+        self, flow: ExactFlow, generator: Matrix, output: Matrix, rate_per_s: float
+    ) -> None:
         n, size = output.shape
         terms = taylor_terms(generator + rate_per_s * np.eye(size), flow.width_s)
         self._flow = flow
@@ -93,18 +95,18 @@ class BallWatch:
             z = self._flow.powers[CELLS] @ z
 
 
-class Reached(NamedTuple):
+class DetectedEvent(NamedTuple):
     """Where a watch has come to."""
 
     after_s: float
     z: Vector
-    reserve: float
+    dynamic_variable: float
     """η."""
     exceeds: bool
     """Whether the comparison holds from there on for a while; else it is the end of the span."""
 
 
-class FormWatch:
+class QuadraticEventDetector:
     """Finds where ‖P z‖² − ‖N z‖² − η first exceeds c², of a threshold c that decays, or 0.
 
     On a cell all of these are polynomials: those of z have degree p, their squares 2p, and η, of
@@ -121,11 +123,11 @@ class FormWatch:
 
     def __init__(
         self,
-        flow: Flow,
+        flow: ExactFlow,
         generator: Matrix,
-        form: Form,
+        form: QuadraticForm,
         rate_per_s: float = 0.0,
-        gain: Form | None = None,
+        gain: QuadraticForm | None = None,
         decay_per_s: float = 0.0,
     ) -> None:
         if gain is not None and rate_per_s:
@@ -143,8 +145,8 @@ class FormWatch:
         self._faded, self._gathered = _reserve_series(decay_per_s, flow.width_s)
 
     def first_exit(
-        self, z: Vector, t_s: float, threshold: float, span_s: float, reserve: float = 0.0
-    ) -> Reached:
+        self, z: Vector, t_s: float, threshold: float, span_s: float, dynamic_variable: float = 0.0
+    ) -> DetectedEvent:
         """Follow the loop until the comparison holds, or to the end of a span.
 
         Args:
@@ -152,7 +154,7 @@ class FormWatch:
             t_s: time.
             threshold: c at ``t_s``, or 0.
             span_s: how far to look.
-            reserve: η at ``t_s``.
+            dynamic_variable: η at ``t_s``.
 
         Raises:
             DivergedError: the state outgrows what can be computed with.
@@ -163,9 +165,11 @@ class FormWatch:
             level = threshold * math.exp(-self._rate_per_s * begin_s)
             if not largest < LARGEST or (level > 0 and not largest / level < LARGEST):
                 raise DivergedError(t_s + begin_s)
-            scale = 1.0 / max(level if level > 0 else largest, math.sqrt(abs(reserve)), 1e-300)
+            scale = 1.0 / max(
+                level if level > 0 else largest, math.sqrt(abs(dynamic_variable)), 1e-300
+            )
             inside = (level * scale) ** 2 - self._form.bernstein(z * scale)
-            saved = self._saved(z * scale, reserve * scale**2)
+            saved = self._saved(z * scale, dynamic_variable * scale**2)
             if saved is not None:
                 inside += saved @ curve_basis(2 * DEGREE).from_taylor.T
             last = min(int((span_s - begin_s) / width_s), CELLS)
@@ -177,18 +181,18 @@ class FormWatch:
                 u = min((span_s - begin_s) / width_s - last, 1.0)
                 return self._reached(begin_s, z, last, u, saved, scale, exceeds=False)
             if saved is not None:
-                reserve = float(saved[-1].sum()) / scale**2
+                dynamic_variable = float(saved[-1].sum()) / scale**2
             z = self._flow.powers[CELLS] @ z
             begin_s += self._flow.window_s
 
-    def _saved(self, z: Vector, reserve: float) -> Matrix | None:
+    def _saved(self, z: Vector, dynamic_variable: float) -> Matrix | None:
         """Taylor coefficients of η in all cells of a window, scaled, shape (cells, 2p + 1)."""
         if self._gain is None:
             return None
         saved = self._gain.taylor(z) @ self._gathered.T
         for cell in range(CELLS):
-            saved[cell] += reserve * self._faded
-            reserve = float(saved[cell].sum())
+            saved[cell] += dynamic_variable * self._faded
+            dynamic_variable = float(saved[cell].sum())
         return saved
 
     def _reached(
@@ -201,14 +205,14 @@ class FormWatch:
         scale: float,
         *,
         exceeds: bool,
-    ) -> Reached:
-        reserve = 0.0
+    ) -> DetectedEvent:
+        dynamic_variable = 0.0
         if saved is not None:
-            reserve = float(u ** np.arange(saved.shape[1]) @ saved[cell]) / scale**2
-        return Reached(
+            dynamic_variable = float(u ** np.arange(saved.shape[1]) @ saved[cell]) / scale**2
+        return DetectedEvent(
             begin_s + (cell + u) * self._flow.width_s,
             self._flow.within_cell(self._flow.powers[cell] @ z, u),
-            reserve,
+            dynamic_variable,
             exceeds,
         )
 
@@ -221,7 +225,7 @@ class _Squares:
         cells: Taylor coefficients of z in the cells, from z at the window's start.
     """
 
-    def __init__(self, form: Form, cells: Matrix) -> None:
+    def __init__(self, form: QuadraticForm, cells: Matrix) -> None:
         rows = np.vstack([form.up, form.down])
         output = np.zeros((len(rows), cells.shape[-1]))
         output[:, : rows.shape[1]] = rows

@@ -35,7 +35,7 @@ def taylor_terms(generator: Matrix, width_s: float) -> Matrix:
     return terms
 
 
-class Flow:
+class ExactFlow:
     """Propagates states of ``dz/dt = G z``.
 
     Args:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
-from cosim.simulation.continuous.exact_flow import Flow, growth_rate
+from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
 from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.trigger.trigger_policy import Trigger
 
@@ -34,7 +34,7 @@ _LONGEST_CELL_S = 1e3
 
 
 @dataclass(frozen=True)
-class Schedule:
+class StepSchedule:
     """What happened when, counted in steps of the plant; K steps follow step 0."""
 
     period_ns: int
@@ -70,14 +70,16 @@ class SampledLoop:
         known_start: sensor and controller know x(0); otherwise the first measured step is event 0.
     """
 
-    def __init__(self, system: ContinuousLoop, schedule: Schedule, *, known_start: bool) -> None:
+    def __init__(
+        self, system: ContinuousLoop, schedule: StepSchedule, *, known_start: bool
+    ) -> None:
         self._system = system
         self._schedule = schedule
         self._known_start = known_start
         self._steps_s = np.arange(len(schedule.measured), dtype=np.float64)
         self._steps_s *= schedule.period_ns * 1e-9
         H = system.loop.H
-        self._model = Flow(H, 1.0 / max(growth_rate(H), 1.0 / _LONGEST_CELL_S))
+        self._model = ExactFlow(H, 1.0 / max(growth_rate(H), 1.0 / _LONGEST_CELL_S))
         self._model_steps = _transitions(self._model, self._steps_s[: _BLOCK + 1])
         self._loop_steps = _transitions(system.flow, self._steps_s[: _BLOCK + 1])
         self._one_step = discretise(system.loop.A, system.loop.B, schedule.period_ns)
@@ -93,7 +95,7 @@ class SampledLoop:
         if in_common:
             trigger.start(0, x0)
         newest = _Update(-1, 0, 0, x0 if in_common else np.zeros_like(x0))
-        under_way: list[_Update] = []
+        in_flight: list[_Update] = []
         events: list[int] = []
         step, event = 0, bool(schedule.measured[0])
         if event and in_common:
@@ -106,16 +108,16 @@ class SampledLoop:
                 events.append(step)
                 if schedule.delivered(number):
                     wait_ns = self._wait_ns(number, hold=hold) if delay else 0
-                    under_way.append(_Update(number, now_ns, now_ns + wait_ns, x))
-                    under_way.sort(key=lambda update: update.acts_ns)
-            while under_way and under_way[0].acts_ns <= now_ns:
-                newest = max(newest, under_way.pop(0), key=lambda update: update.number)
+                    in_flight.append(_Update(number, now_ns, now_ns + wait_ns, x))
+                    in_flight.sort(key=lambda update: update.acts_ns)
+            while in_flight and in_flight[0].acts_ns <= now_ns:
+                newest = max(newest, in_flight.pop(0), key=lambda update: update.number)
             if step == last:
                 return SampledRun(states, np.array(events, dtype=np.int64))
             until = min(step + _BLOCK, last)
-            if under_way:
-                until = min(until, max(under_way[0].acts_ns // period_ns, step + 1))
-            within = [update for update in under_way if update.acts_ns < until * period_ns]
+            if in_flight:
+                until = min(until, max(in_flight[0].acts_ns // period_ns, step + 1))
+            within = [update for update in in_flight if update.acts_ns < until * period_ns]
             following = slice(step + 1, until + 1)
             if hold:
                 states[following] = self._held(x, newest, step, until)
@@ -189,7 +191,7 @@ class _Update(NamedTuple):
     x: Vector
 
 
-def _transitions(flow: Flow, dt_s: Vector) -> Matrix:
+def _transitions(flow: ExactFlow, dt_s: Vector) -> Matrix:
     """e^{G dt} for each dt, shape (len(dt_s), N, N)."""
     columns = np.eye(flow.powers.shape[1])
     return np.stack([flow.sample(column, dt_s) for column in columns], axis=2)

@@ -24,7 +24,7 @@ from cosim.output.report.axes import (
 )
 from cosim.output.report.figure_style import printed, styled
 from cosim.studies.campaign import campaign_file
-from cosim.studies.campaign.campaign_summary import Found, Summary, runs_at
+from cosim.studies.campaign.campaign_summary import CampaignSummary, GridPointResult, runs_at
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS, Metric
@@ -51,7 +51,7 @@ class Drawn(NamedTuple):
     caption: str
 
 
-def figures(summary: Summary, store: Store) -> Iterator[Drawn]:
+def figures(summary: CampaignSummary, store: Store) -> Iterator[Drawn]:
     """Draw the figures that the campaign asks for."""
     for i, wanted in enumerate(summary.campaign.figures):
         places = set(summary.campaign.selected(wanted.where))
@@ -233,7 +233,7 @@ def distribution_figure(series: Mapping[str, Vector], metric: Metric) -> Figure:
 
 
 def _pareto(
-    summary: Summary, found: Sequence[Found], wanted: campaign_file.Pareto
+    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Pareto
 ) -> tuple[Figure, str]:
     series: dict[str, tuple[list[Estimate], list[Estimate]]] = {}
     for one in found:
@@ -249,7 +249,7 @@ def _pareto(
 
 
 def _curve(
-    summary: Summary, found: Sequence[Found], wanted: campaign_file.Curve
+    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.Curve
 ) -> tuple[Figure, str]:
     axis = summary.campaign.by_name[wanted.x]
     numbers = None if axis.numbers is None else np.array(axis.numbers)
@@ -273,7 +273,7 @@ def _curve(
 
 
 def _heat_map(
-    summary: Summary, found: Sequence[Found], wanted: campaign_file.HeatMap
+    summary: CampaignSummary, found: Sequence[GridPointResult], wanted: campaign_file.HeatMap
 ) -> tuple[Figure, str]:
     axes = [summary.campaign.by_name[name] for name in (wanted.x, wanted.y)]
     places = [summary.campaign.axes.index(axis) for axis in axes]
@@ -293,7 +293,10 @@ def _heat_map(
 
 
 def _distribution(
-    summary: Summary, found: Sequence[Found], wanted: campaign_file.Distribution, store: Store
+    summary: CampaignSummary,
+    found: Sequence[GridPointResult],
+    wanted: campaign_file.Distribution,
+    store: Store,
 ) -> tuple[Figure, str]:
     series = {
         label: runs_at(one.point, store)[0][wanted.metric]
@@ -306,11 +309,11 @@ def _distribution(
 
 
 def _series(
-    summary: Summary, found: Sequence[Found], spanned: tuple[str, ...]
-) -> Iterator[tuple[str, list[Found]]]:
+    summary: CampaignSummary, found: Sequence[GridPointResult], spanned: tuple[str, ...]
+) -> Iterator[tuple[str, list[GridPointResult]]]:
     """Grid points by the values of the axes that have no place of their own."""
     rest = [axis for axis in summary.campaign.axes if axis.name not in spanned]
-    groups: dict[str, list[Found]] = {}
+    groups: dict[str, list[GridPointResult]] = {}
     for one in found:
         label = ", ".join(
             one.point.labels[axis.name] if axis.numbers is None

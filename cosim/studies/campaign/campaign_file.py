@@ -17,7 +17,7 @@ from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.config import toml_file
 from noack.config.matrices import Rows
-from noack.config.section import Section, Seed
+from noack.config.section import ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12
@@ -51,7 +51,7 @@ def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
             raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which stands before it")
 
 
-class Axis(Section):
+class Axis(ScenarioSection):
     """What is varied: a key of the scenario with its values, or variants of several keys each."""
 
     name: Identifier
@@ -113,7 +113,7 @@ class Axis(Section):
         return [float(value) for value in values]
 
 
-class Metrics(Section):
+class Metrics(ScenarioSection):
     """How runs are measured, and what of it tables show."""
 
     shown: Annotated[tuple[Metric, ...], Field(min_length=1)] = (
@@ -135,7 +135,7 @@ class Metrics(Section):
     """A run with more transmissions is given up."""
 
 
-class Comparison(Section):
+class PairedComparison(ScenarioSection):
     """Differences draw by draw: the same plant, start and losses at two values of an axis."""
 
     axis: Identifier
@@ -144,7 +144,7 @@ class Comparison(Section):
     """The value or variant that the others are compared with."""
 
 
-class _Figure(Section):
+class _Figure(ScenarioSection):
     where: dict[str, Value] = Field({})
     """Only grid points with these values of these axes."""
 
@@ -211,7 +211,7 @@ def spanned(figure: Pareto | Curve | HeatMap | Distribution) -> tuple[str, ...]:
             return ()
 
 
-class Campaign(Section):
+class Campaign(ScenarioSection):
     """Many runs over a grid of settings."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
@@ -235,7 +235,7 @@ class Campaign(Section):
     axes: Annotated[tuple[Axis, ...], Field(min_length=1)]
     """What is varied; the grid is all combinations."""
     metrics: Metrics = Metrics()
-    compare: Comparison | None = None
+    compare: PairedComparison | None = None
     figures: tuple[Figure, ...] = ()
     """What the page shows."""
 

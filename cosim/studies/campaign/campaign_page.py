@@ -13,21 +13,21 @@ from cosim.output import report
 from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
 from cosim.studies.campaign.campaign_figures import Drawn
-from cosim.studies.campaign.campaign_summary import Compared, Found, Summary
+from cosim.studies.campaign.campaign_summary import CampaignSummary, ComparedResult, GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS, Metric
 
 NONE = "–"
 
 
-class Row(NamedTuple):
+class SummaryRow(NamedTuple):
     """Of a table of grid points."""
 
     labels: Sequence[str]
     cells: Sequence[str]
 
 
-def page(summary: Summary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> str:
+def page(summary: CampaignSummary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> str:
     """Return the page as HTML; whatever is not a figure is escaped.
 
     Args:
@@ -60,7 +60,7 @@ def page(summary: Summary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> s
     )  # fmt: skip
 
 
-def verdict(summary: Summary) -> str:
+def verdict(summary: CampaignSummary) -> str:
     """One sentence on the whole."""
     runs = len(summary.found) * summary.draws
     certified = sum(found.point.certified_error is not None for found in summary.found)
@@ -73,26 +73,26 @@ def verdict(summary: Summary) -> str:
     return f"{runs:,} runs; none exceeds the bound that is certified at {where} grid points."
 
 
-def found_row(found: Found, metrics: Sequence[Metric]) -> Row:
+def found_row(found: GridPointResult, metrics: Sequence[Metric]) -> SummaryRow:
     """A grid point's means with their intervals."""
     cells = [written(found.estimates[m]) if m in found.estimates else NONE for m in metrics]
-    return Row(list(found.point.labels.values()), cells)
+    return SummaryRow(list(found.point.labels.values()), cells)
 
 
-def compared_row(compared: Compared, metrics: Sequence[Metric]) -> Row:
+def compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> SummaryRow:
     """Mean differences with their intervals."""
     found = [compared.differences.get(metric) for metric in metrics]
     cells = [written(d.estimate) if d and d.estimate.finite else NONE for d in found]
-    return Row(list(compared.point.labels.values()), cells)
+    return SummaryRow(list(compared.point.labels.values()), cells)
 
 
-def _compared_row(compared: Compared, metrics: Sequence[Metric]) -> Row:
+def _compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> SummaryRow:
     """The same, and in how many draws the metric is smaller."""
     labels, cells = compared_row(compared, metrics)
     shares = [
         compared.differences[m].smaller if m in compared.differences else None for m in metrics
     ]
-    return Row(
+    return SummaryRow(
         labels,
         [
             cell if share is None else f"{cell}, smaller in {100 * share:.3g} %"
@@ -111,7 +111,7 @@ def written(estimate: Estimate) -> str:
     return text
 
 
-def unfinished(summary: Summary) -> Iterator[str]:
+def unfinished(summary: CampaignSummary) -> Iterator[str]:
     """Of grid points where not all runs reached the horizon."""
     for found in summary.found:
         others = {how: count for how, count in found.ended.items() if how != "finished"}

@@ -13,14 +13,14 @@ from rich.table import Table
 
 from cosim.studies.campaign.campaign_figures import figures
 from cosim.studies.campaign.campaign_page import (
-    Row,
+    SummaryRow,
     compared_row,
     found_row,
     page,
     unfinished,
     verdict,
 )
-from cosim.studies.campaign.campaign_summary import Summary
+from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.metrics import METRICS
 from noack.core.errors import MachineError
@@ -32,7 +32,7 @@ _APART = 3
 _MOST_REMARKS = 5
 
 
-def write_report(summary: Summary, store: Store, base: Mapping[str, Any]) -> list[Path]:
+def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
     """Write page and summary; return the paths of what is to be looked at.
 
     Raises:
@@ -52,7 +52,7 @@ def write_report(summary: Summary, store: Store, base: Mapping[str, Any]) -> lis
     return [*written, store.folder / RUNS]
 
 
-def print_summary(console: Console, summary: Summary) -> None:
+def print_summary(console: Console, summary: CampaignSummary) -> None:
     """Print the tables of a summary."""
     campaign = summary.campaign
     shown = campaign.metrics.shown
@@ -88,7 +88,7 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 
 def tables_of(
-    title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[Row], width: int
+    title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[SummaryRow], width: int
 ) -> Iterator[Table]:
     """Tables with all columns, as many as are needed for a terminal of this width; nothing is cut.
 

@@ -12,8 +12,8 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.chunk_store import Store
 from cosim.studies.campaign.draw_statistics import (
     CONFIDENCE,
-    Difference,
     Estimate,
+    PairedDifference,
     difference,
     estimate,
 )
@@ -27,7 +27,7 @@ _ENDED = {
 }  # fmt: skip
 
 
-class Found(NamedTuple):
+class GridPointResult(NamedTuple):
     """All runs at a grid point."""
 
     point: Point
@@ -38,21 +38,21 @@ class Found(NamedTuple):
     """Runs whose ‖e_c‖ exceeds what is certified: a mistake in the theory or in the code."""
 
 
-class Compared(NamedTuple):
+class ComparedResult(NamedTuple):
     """Runs at a grid point, less those of the same draws at another."""
 
     point: Point
     reference: Point
-    differences: Mapping[Metric, Difference]
+    differences: Mapping[Metric, PairedDifference]
 
 
-class Summary(NamedTuple):
+class CampaignSummary(NamedTuple):
     """What a campaign found."""
 
     campaign: Campaign
     draws: int
-    found: Sequence[Found]
-    compared: Sequence[Compared]
+    found: Sequence[GridPointResult]
+    compared: Sequence[ComparedResult]
 
     @property
     def breaches(self) -> int:
@@ -89,10 +89,10 @@ class Summary(NamedTuple):
         }
 
 
-def summarise(campaign: Campaign, store: Store) -> Summary:
+def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
     """Read all runs of a campaign, one or two grid points at a time."""
     found = [_found(point, store) for point in store.points]
-    return Summary(campaign, store.draws, found, list(_compared(campaign, store)))
+    return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)))
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
@@ -101,10 +101,10 @@ def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
     return measured(columns, point.certified_error), columns["status"]
 
 
-def _found(point: Point, store: Store) -> Found:
+def _found(point: Point, store: Store) -> GridPointResult:
     metrics, status = runs_at(point, store)
     used = metrics.get("certificate_used", np.zeros(0))
-    return Found(
+    return GridPointResult(
         point,
         {how: int((status == code).sum()) for code, how in _ENDED.items() if code in status},
         {name: estimate(values) for name, values in metrics.items()},
@@ -112,7 +112,7 @@ def _found(point: Point, store: Store) -> Found:
     )
 
 
-def _compared(campaign: Campaign, store: Store) -> Iterator[Compared]:
+def _compared(campaign: Campaign, store: Store) -> Iterator[ComparedResult]:
     if campaign.compare is None:
         return
     axis = [axis.name for axis in campaign.axes].index(campaign.compare.axis)
@@ -130,4 +130,4 @@ def _compared(campaign: Campaign, store: Store) -> Iterator[Compared]:
                     name: difference(values, own[name])
                     for name, values in others.items() if name in own
                 }  # fmt: skip
-                yield Compared(point, reference, differences)
+                yield ComparedResult(point, reference, differences)

@@ -206,18 +206,18 @@ def _windowed(
 ) -> Iterator[Finished]:
     """Keep so many chunks under way, so that memory does not grow with the campaign."""
     rest = iter(chunks)
-    under_way: dict[Future[NDArray[np.void]], Chunk] = {}
+    in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
     while True:
-        for chunk in islice(rest, max(most() - len(under_way), 0)):
+        for chunk in islice(rest, max(most() - len(in_flight), 0)):
             task = (points[chunk.point].work, chunk.draws)
             with interrupts_held():
                 future = (
                     executor.submit(run_draws, *task) if wanted is None
                     else executor.submit(run_alike, *task, wanted)
                 )  # fmt: skip
-            under_way[future] = chunk
-        if not under_way:
+            in_flight[future] = chunk
+        if not in_flight:
             return
-        done, _ = wait(under_way, _LOOK_EVERY_S, FIRST_COMPLETED)
+        done, _ = wait(in_flight, _LOOK_EVERY_S, FIRST_COMPLETED)
         for future in done:
-            yield under_way.pop(future), future.result()
+            yield in_flight.pop(future), future.result()

@@ -69,7 +69,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
     )
 
 
-class Difference(NamedTuple):
+class PairedDifference(NamedTuple):
     """A metric at one grid point minus at another, draw by draw."""
 
     estimate: Estimate
@@ -79,7 +79,7 @@ class Difference(NamedTuple):
     """Share of the draws in which it is smaller."""
 
 
-def difference(values: Vector, reference: Vector) -> Difference:
+def difference(values: Vector, reference: Vector) -> PairedDifference:
     """Estimate ``values`` − ``reference``, (k,) each.
 
     Where both are infinite the difference is 0 for quantiles, and does not count for the mean.
@@ -87,7 +87,7 @@ def difference(values: Vector, reference: Vector) -> Difference:
     with np.errstate(invalid="ignore"):
         differences = np.where(values == reference, 0.0, values - reference)
     both = np.isfinite(values) & np.isfinite(reference)
-    return Difference(
+    return PairedDifference(
         estimate(differences, differences[both]),
         float((values > reference).mean()),
         float((values < reference).mean()),

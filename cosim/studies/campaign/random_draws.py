@@ -13,7 +13,7 @@ import numpy as np
 from cosim.simulation.batch.batch_interface import Population
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import Seeds
+from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import uniforms, words
 
@@ -103,7 +103,7 @@ def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
         int(words(seed, _STREAM, name, rows=range(draw, draw + 1), width=1)[0, 0] >> np.uint64(1))
         for name in ("disturbance", "noise")
     )
-    seeds = Seeds(loss=loss_seeds, disturbance=disturbance, noise=noise)
+    seeds = SeedsSection(loss=loss_seeds, disturbance=disturbance, noise=noise)
     return resolve(scenario.model_copy(update={"plant": plant, "seeds": seeds}))
 
 

@@ -22,7 +22,7 @@ from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
 from noack.config.scenario import Scenario
-from noack.config.sections.run_sections import Ports, Realtime, Seeds
+from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import (
@@ -95,7 +95,7 @@ class SampledWork:
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         joined = join_all(record)
-        fading_per_s = policy_of(record.scenario).guards(record.loop.n).fading_per_s
+        fading_per_s = policy_of(record.scenario).trigger_rule(record.loop.n).fading_per_s
         scaled = joined.e_c_norm * np.exp(fading_per_s * joined.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
 
@@ -136,8 +136,8 @@ def in_virtual_time(scenario: Scenario) -> Scenario:
             "name": "campaign",
             "description": "",
             "speed": 1.0,
-            "seeds": Seeds(),
-            "ports": Ports(),
-            "realtime": Realtime(),
+            "seeds": SeedsSection(),
+            "ports": PortsSection(),
+            "realtime": RealtimeSection(),
         }
     )

@@ -33,8 +33,8 @@ from cosim.output.report.decimate import Reals
 from cosim.output.report.figure_files import inline, save
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
-from cosim.record.align import Joined, join_all
-from cosim.studies.comparison.run_comparison import ComparedRun, Comparison
+from cosim.record.align import AlignedRun, join_all
+from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError, MachineError, why
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, SENSOR_MEASUREMENT
@@ -94,11 +94,11 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": printed(palette.SERIES[number % len(palette.SERIES)]), "linewidth": width}
 
 
-def _times(joined: Joined) -> Reals:
+def _times(joined: AlignedRun) -> Reals:
     return np.asarray(joined.t_ns / NS_PER_S, dtype=np.float64)
 
 
-def _state(axes: Axes, entry: int, joined: Sequence[Joined]) -> list[Shown]:
+def _state(axes: Axes, entry: int, joined: Sequence[AlignedRun]) -> list[Shown]:
     shown: list[Shown] = []
     for number, one in enumerate(joined):
         shown += line(axes, _times(one), finite(one.x[:, entry]), **_style(number))
@@ -145,7 +145,7 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
     legend(axes, shown)
 
 
-def write_overlay(comparison: Comparison, path: Path) -> None:
+def write_overlay(comparison: RunComparison, path: Path) -> None:
     """Write the overlay of runs, as ``save`` has it."""
     if path.suffix not in (".html", ".svg", ".png"):
         raise CallerError(f"{path}: a comparison is written as .html, .svg or .png")

@@ -65,7 +65,7 @@ class KeyNumber(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RunComparison:
     """Runs of plants with the same number of states, beside each other.
 
     Args:
@@ -145,7 +145,7 @@ class Comparison:
         return f"{legend}\n{as_text([('', *(run.label for run in self.runs)), *self.rows])}"
 
 
-def compare_runs(directories: Sequence[Path]) -> Comparison:
+def compare_runs(directories: Sequence[Path]) -> RunComparison:
     """Open runs and put them beside each other.
 
     Args:
@@ -171,7 +171,7 @@ def compare_runs(directories: Sequence[Path]) -> Comparison:
                 f"{run.directory}: its plant has {run.record.loop.n} states, that of "
                 f"{runs[0].directory} has {first}; runs with equally many states can be compared"
             )
-    return Comparison(runs)
+    return RunComparison(runs)
 
 
 def _claims(verdict: str) -> Callable[[Summary], int]:
@@ -195,7 +195,7 @@ _NUMBERS: dict[str, Callable[[Summary], float | None]] = {
     "forced by the guarantee": lambda s: s["forced_deliveries"],
     "lost in the network": lambda s: s["drops"],
     "loss rate, %": _loss_rate,
-    "longest loss burst": lambda s: s["longest_drop_run"],
+    "longest loss burst": lambda s: s["longest_loss_burst"],
     "shortest inter-event time, s": lambda s: s["inter_event_min_s"],
     "median inter-event time, s": lambda s: s["inter_event_median_s"],
     "median time between deliveries, s": lambda s: s["inter_delivery_median_s"],

@@ -13,7 +13,12 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.theory.run_conditions import ideal_conditions, nominal_conditions
-from noack.theory.scenario_certificates import Certificate, certify, certify_box, outside_box
+from noack.theory.scenario_certificates import (
+    ScenarioCertificate,
+    certify,
+    certify_box,
+    outside_box,
+)
 
 Bounded = Literal["state", "error"]
 Bounds = Mapping[Bounded, float]
@@ -23,7 +28,7 @@ _Z = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class Limits:
+class DesignLimits:
     """What a design must meet.
 
     Args:
@@ -47,7 +52,7 @@ class Limits:
         return max(0.0, *(1.0 - limit / value if value > 0 else 0.0 for value, limit in pairs))
 
 
-class Measured(NamedTuple):
+class CandidateMeasures(NamedTuple):
     """Of k draws; intervals have 95 % confidence."""
 
     draws: int
@@ -64,7 +69,7 @@ class Measured(NamedTuple):
     """The share of runs that settle within the limit."""
 
 
-def measure(scenario: Scenario, limits: Limits, population: Population) -> Measured:
+def measure(scenario: Scenario, limits: DesignLimits, population: Population) -> CandidateMeasures:
     """Run a scenario over draws; a run that fails never settles.
 
     Raises:
@@ -76,7 +81,7 @@ def measure(scenario: Scenario, limits: Limits, population: Population) -> Measu
     settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
     ordered = np.append(np.sort(settling_s), math.inf)
     at, low, high = ranks(len(rows), limits.quantile)
-    return Measured(
+    return CandidateMeasures(
         len(rows),
         float(sent.mean()),
         _Z * float(sent.std(ddof=1)) / math.sqrt(len(sent)),
@@ -132,7 +137,7 @@ def require_certifiable(scenario: Scenario) -> None:
         raise CallerError(f"--bound: {outside}")
 
 
-def certificate_of(scenario: Scenario, limits: Limits) -> Certificate:
+def certificate_of(scenario: Scenario, limits: DesignLimits) -> ScenarioCertificate:
     """The certificate of all plants in the box, or of the plant if there is no box."""
     resolved = resolve(scenario)
     late = resolved.certificate.late_periods
@@ -142,7 +147,7 @@ def certificate_of(scenario: Scenario, limits: Limits) -> Certificate:
     return certify_box(resolved, conditions) or certify(resolved, conditions)
 
 
-def bounds_of(scenario: Scenario, limits: Limits) -> Bounds:
+def bounds_of(scenario: Scenario, limits: DesignLimits) -> Bounds:
     """Certified sup‖x‖ and sup‖e_c‖ over all times; ‖e_c‖ ≤ ‖W⁻¹‖ ‖e_c‖_W."""
     found = certificate_of(scenario, limits)
     if found.constants is None:

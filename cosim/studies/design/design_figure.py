@@ -7,14 +7,14 @@ from matplotlib.lines import Line2D
 from cosim.output import palette
 from cosim.output.report.axes import finish, legend, logarithmic, plain, single
 from cosim.output.report.figure_style import printed, styled
-from cosim.studies.design.design_result import Found
+from cosim.studies.design.design_result import DesignResult
 
 _HEIGHT_IN = 3.8
 _MARKERS = "os^Dv<>PX"
 
 
 @styled
-def trade_off(found: Found) -> Figure:
+def trade_off(found: DesignResult) -> Figure:
     """Draw all that was tried, the trade-off curve, the limit and the chosen one."""
     names = [f"W {family.name}" for family in found.space.families]
     star_name = "the choice" if found.feasible else "the closest"

@@ -13,7 +13,7 @@ from cosim.output import report
 from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
 from cosim.studies.design.design_figure import trade_off
-from cosim.studies.design.design_result import WORDS, Found, certified, seconds
+from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 
 _CAPTION = (
@@ -25,7 +25,7 @@ _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 
 
-def page(found: Found) -> str:
+def page(found: DesignResult) -> str:
     """Return the page as HTML; whatever is not the figure is escaped."""
     limits, bounds = found.limits, found.bounds or {}
     lines = [
@@ -50,7 +50,7 @@ def page(found: Found) -> str:
     )  # fmt: skip
 
 
-def rows(found: Found) -> list[tuple[str, ...]]:
+def rows(found: DesignResult) -> list[tuple[str, ...]]:
     """The trade-off curve."""
     found_rows: list[tuple[str, ...]] = []
     for trial in found.front:
@@ -68,7 +68,7 @@ def rows(found: Found) -> list[tuple[str, ...]]:
     return found_rows
 
 
-def print_found(console: Console, found: Found) -> None:
+def print_found(console: Console, found: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
     title = f"{found.space.families[0].scenario.name}: trade-off, no other is smaller in both"
     # All of it in 80 columns, no figure cut off.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from cosim.output.number_format import plus_minus
-from cosim.studies.design.candidate_measures import Bounded, Bounds, Limits, Measured
+from cosim.studies.design.candidate_measures import Bounded, Bounds, CandidateMeasures, DesignLimits
 from cosim.studies.design.design_search import Trial
-from cosim.studies.design.design_space import Space
+from cosim.studies.design.design_space import DesignSpace
 from noack.config.scenario import Scenario
 
 _DESIGNED = "_designed"
@@ -16,7 +16,7 @@ WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}
 
 
 @dataclass(frozen=True)
-class Found:
+class DesignResult:
     """The result of a design.
 
     Args:
@@ -30,12 +30,12 @@ class Found:
         seed: of the draws.
     """
 
-    space: Space
-    limits: Limits
+    space: DesignSpace
+    limits: DesignLimits
     trials: Sequence[Trial]
     front: Sequence[Trial]
     best: Trial
-    fresh: Measured
+    fresh: CandidateMeasures
     bounds: Bounds | None
     seed: int
 
@@ -124,7 +124,7 @@ class Found:
         name = self.space.families[one.family].name
         return f"α = {one.alpha_per_s:.4g} /s, β = {one.beta:.4g}, weight {name}"
 
-    def _settling(self, measured: Measured) -> str:
+    def _settling(self, measured: CandidateMeasures) -> str:
         return f"{seconds(measured)} in {100 * self.limits.quantile:g} % of draws"
 
     def _missed(self) -> str:
@@ -149,7 +149,7 @@ def certified(name: Bounded, value: float) -> str:
     return f"{WORDS[name]} ≤ {value:.4g}"
 
 
-def seconds(measured: Measured) -> str:
+def seconds(measured: CandidateMeasures) -> str:
     """The quantile of the settling times with its interval."""
     low, at, high = (
         f"{value:.4g}" if math.isfinite(value) else "∞"

@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping
 
 from cosim.studies.campaign.random_draws import box_of
 from cosim.studies.design.candidate_measures import (
-    Limits,
+    DesignLimits,
     bounds_of,
     require_certifiable,
     require_draws,
 )
-from cosim.studies.design.design_result import Found
+from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.design_search import Search
 from cosim.studies.design.design_space import space_of
 from noack.config.scenario import Scenario
@@ -21,12 +21,12 @@ _SCREENING = 4
 
 def design(
     families: Mapping[tuple[str, str], Scenario],
-    limits: Limits,
+    limits: DesignLimits,
     *,
     draws: int,
     seed: int,
     progress: Callable[[float], None] = lambda share: None,
-) -> Found:
+) -> DesignResult:
     """Choose among families; deterministic.
 
     Args:
@@ -60,6 +60,6 @@ def design(
         bounds = best.bounds or bounds_of(scenario, limits)
     except CallerError:  # nobody asked for a bound
         bounds = None
-    return Found(
+    return DesignResult(
         space, limits, search.trials, search.front(), best, search.confirm(best), bounds, seed
     )

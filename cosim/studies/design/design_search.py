@@ -14,8 +14,14 @@ import numpy as np
 from cosim.simulation.batch.batch_interface import Population
 from cosim.studies.campaign.campaign_figures import undominated
 from cosim.studies.campaign.random_draws import Box
-from cosim.studies.design.candidate_measures import Bounds, Limits, Measured, bounds_of, measure
-from cosim.studies.design.design_space import Candidate, Space
+from cosim.studies.design.candidate_measures import (
+    Bounds,
+    CandidateMeasures,
+    DesignLimits,
+    bounds_of,
+    measure,
+)
+from cosim.studies.design.design_space import Candidate, DesignSpace
 
 _SMALLEST_STEP = 0.04
 """Of the grid's steps."""
@@ -30,13 +36,13 @@ class Trial:
     """A candidate, and what is known of it so far."""
 
     candidate: Candidate
-    measured: Measured
+    measured: CandidateMeasures
     full: bool = False
     """Measured with all draws."""
     bounds: Bounds = field(default_factory=dict)
     """Certified, once it was asked for."""
 
-    def excess(self, limits: Limits) -> float:
+    def excess(self, limits: DesignLimits) -> float:
         """How far it misses the limits, as far as is known."""
         settling_s = self.measured.settling_high_s if self.full else self.measured.settling_s
         return limits.excess(settling_s, self.bounds)
@@ -57,8 +63,8 @@ class Search:
 
     def __init__(
         self,
-        space: Space,
-        limits: Limits,
+        space: DesignSpace,
+        limits: DesignLimits,
         box: Box,
         seed: int,
         *,
@@ -109,7 +115,7 @@ class Search:
             for trial in open_:
                 self._settle(trial)
 
-    def confirm(self, trial: Trial) -> Measured:
+    def confirm(self, trial: Trial) -> CandidateMeasures:
         """Measure a trial on draws that no choice depended on."""
         return self._measure(trial.candidate, self._fresh)
 
@@ -160,6 +166,6 @@ class Search:
             trial.bounds.get(name, 0.0) <= limit for name, limit in self.limits.bounds.items()
         )
 
-    def _measure(self, candidate: Candidate, population: Population) -> Measured:
+    def _measure(self, candidate: Candidate, population: Population) -> CandidateMeasures:
         family = self.space.families[candidate.family]
         return measure(family.with_trigger(candidate), self.limits, population)

@@ -57,7 +57,7 @@ class Family:
 
 
 @dataclass(frozen=True)
-class Space:
+class DesignSpace:
     """All families with their ranges of α and β.
 
     Args:
@@ -128,7 +128,7 @@ def decay_rate(scenario: Scenario) -> float:
     return rate
 
 
-def space_of(families: Mapping[tuple[str, str], Scenario]) -> Space:
+def space_of(families: Mapping[tuple[str, str], Scenario]) -> DesignSpace:
     """The space of scenarios by the names of gain and norm.
 
     Raises:
@@ -148,4 +148,4 @@ def space_of(families: Mapping[tuple[str, str], Scenario]) -> Space:
             f"{LEVELS[-1]:g} ‖x(0)‖ = {highest:g}"
         )
     rates = tuple(decay_rate(one.scenario) for one in found)
-    return Space(found, rates, initial_norm, floor)
+    return DesignSpace(found, rates, initial_norm, floor)

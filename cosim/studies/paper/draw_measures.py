@@ -11,10 +11,10 @@ from cosim.simulation.continuous.continuous_run import (
     TooManyEventsError,
     simulate_continuous,
 )
-from cosim.simulation.continuous.exact_flow import Flow, growth_rate
+from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.studies.paper.paper_conditions import MODES, resolved_draw
-from noack.config.resolution import Loop, loop_of
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 
@@ -93,7 +93,7 @@ def measure_draw(scenario: Scenario, draw: int) -> Draw:
     )
 
 
-def open_loop_eigenvalues(loop: Loop) -> Vector:
+def open_loop_eigenvalues(loop: LoopMatrices) -> Vector:
     """Eigenvalues of A, those within rounding of 0 set to 0, (n,).
 
     A defective double eigenvalue splits by about the square root of the rounding error.
@@ -161,7 +161,7 @@ def _grid(until_s: float) -> Vector:
 def _ideal_norms(closed: Matrix, x0: Vector, horizon_s: float) -> tuple[Vector, Vector]:
     """Times and ‖x‖ of dx/dt = (A + BK) x."""
     t_s = _grid(horizon_s)
-    flow = Flow(closed, 1.0 / growth_rate(closed))
+    flow = ExactFlow(closed, 1.0 / growth_rate(closed))
     return t_s, np.asarray(np.linalg.norm(flow.sample(x0, t_s), axis=1))
 
 

@@ -20,7 +20,7 @@ from noack.core.linear_systems import Vector
 CONFIRMED_FROM, PARTLY_FROM = 0.95, 0.5
 
 
-class Verdict(StrEnum):
+class PaperVerdict(StrEnum):
     """What the draws say of a claim."""
 
     CONFIRMED = "confirmed"
@@ -28,13 +28,13 @@ class Verdict(StrEnum):
     NOT_CONFIRMED = "not confirmed"
 
 
-class Claim(NamedTuple):
+class PaperClaim(NamedTuple):
     """A claim with its verdict."""
 
     where: str
     """In the paper."""
     gist: str
-    verdict: Verdict
+    verdict: PaperVerdict
     why: str
     """The numbers."""
 
@@ -53,11 +53,11 @@ class Judgement(NamedTuple):
     least_in: str
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PaperVerdict:
         """By the rule above."""
         if min(self.base, self.least) >= CONFIRMED_FROM:
-            return Verdict.CONFIRMED
-        return Verdict.PARTLY if self.base >= PARTLY_FROM else Verdict.NOT_CONFIRMED
+            return PaperVerdict.CONFIRMED
+        return PaperVerdict.PARTLY if self.base >= PARTLY_FROM else PaperVerdict.NOT_CONFIRMED
 
     def __str__(self) -> str:
         text = f"in {percent(self.base)} of the draws"
@@ -93,16 +93,16 @@ def judge(
     return Judgement(base, shares.get(least_in, base), least_in)
 
 
-def claims(results: Results) -> Iterator[Claim]:
+def claims(results: Results) -> Iterator[PaperClaim]:
     """All claims of the paper's text about its example, in the order of the text."""
     yield from _mb_et(results)
     yield from _zoh_et(results)
     yield from _inter_event(results)
 
 
-def _mb_et(results: Results) -> Iterator[Claim]:
+def _mb_et(results: Results) -> Iterator[PaperClaim]:
     fewer = judge(results, lambda c: c("model.deliveries") < c("model.events"))
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 2",
         "Because of dropouts, x_c is updated less often than x_s.",
         fewer.verdict,
@@ -110,7 +110,7 @@ def _mb_et(results: Results) -> Iterator[Claim]:
         f"{_median(results, 'model.deliveries')} of x_c.",
     )
     often = judge(results, lambda c: c("model.gap_median_s") < c("model.reception_median_s"))
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 2",
         "Transmissions are more frequent than receptions.",
         often.verdict,
@@ -119,7 +119,7 @@ def _mb_et(results: Results) -> Iterator[Claim]:
     )
     most = judge(results, lambda c: c("model.deliveries") < 0.5 * c("model.events"))
     loss = results.evidence["loss"]
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 2",
         "Most of the transmitted packets are lost.",
         most.verdict,
@@ -128,7 +128,7 @@ def _mb_et(results: Results) -> Iterator[Claim]:
         f"{number(loss['half'])}; never more than {percent(loss['most'])} are.",
     )
     larger = judge(results, lambda c: c("model.controller_error") > 1 + 1e-9)
-    yield Claim(
+    yield PaperClaim(
         "Section III",
         "In general ‖e_c‖ grows larger than ‖e_s‖.",
         larger.verdict,
@@ -136,7 +136,7 @@ def _mb_et(results: Results) -> Iterator[Claim]:
         "threshold in the median; ‖e_s‖ reaches it once, by definition.",
     )
     settled = judge(results, lambda c: np.isfinite(c("model.settled_1_s")))
-    yield Claim(
+    yield PaperClaim(
         "Abstract, Theorem 2",
         "MB-ET stabilises the uncertain system.",
         settled.verdict,
@@ -148,7 +148,7 @@ def _mb_et(results: Results) -> Iterator[Claim]:
         results,
         lambda c: np.isfinite(c("model.settled_1_s")) & np.isfinite(c("zoh.settled_1_s")),
     )
-    yield Claim(
+    yield PaperClaim(
         "Abstract",
         "No acknowledgement messages are needed.",
         both.verdict,
@@ -157,9 +157,9 @@ def _mb_et(results: Results) -> Iterator[Claim]:
     )
 
 
-def _zoh_et(results: Results) -> Iterator[Claim]:
+def _zoh_et(results: Results) -> Iterator[PaperClaim]:
     settled = judge(results, lambda c: np.isfinite(c("zoh.settled_1_s")))
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 3",
         "ZOH-ET stabilises the system, too.",
         settled.verdict,
@@ -170,7 +170,7 @@ def _zoh_et(results: Results) -> Iterator[Claim]:
     finer = judge(results, lambda c: c("zoh.settled_1_s") > c("model.settled_1_s"))
     least = min(later.least, finer.least)
     verdict = Judgement(min(later.base, finer.base), least, "").verdict
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 3",
         "With ZOH the system takes longer to settle.",
         verdict,
@@ -188,7 +188,7 @@ def _zoh_et(results: Results) -> Iterator[Claim]:
         ),
     )
     ratio = quartiles(results.column("zoh.events") / results.column("model.events"))
-    yield Claim(
+    yield PaperClaim(
         "Section V, on Fig. 3",
         "With ZOH the number of updates increases.",
         more.verdict,
@@ -197,7 +197,7 @@ def _zoh_et(results: Results) -> Iterator[Claim]:
     )
 
 
-def _inter_event(results: Results) -> Iterator[Claim]:
+def _inter_event(results: Results) -> Iterator[PaperClaim]:
     longer = judge(
         results,
         lambda c: (
@@ -205,7 +205,7 @@ def _inter_event(results: Results) -> Iterator[Claim]:
             & (c("model.gap_min_s") > c("zoh.gap_min_s"))
         ),
     )
-    yield Claim(
+    yield PaperClaim(
         "Section II, Section VI",
         "MB-ET extends the inter-event times.",
         longer.verdict,
@@ -220,10 +220,10 @@ def _inter_event(results: Results) -> Iterator[Claim]:
         for name in ("exact_model", BASE.name, "wide_box")
     ]
     ordered = medians[0] > medians[1] > medians[2]
-    yield Claim(
+    yield PaperClaim(
         "Section II",
         "MB-ET does so especially when the model is close to the system.",
-        Verdict.CONFIRMED if ordered else Verdict.NOT_CONFIRMED,
+        PaperVerdict.CONFIRMED if ordered else PaperVerdict.NOT_CONFIRMED,
         f"Medians of the median inter-event time: {number(medians[0])} s with an exact model (no "
         f"event after t_0), {number(medians[1])} s in the paper's box, {number(medians[2])} s in "
         "a box five times as wide.",
@@ -233,10 +233,10 @@ def _inter_event(results: Results) -> Iterator[Claim]:
     printed = results.column("inter_event_s", table="printed")
     positive = judge(results, lambda c: c("model.gap_min_s") > 0)
     respected = (observed >= certified).all() and (observed[: len(printed)] >= printed).all()
-    yield Claim(
+    yield PaperClaim(
         "Abstract, Theorem 2",
         "A positive minimum inter-event time exists.",
-        positive.verdict if respected else Verdict.NOT_CONFIRMED,
+        positive.verdict if respected else PaperVerdict.NOT_CONFIRMED,
         f"MB-ET: no two events are closer than {number(1e3 * observed.min())} ms in any draw of "
         f"the base. Certified per draw: {_range(1e3 * certified)} ms. Theorem 2 as printed, "
         f"with the certified Δ ({len(printed)} draws): {_range(1e3 * printed)} ms. "

@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
-from noack.config.sections.run_sections import Seeds
+from noack.config.sections.run_sections import SeedsSection
 
 Mode = Literal["model", "zoh"]
 
@@ -91,5 +91,5 @@ def settings_of(condition: Condition, draw: int) -> list[str]:
 
 def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
     """Draw number ``draw`` of a condition's scenario, resolved."""
-    seeds = Seeds(**dict.fromkeys(_STREAMS, draw))
+    seeds = SeedsSection(**dict.fromkeys(_STREAMS, draw))
     return resolve(scenario.model_copy(update={"mode": mode, "seeds": seeds}))

@@ -40,7 +40,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {name: columns for name, (_, columns) i
 """Of each table."""
 
 
-class Part(NamedTuple):
+class EnsemblePart(NamedTuple):
     """A table of a condition, one row per draw, from draw 0 on."""
 
     table: str
@@ -48,17 +48,17 @@ class Part(NamedTuple):
     draws: int
 
 
-def parts(draws: int) -> list[Part]:
+def parts(draws: int) -> list[EnsemblePart]:
     """What is to be simulated for an ensemble of so many draws."""
     varied, few = max(draws // _VARIED, _FEWEST), max(draws // _PRINTED, _FEWEST)
     return [
-        Part("printed", BASE, few),
-        Part("certified", BASE, draws),
-        *(Part("draws", c, draws if c is BASE else varied) for c in CONDITIONS),
+        EnsemblePart("printed", BASE, few),
+        EnsemblePart("certified", BASE, draws),
+        *(EnsemblePart("draws", c, draws if c is BASE else varied) for c in CONDITIONS),
     ]
 
 
-def rows_of(path: Path, part: Part, draws: Sequence[int]) -> list[Row]:
+def rows_of(path: Path, part: EnsemblePart, draws: Sequence[int]) -> list[Row]:
     """The rows of some draws.
 
     Raises:
@@ -70,7 +70,7 @@ def rows_of(path: Path, part: Part, draws: Sequence[int]) -> list[Row]:
 
 def simulate_ensemble(
     path: Path, draws: int, workers: int = 1, progress: Progress | None = None
-) -> list[tuple[Part, list[Row]]]:
+) -> list[tuple[EnsemblePart, list[Row]]]:
     """Simulate every part.
 
     Args:
@@ -85,7 +85,7 @@ def simulate_ensemble(
         for part in wanted
         for start in range(0, part.draws, _CHUNK)
     ]
-    found: dict[Part, list[Row]] = {part: [] for part in wanted}
+    found: dict[EnsemblePart, list[Row]] = {part: [] for part in wanted}
     done, total = 0, sum(part.draws for part in wanted)
     for (_, part, chunk), rows in zip(tasks, _work(tasks, workers), strict=True):
         found[part] += rows
@@ -95,7 +95,7 @@ def simulate_ensemble(
     return list(found.items())
 
 
-_Task = tuple[Path, Part, range]
+_Task = tuple[Path, EnsemblePart, range]
 
 
 def _work(tasks: Sequence[_Task], workers: int) -> Iterator[list[Row]]:

@@ -20,7 +20,7 @@ from cosim.simulation.virtual_time import simulate
 from cosim.studies.paper.draw_measures import open_loop_eigenvalues, simulate_draw
 from cosim.studies.paper.paper_conditions import BASE, MODES, load_condition, resolved_draw
 from noack.config.named_models import lane_following
-from noack.config.resolution import Loop, loop_of
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario_file import load
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
@@ -142,7 +142,7 @@ def _trapped(path: Path) -> Numbers:
     }
 
 
-def _stable_pairs(loop: Loop, H: Matrix, least_real: float) -> int:
+def _stable_pairs(loop: LoopMatrices, H: Matrix, least_real: float) -> int:
     """Dimensions of {x: (x, x) has no share in modes of Γ = [[A, BK], [0, H]] beyond a real part.
 
     The rows of the left invariant subspace of these modes vanish on such a pair.
@@ -326,12 +326,12 @@ def _loop(
     K: Matrix | None = None,
     A_model: Matrix | None = None,
     x0: Matrix | None = None,
-) -> Loop:
+) -> LoopMatrices:
     n = len(A)
     B = np.zeros((n, 1)) if B is None else B
     K = np.zeros((1, n)) if K is None else K
     A_model = A if A_model is None else A_model
-    return Loop(
+    return LoopMatrices(
         A_model=A_model,
         B_model=B,
         K=K,

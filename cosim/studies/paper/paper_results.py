@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cosim.studies.paper.paper_conditions import BASE, CONDITIONS
-from cosim.studies.paper.paper_ensemble import COLUMNS, Part, Row
+from cosim.studies.paper.paper_ensemble import COLUMNS, EnsemblePart, Row
 from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5
@@ -63,7 +63,9 @@ class Results:
         return int(np.argmin(distance))
 
 
-def results_of(parts: Iterable[tuple[Part, list[Row]]], evidence: Mapping[str, Any]) -> Results:
+def results_of(
+    parts: Iterable[tuple[EnsemblePart, list[Row]]], evidence: Mapping[str, Any]
+) -> Results:
     """Results, with as many digits as the file keeps."""
     document = {
         "tables": [

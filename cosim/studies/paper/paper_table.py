@@ -5,12 +5,12 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from cosim.studies.paper.paper_claims import Verdict
+from cosim.studies.paper.paper_claims import PaperVerdict
 
 _STYLES = {
-    Verdict.CONFIRMED: "green",
-    Verdict.PARTLY: "yellow",
-    Verdict.NOT_CONFIRMED: "bold red",
+    PaperVerdict.CONFIRMED: "green",
+    PaperVerdict.PARTLY: "yellow",
+    PaperVerdict.NOT_CONFIRMED: "bold red",
 }
 
 

@@ -15,8 +15,8 @@ from netem.engine.pump.pump_layout import (
     STORE_FULL,
     Memory,
 )
-from netem.rule_records import Verdict
-from netem.rules.link_rules import Program, State, admit, leave
+from netem.rule_records import PacketDecision
+from netem.rules.link_rules import LinkMemory, LinkProgram, admit, leave
 from netem.rules.mansd import NEVER_NS
 
 _HEAD_BYTES = 16
@@ -26,7 +26,7 @@ _STAMP = 1 | 35 << 32
 _NS = 1_000_000_000
 
 
-def let_out_due(memory: Memory, state_like: State, until_ns: int) -> int:
+def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
     """Line up what is due; return why this ends: CARRY_ON, or what there is no room for.
 
     Args:
@@ -45,7 +45,7 @@ def let_out_due(memory: Memory, state_like: State, until_ns: int) -> int:
         release_ns, number = entry.release_ns, entry.slot
         pop(memory)
         pump.now_ns = max(pump.now_ns, release_ns)
-        memory.clients[slot.client].under_way -= 1
+        memory.clients[slot.client].in_flight -= 1
         _line_up(
             memory, state_like, slot.direction, slot.client, slot.packet, slot.arrival_ns,
             release_ns, slot.size_bytes, 0, number, slot.bit, slot.copy, slot.fate, 1, slot.counts,
@@ -53,7 +53,9 @@ def let_out_due(memory: Memory, state_like: State, until_ns: int) -> int:
     return CARRY_ON
 
 
-def decide(memory: Memory, program_like: Program, state_like: State, verdict: Verdict) -> int:
+def decide(
+    memory: Memory, program_like: LinkProgram, state_like: LinkMemory, verdict: PacketDecision
+) -> int:
     """Decide on the datagrams at hand, all from one socket; return why this ends.
 
     Args:
@@ -68,7 +70,7 @@ def decide(memory: Memory, program_like: Program, state_like: State, verdict: Ve
     link = memory.clients[client_row].link if back else pump.batch_socket
     way = 2 * link + back
     direction = memory.directions[way]
-    program = Program(
+    program = LinkProgram(
         array_at(program_like.stages, direction.stages, direction.stages_rows, 0),
         array_at(program_like.chances, direction.chances, direction.chances_rows, 0),
         array_at(program_like.chains, direction.chains, direction.chains_rows, 0),
@@ -89,7 +91,7 @@ def decide(memory: Memory, program_like: Program, state_like: State, verdict: Ve
         direction.scored != 0,
         direction.tracks != 0,
     )  # fmt: skip
-    state = State(
+    state = LinkMemory(
         array_at(state_like.flows, direction.flows, direction.rows, 0),
         array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
         array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
@@ -170,7 +172,7 @@ def _read_arrival(memory: Memory) -> None:
 
 def _release(
     memory: Memory,
-    state_like: State,
+    state_like: LinkMemory,
     way: int,
     client: int,
     address: int,
@@ -199,7 +201,7 @@ def _release(
         slot.fate = fate
         pump.put += 1
         push(memory, release_ns, pump.put, number)
-        memory.clients[client].under_way += 1
+        memory.clients[client].in_flight += 1
     else:
         _line_up(
             memory, state_like, way, client, packet, pump.now_ns, release_ns, size_bytes, address,
@@ -209,7 +211,7 @@ def _release(
 
 def _line_up(
     memory: Memory,
-    state_like: State,
+    state_like: LinkMemory,
     way: int,
     client: int,
     packet: int,
@@ -227,7 +229,7 @@ def _line_up(
     """Line up a datagram to be sent, and take note that it leaves."""
     pump, direction = memory.pump[0], memory.directions[way]
     place = memory.clients[client].place
-    state = State(
+    state = LinkMemory(
         array_at(state_like.flows, direction.flows, direction.rows, 0),
         state_like.memory,
         state_like.recent_ns,

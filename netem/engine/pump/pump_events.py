@@ -6,7 +6,7 @@ from netem.engine.pump.libc_calls import address_of, array_at, memcpy
 from netem.engine.pump.payload_store import block_address
 from netem.engine.pump.pump_layout import BLOCK_BYTES, CLIENT, DIRECTION, Memory
 from netem.relay_events import EVENT
-from netem.rule_records import Verdict
+from netem.rule_records import PacketDecision
 from netem.rules.mansd import NEVER_NS
 
 _EVENT_BYTES = EVENT.itemsize
@@ -32,7 +32,7 @@ def has_room(memory: Memory, size_bytes: int) -> bool:
 
 
 def tell_arrival(
-    memory: Memory, way: int, client: int, size_bytes: int, address: int, verdict: Verdict
+    memory: Memory, way: int, client: int, size_bytes: int, address: int, verdict: PacketDecision
 ) -> None:
     """Tell that a datagram has come, and what was decided.
 
@@ -54,7 +54,7 @@ def tell_arrival(
         event.delay_ns = verdict.release_ns - pump.now_ns
     if verdict.copy_ns != NEVER_NS:
         event.copy_delay_ns = verdict.copy_ns - pump.now_ns
-    event.held_ns = verdict.held_ns
+    event.hold_back_ns = verdict.hold_back_ns
     event.bit = verdict.bit
     event.copy_bit = verdict.copy_bit
     event.departure = 0
@@ -84,7 +84,7 @@ def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
     event.run = 0
     event.delay_ns = now_ns - leaving.arrival_ns
     event.copy_delay_ns = -1
-    event.held_ns = 0
+    event.hold_back_ns = 0
     event.bit = leaving.bit
     event.copy_bit = -1
     event.departure = 1

@@ -90,7 +90,7 @@ CLIENT = np.dtype(
         ("key3", "<i8"),
         ("last_ns", "<i8"),  # when it, or the server, last sent
         ("number", "<i8"),  # of its flows; -1: there is none
-        ("under_way", "<i4"),
+        ("in_flight", "<i4"),
         ("link", "<i4"),
         ("place", "<i4"),  # row of its flows in the link's states
         ("name_bytes", "<i4"),

@@ -24,8 +24,8 @@ from netem.engine.pump.pump_layout import (
     Memory,
 )
 from netem.engine.pump.pump_send import send
-from netem.rule_records import Verdict
-from netem.rules.link_rules import Program, State
+from netem.rule_records import PacketDecision
+from netem.rules.link_rules import LinkMemory, LinkProgram
 
 _HEADER_BYTES = HEADER.itemsize
 _EPOLLERR = 8
@@ -37,7 +37,11 @@ _MOST_PUT_OFF_NS = 10_000_000
 
 
 def run_pump(
-    memory: Memory, program_like: Program, state_like: State, verdicts: list[Verdict], until_ns: int
+    memory: Memory,
+    program_like: LinkProgram,
+    state_like: LinkMemory,
+    verdicts: list[PacketDecision],
+    until_ns: int,
 ) -> int:
     """Relay until Python is needed; return why it is.
 

@@ -5,11 +5,11 @@ from typing import Annotated, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.matrices import Row
-from noack.config.section import Section
+from noack.config.section import ScenarioSection
 from noack.config.sections.rates import RateHz, require_whole_period
 
 
-class Controller(Section):
+class ControllerSection(ScenarioSection):
     """The controller's schedule, and what it steers to."""
 
     rate_hz: RateHz = 500.0

@@ -7,12 +7,12 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.matrices import Rows, require_length, require_shape, shape
 from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
-from noack.config.section import Section
+from noack.config.section import ScenarioSection
 from noack.config.sections.matrix_file_section import require_read
 from noack.core.linear_systems import Matrix, spectral_abscissa
 
 
-class Model(Section):
+class ModelSection(ScenarioSection):
     """What sensor and controller believe about the plant: Â, B̂, and the gain K of u = K x_c.
 
     Either ``name`` (with optional ``parameters``), or the matrices ``A``, ``B`` and ``gain``, or a

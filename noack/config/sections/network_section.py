@@ -8,18 +8,18 @@ from noack.config.impairments import (
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
     Mansd,
+    NoLoss,
     require_scores,
 )
-from noack.config.section import Section
+from noack.config.section import ScenarioSection
 
 
-class Acknowledgements(Section):
+class AcknowledgementSection(ScenarioSection):
     """The way back from controller to sensor, of the acknowledgement baseline."""
 
-    loss: Loss = Lossless()
+    loss: Loss = NoLoss()
     """What is lost of the acknowledgements."""
     mansd: Mansd | None = None
     """At most so many successive acknowledgements are lost; without it, any number."""
@@ -42,7 +42,7 @@ class Acknowledgements(Section):
         )
 
 
-class Network(Section):
+class NetworkSection(ScenarioSection):
     """The lossy network between sensor and controller."""
 
     mansd: Mansd
@@ -61,7 +61,7 @@ class Network(Section):
     protocol: Literal["none", "ack"] = "none"
     """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
     the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
-    acknowledgements: Acknowledgements | None = None
+    acknowledgements: AcknowledgementSection | None = None
     """The way back, for protocol = "ack"; by default nothing is lost on it. Of no effect where
     protocol = "none" is said."""
 
@@ -76,9 +76,9 @@ class Network(Section):
         return self
 
     @property
-    def way_back(self) -> Acknowledgements:
+    def reverse(self) -> AcknowledgementSection:
         """The way back from controller to sensor, as given or by default."""
-        return self.acknowledgements or Acknowledgements()
+        return self.acknowledgements or AcknowledgementSection()
 
     @property
     def link(self) -> LinkSettings:

@@ -7,13 +7,13 @@ from pydantic import Field, FiniteFloat, model_validator
 from noack.config.disturbances import AnyDisturbance
 from noack.config.matrices import Row, Rows, require_non_negative
 from noack.config.observers import Measurement
-from noack.config.plant_systems import AnySystem, Linear
-from noack.config.section import Section
+from noack.config.plant_systems import AnySystem, LinearSettings
+from noack.config.section import ScenarioSection
 from noack.config.sections.matrix_file_section import require_read
 from noack.config.sections.rates import RateHz, require_whole_period
 
 
-class Watchdog(Section):
+class WatchdogSection(ScenarioSection):
     """What the plant does when no actuation has come for too long."""
 
     timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
@@ -24,10 +24,10 @@ class Watchdog(Section):
     controller's model asks for, propagated from the newest actuation, which then carries x_c."""
 
 
-class Plant(Section):
+class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
-    system: AnySystem = Linear()
+    system: AnySystem = LinearSettings()
     """What it is: a table with ``kind``; a linear system unless given."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
@@ -55,7 +55,7 @@ class Plant(Section):
     measurement: Measurement = Measurement()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """What disturbs it, one added to the other."""
-    watchdog: Watchdog = Watchdog()
+    watchdog: WatchdogSection = WatchdogSection()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -67,7 +67,7 @@ class Plant(Section):
                 raise ValueError(f'{key}: draw = "given" needs both matrices A and B')
             if self.draw != "given" and matrix is not None:
                 raise ValueError(f'{key}: matrices are for draw = "given", not "{self.draw}"')
-        if self.draw != "nominal" and not isinstance(self.system, Linear):
+        if self.draw != "nominal" and not isinstance(self.system, LinearSettings):
             raise ValueError(
                 f'draw: "{self.draw}" is for linear plants; a {self.system.kind} is what it is'
             )

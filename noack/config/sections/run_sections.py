@@ -4,20 +4,20 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.section import Section, Seed
+from noack.config.section import ScenarioSection, Seed
 from noack.core.clock import NS_PER_S
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 
 
-class Certificate(Section):
+class CertificateSection(ScenarioSection):
     """What the certificates of a run allow for, beyond the run's own schedule."""
 
     late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
     """Updates and inputs may be late by so many steps of the plant."""
 
 
-class Recovery(Section):
+class RecoverySection(ScenarioSection):
     """What becomes of a run when one of its processes dies."""
 
     rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
@@ -27,7 +27,7 @@ class Recovery(Section):
     there is no run."""
 
 
-class ScheduledChange(Section):
+class ScheduledChange(ScenarioSection):
     """Settings that are others from a time on, while the run goes on."""
 
     at_s: Annotated[FiniteFloat, Field(ge=0, le=1e7)]
@@ -42,7 +42,7 @@ class ScheduledChange(Section):
         return round(self.at_s * NS_PER_S)
 
 
-class Seeds(Section):
+class SeedsSection(ScenarioSection):
     """Seeds of the named random streams; they are independent of each other."""
 
     plant: Seed = 0
@@ -57,7 +57,7 @@ class Seeds(Section):
     """The measurements' noise."""
 
 
-class Ports(Section):
+class PortsSection(ScenarioSection):
     """UDP ports on the loopback interface, and the control plane's TCP port; 0 takes a free one."""
 
     plant: Port = 0
@@ -85,7 +85,7 @@ class Ports(Section):
         return self
 
 
-class Realtime(Section):
+class RealtimeSection(ScenarioSection):
     """Real-time settings of the loop's processes; each is taken where the system permits it."""
 
     enabled: bool = True

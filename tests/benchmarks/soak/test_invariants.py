@@ -59,7 +59,7 @@ def test_of_a_good_run_nothing_is_broken(
     assert found.broken == []
     assert account["rows"] == {table: len(record[table]) for table in record.tables}
     assert account["events"] == (record["sensor_measurement"]["event"] >= 0).sum()
-    assert 1 <= int(str(account["longest_drop_run"])) <= record.scenario.network.mansd
+    assert 1 <= int(str(account["longest_loss_burst"])) <= record.scenario.network.mansd
     assert 0 < float(str(account["identity_residual_relative"])) < 1e-12
 
 

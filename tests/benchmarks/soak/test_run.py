@@ -47,8 +47,8 @@ def test_a_real_run_breaks_nothing(result: Result) -> None:
     assert result.account["broken"] == 0, result.account["first_broken"]
     assert result.account["rows"]["plant_step"] == 96 * 20 + 1
     assert result.account["events"] > 100
-    overtaken = result.account["overtaken"]
-    assert ended_badly(result.summary, 0, result.account["rows"], overtaken) == []
+    delivered_out_of_order = result.account["delivered_out_of_order"]
+    assert ended_badly(result.summary, 0, result.account["rows"], delivered_out_of_order) == []
 
 
 def test_it_writes_figures_and_a_picture(result: Result) -> None:
@@ -66,8 +66,11 @@ def test_a_good_end_has_no_faults() -> None:
 def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
     rows, stale = {"plant_step": 7}, {"controller": {"stale": 3}}
     assert ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, 3) == []
-    for overtaken in (0, 2):
-        assert len(ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, overtaken)) == 1
+    for delivered_out_of_order in (0, 2):
+        assert (
+            len(ended_badly(GOOD | {"rejected_datagrams": stale}, 0, rows, delivered_out_of_order))
+            == 1
+        )
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import dumps, summarise
 from cosim.record.run_record import RunRecord
@@ -48,7 +48,7 @@ def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict
     assert found["exit"]["status"] == status, found["exit"]
     assert replay(record).bit_exact is True
     with np.errstate(all="ignore"):
-        claims = Claims(record).judge()
+        claims = ClaimEvaluation(record).judge()
     assert claims
     assert [c for c in claims if c.verdict is ClaimVerdict.VIOLATED] == []
     return found
@@ -213,4 +213,4 @@ def test_a_damaged_number_in_a_record_is_named(
     assert (found.table, found.column.rstrip("0123456789[]_")) == (table, column.rstrip("_"))
     dumps(summarise(damaged, 0, "horizon"))
     with np.errstate(all="ignore"):
-        assert Claims(damaged).judge()
+        assert ClaimEvaluation(damaged).judge()

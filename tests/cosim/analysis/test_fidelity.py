@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import cosim.analysis.fidelity
-from cosim.analysis.fidelity import Fidelity, fidelity_for_summary, fidelity_of
+from cosim.analysis.fidelity import Fidelity, compute_fidelity, fidelity_for_summary
 from cosim.analysis.step_schedule import IncomparableError, live_run
 from cosim.cli import app
 from cosim.output.fidelity_table import summary_rows
@@ -46,7 +46,7 @@ def record() -> RunRecord:
 
 @pytest.fixture(scope="module")
 def fidelity(record: RunRecord) -> Fidelity:
-    return fidelity_of(record)
+    return compute_fidelity(record)
 
 
 def with_rows(record: RunRecord, **changed: Rows) -> RunRecord:
@@ -85,7 +85,7 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
         asked.append(now_ns)
         return None if len(asked) % 3 == 2 else 7_000_000 * (len(asked) % 5)
 
-    fidelity = fidelity_of(lane(network, *settings))
+    fidelity = compute_fidelity(lane(network, *settings))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
 
@@ -99,7 +99,7 @@ def test_losses_and_delays_are_explained_in_every_mode(mode: str, start: str) ->
     ],
 )
 def test_any_policy_is_explained(policy: str) -> None:
-    fidelity = fidelity_of(lane(None, f"trigger={policy}", 'mode="zoh"'))
+    fidelity = compute_fidelity(lane(None, f"trigger={policy}", 'mode="zoh"'))
     assert fidelity.explained_relative < 1e-9
     assert fidelity.events_live > 3
 
@@ -126,11 +126,11 @@ def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> N
     policy = '{ policy = "dynamic", sigma = 0.2, theta_s = 0.1, decay_per_s = 0.5 }'
     record = lane(None, f"trigger={policy}", 'mode="zoh"', "horizon_s=100")
     with pytest.raises(IncomparableError, match="turns rounding into another run"):
-        fidelity_of(record)
+        compute_fidelity(record)
 
 
 def test_delay_shows_as_delay() -> None:
-    prompt, late = (fidelity_of(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
+    prompt, late = (compute_fidelity(lane(lambda data, now_ns, d=d: d)) for d in (0, 30_000_000))  # type: ignore[misc]
     sampling, delay = (late.stages[i].difference.rms for i in (0, 1))
     assert delay > 2 * prompt.stages[1].difference.rms
     assert sampling == pytest.approx(prompt.stages[0].difference.rms)  # the same fates, no delay
@@ -139,7 +139,7 @@ def test_delay_shows_as_delay() -> None:
 def test_a_start_without_actuation_shows_as_held_actuation() -> None:
     """Known x(0), no event at all: the plant still waits for the first tick, 8 ms late."""
     settings = ("trigger.beta=100", 'network.initial_sync="known_state"', "controller.phase=0.8")
-    fidelity = fidelity_of(lane(None, *settings))
+    fidelity = compute_fidelity(lane(None, *settings))
     sampling, delay, held, _ = fidelity.stages
     assert fidelity.events_live == 0
     assert sampling.difference.max == pytest.approx(0.0, abs=1e-12)
@@ -154,7 +154,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
     A = tuple(tuple(1.05 * entry for entry in row) for row in plant.A)
     other = record.scenario.model_copy(update={"plant": plant.model_copy(update={"A": A})})
     rows = {table: record[table] for table in record.tables}
-    fidelity = fidelity_of(RunRecord(other, rows, record.notices, record.reports))
+    fidelity = compute_fidelity(RunRecord(other, rows, record.notices, record.reports))
     assert fidelity.explained_relative > 0.1
     assert not fidelity.explained
     assert "too much" in fidelity.verdict
@@ -163,11 +163,11 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][200:] += 0.1
-    assert not fidelity_of(with_rows(record, plant_step=steps)).explained
+    assert not compute_fidelity(with_rows(record, plant_step=steps)).explained
 
 
 def test_at_rest_there_is_nothing_to_explain() -> None:
-    fidelity = fidelity_of(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
+    fidelity = compute_fidelity(lane(None, "plant.initial_state=[0.0, 0.0, 0.0, 0.0]"))
     assert fidelity.explained
     assert fidelity.explained_relative == 0.0
     assert "rounding" in fidelity.verdict
@@ -190,7 +190,7 @@ def test_events_that_the_run_did_not_have_take_the_networks_fates_and_usual_dela
 
 def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
     """A sampled sensor that looks four times a second has fewer events than the paper's."""
-    fidelity = fidelity_of(lane(None, "plant.measure_every=25", 'mode="zoh"'))
+    fidelity = compute_fidelity(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live
     assert fidelity.parted_event is not None
     assert fidelity.explained_relative < 1e-9
@@ -211,7 +211,7 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
 def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, why: str) -> None:
     broken = with_rows(record, **{table: record[table][rows]})
     with pytest.raises(IncomparableError, match=why):
-        fidelity_of(broken)
+        compute_fidelity(broken)
     summary = fidelity_for_summary(broken)
     assert why in summary.pop("reason")
     assert set(summary.values()) == {None}
@@ -220,7 +220,7 @@ def test_a_record_with_gaps_says_so(record: RunRecord, table: str, rows: Any, wh
 def test_a_run_that_was_cut_short_is_compared_as_far_as_it_goes(record: RunRecord) -> None:
     """The sensor was the first to end."""
     short = with_rows(record, sensor_measurement=record[SENSOR_MEASUREMENT][:250])
-    fidelity = fidelity_of(short)
+    fidelity = compute_fidelity(short)
     assert fidelity.samples == 250
     assert fidelity.explained_relative < 1e-9
 
@@ -229,13 +229,13 @@ def test_a_run_that_diverged_says_so(record: RunRecord) -> None:
     steps = record[PLANT_STEP].copy()
     steps["x"][300:] = math.nan
     with pytest.raises(IncomparableError, match="diverged"):
-        fidelity_of(with_rows(record, plant_step=steps))
+        compute_fidelity(with_rows(record, plant_step=steps))
 
 
 def test_a_loop_whose_events_accumulate_says_so() -> None:
     unstable = lane(None, "model.parameters.gain=-1.0", "model.allow_unstable=true", "horizon_s=20")
     with pytest.raises(IncomparableError, match="more than 200 events, which accumulate"):
-        fidelity_of(unstable, max_events=200)
+        compute_fidelity(unstable, max_events=200)
 
 
 def test_the_summary_has_the_same_keys_whatever_happens(
@@ -248,7 +248,7 @@ def test_the_summary_has_the_same_keys_whatever_happens(
     def broken(*_: object) -> Fidelity:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(cosim.analysis.fidelity, "fidelity_of", broken)
+    monkeypatch.setattr(cosim.analysis.fidelity, "compute_fidelity", broken)
     bad = fidelity_for_summary(record)
     assert bad.keys() == good.keys()
     assert bad["reason"] == "RuntimeError('a bug')"
@@ -317,4 +317,4 @@ def test_a_record_with_times_that_no_run_has_is_not_compared(
     rows[table][column][len(rows[table]) // 2] = value
     damaged = RunRecord(record.scenario, rows, [], record.reports)
     with pytest.raises(IncomparableError, match=f"{table} has times that no run has"):
-        fidelity_of(damaged)
+        compute_fidelity(damaged)

@@ -18,7 +18,7 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import MachineError
 from noack.protocol.record_tables import OWNER
-from noack.runtime.control_messages import Progress, heard
+from noack.runtime.control_messages import RunProgress, parse_message
 from tests.cosim.live.outage import SCENARIOS, with_outage
 from tests.fuzz.plane import FakePlane, Sample
 
@@ -38,7 +38,7 @@ class Told(FakePlane):
 
     def put(self, key: str, content: Any) -> None:
         if isinstance(content, str):
-            self.accounts.append(heard(Progress, content))
+            self.accounts.append(parse_message(RunProgress, content))
         super().put(key, content)
 
 
@@ -105,7 +105,7 @@ def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
 def test_the_terminal_says_each_cause_once(run: RunRecord, terminal: bool) -> None:
     shown = io.StringIO()
     account: dict[str, Any] = {
-        "t_s": 0.5, "events": 3, "deliveries": 2, "longest_drop_run": 1, "x_norm": 1.0,
+        "t_s": 0.5, "events": 3, "deliveries": 2, "longest_loss_burst": 1, "x_norm": 1.0,
         "live": None,
     }  # fmt: skip
     console = Console(file=shown, force_terminal=terminal, width=200)

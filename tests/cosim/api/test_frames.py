@@ -57,8 +57,12 @@ def test_what_overtakes_and_what_is_under_way_is_said(scenario: noack.Scenario) 
     run = noack.simulate(noack.with_settings(scenario, {"network.impairments": [jitter]}))
     crossed = crossing(load_record(run.directory))
     fates = Counter(run.events()["fate"].to_pylist())
-    assert fates["overtaken"] == run.summary["drops_by_cause"]["overtaken"] > 0
-    assert fates["under_way"] == crossed.under_way.sum()
+    assert (
+        fates["delivered_out_of_order"]
+        == run.summary["drops_by_cause"]["delivered_out_of_order"]
+        > 0
+    )
+    assert fates["in_flight"] == crossed.in_flight.sum()
 
 
 def test_a_damaged_table_is_one_line(tmp_path: Path, scenario: noack.Scenario) -> None:

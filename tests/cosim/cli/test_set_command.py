@@ -90,6 +90,6 @@ def test_only_what_runs_can_be_changed(ticket: Ticket, coordinator: Coordinator)
     asked = {"settings": {"network.mansd": 1}}
     with pytest.raises(CallerError, match="the run has not begun"):
         coordinator._answer_to(asked)
-    knobs = coordinator._answer_to({})["knobs"]
-    assert knobs["network.mansd"] == 2
-    assert knobs["controller.setpoint"] == [0.0, 0.0]
+    runtime_parameters = coordinator._answer_to({})["runtime_parameters"]
+    assert runtime_parameters["network.mansd"] == 2
+    assert runtime_parameters["controller.setpoint"] == [0.0, 0.0]

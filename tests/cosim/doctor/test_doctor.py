@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from cosim.cli import app
-from cosim.doctor.machine_facts import wanted_of
+from cosim.doctor.machine_facts import requirements_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 
@@ -47,7 +47,7 @@ def test_a_taken_port_makes_a_run_impossible() -> None:
 
 
 def test_a_scenario_wants_wall_time() -> None:
-    wanted = wanted_of(resolve(load(Path("scenarios/lane_following.toml"), ["speed=4"])))
+    wanted = requirements_of(resolve(load(Path("scenarios/lane_following.toml"), ["speed=4"])))
     assert (wanted.duration_s, wanted.period_ns, wanted.allowance_ns) == (5.0, 500_000, 1_000_000)
     assert wanted.rate_hz == 2000
     assert set(wanted.ports) == {"plant", "sensor", "netem", "controller"}

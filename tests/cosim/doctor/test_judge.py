@@ -7,17 +7,24 @@ from typing import Any
 
 import pytest
 
-from cosim.doctor.findings import Finding, Verdict, judge, worst
-from cosim.doctor.machine_facts import Buffer, Disk, Lateness, Machine, RoundTrips, Wanted
+from cosim.doctor.findings import FindingStatus, MachineFinding, judge, worst
+from cosim.doctor.machine_facts import (
+    Buffer,
+    Disk,
+    Lateness,
+    MachineFacts,
+    RoundTrips,
+    RunRequirements,
+)
 from cosim.doctor.machine_measures import lateness
 
-WANTED = Wanted(
+WANTED = RunRequirements(
     name="loop", duration_s=20.0, period_ns=2_000_000, allowance_ns=4_000_000, realtime=True,
     fifo_priority=50, spin_us=0.0, ports={"plant": 47001, "control": 47005},
 )  # fmt: skip
 PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
 ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")
-IDEAL = Machine(
+IDEAL = MachineFacts(
     cores=4, cores_online=4, load=0.1, governor="performance",
     granted=dict.fromkeys(ALL, "granted"),
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
@@ -28,49 +35,49 @@ IDEAL = Machine(
 )  # fmt: skip
 
 
-def about(what: str, wanted: Wanted = WANTED, **changed: Any) -> Finding:
+def about(what: str, wanted: RunRequirements = WANTED, **changed: Any) -> MachineFinding:
     """The first finding of a kind that is not good; the first of all if every one is."""
     found = [one for one in judge(replace(IDEAL, **changed), wanted) if one.what.startswith(what)]
-    return next((one for one in found if one.verdict is not Verdict.GOOD), found[0])
+    return next((one for one in found if one.verdict is not FindingStatus.GOOD), found[0])
 
 
 def test_a_machine_that_grants_everything_is_good() -> None:
     findings = judge(IDEAL, WANTED)
-    assert worst(findings) is Verdict.GOOD
+    assert worst(findings) is FindingStatus.GOOD
     assert not [one for one in findings if one.remedy]
 
 
 @pytest.mark.parametrize(("what", "changed", "verdict"), [
-    ("cores", {"cores": 1}, Verdict.LIMITED),
-    ("cores", {"load": 7.0}, Verdict.LIMITED),
-    ("cores", {"governor": "powersave"}, Verdict.LIMITED),
-    ("cores", {"load": None, "governor": None}, Verdict.GOOD),
-    ("real-time", {"granted": {"sched_fifo": "refused: no"}}, Verdict.LIMITED),
-    ("timers", {"timer_resolution_ns": 4_000_000}, Verdict.LIMITED),
-    ("UDP", {"round_trips": "datagrams on the loopback are lost"}, Verdict.BAD),
-    ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, Verdict.LIMITED),
-    ("receive buffer", {"buffer": Buffer(256, 212_992, 212_992)}, Verdict.LIMITED),
-    ("receive buffer", {"buffer": "nothing"}, Verdict.BAD),
-    ("ports", {"ports_taken": ["plant: UDP port 47001 is taken"]}, Verdict.BAD),
-    ("control plane", {"control": "no answer within 2 s"}, Verdict.BAD),
-    ("disk", {"disk": "runs: cannot be written: no space left"}, Verdict.BAD),
-    ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, Verdict.BAD),
-    ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, Verdict.LIMITED),
-    ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, Verdict.LIMITED),
-    ("compiled code", {"cache": False}, Verdict.LIMITED),
-    ("viewer", {"display": False}, Verdict.LIMITED),
-    ("viewer", {"viewer": None}, Verdict.BAD),
-    ("extra: fmi", {"extras": {"fmi": False}}, Verdict.LIMITED),
-    ("versions", {"versions": {"python": "3.12.1", "noack": None}}, Verdict.LIMITED),
+    ("cores", {"cores": 1}, FindingStatus.LIMITED),
+    ("cores", {"load": 7.0}, FindingStatus.LIMITED),
+    ("cores", {"governor": "powersave"}, FindingStatus.LIMITED),
+    ("cores", {"load": None, "governor": None}, FindingStatus.GOOD),
+    ("real-time", {"granted": {"sched_fifo": "refused: no"}}, FindingStatus.LIMITED),
+    ("timers", {"timer_resolution_ns": 4_000_000}, FindingStatus.LIMITED),
+    ("UDP", {"round_trips": "datagrams on the loopback are lost"}, FindingStatus.BAD),
+    ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, FindingStatus.LIMITED),
+    ("receive buffer", {"buffer": Buffer(256, 212_992, 212_992)}, FindingStatus.LIMITED),
+    ("receive buffer", {"buffer": "nothing"}, FindingStatus.BAD),
+    ("ports", {"ports_taken": ["plant: UDP port 47001 is taken"]}, FindingStatus.BAD),
+    ("control plane", {"control": "no answer within 2 s"}, FindingStatus.BAD),
+    ("disk", {"disk": "runs: cannot be written: no space left"}, FindingStatus.BAD),
+    ("disk", {"disk": Disk("runs", 10**6, 10**7, 5e8)}, FindingStatus.BAD),
+    ("disk", {"disk": Disk("runs", 10**10, 10**7, 1e6)}, FindingStatus.LIMITED),
+    ("runtime folder", {"runtime_folder": "/run/x: must be yours"}, FindingStatus.LIMITED),
+    ("compiled code", {"cache": False}, FindingStatus.LIMITED),
+    ("viewer", {"display": False}, FindingStatus.LIMITED),
+    ("viewer", {"viewer": None}, FindingStatus.BAD),
+    ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),
+    ("versions", {"versions": {"python": "3.12.1", "noack": None}}, FindingStatus.LIMITED),
 ])  # fmt: skip
 def test_each_thing_is_judged_and_what_is_not_good_says_what_would_be(
-    what: str, changed: dict[str, Any], verdict: Verdict
+    what: str, changed: dict[str, Any], verdict: FindingStatus
 ) -> None:
     found = about(what, **changed)
     assert found.verdict is verdict
-    if verdict is not Verdict.GOOD:
+    if verdict is not FindingStatus.GOOD:
         assert found.means
-        assert found.remedy or found.verdict is Verdict.BAD
+        assert found.remedy or found.verdict is FindingStatus.BAD
         assert worst(judge(replace(IDEAL, **changed), WANTED)) is verdict
 
 
@@ -83,7 +90,7 @@ def test_the_remedy_of_a_missing_extra_installs_it() -> None:
 def test_lateness_is_judged_against_what_the_certificates_allow() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
     found = about("wake-ups with what was granted", realtime=late)
-    assert found.verdict is Verdict.LIMITED
+    assert found.verdict is FindingStatus.LIMITED
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
     assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in found.means
     assert "every 0.5 s, of its 20 s" in found.means
@@ -92,17 +99,17 @@ def test_lateness_is_judged_against_what_the_certificates_allow() -> None:
 
 def test_what_is_not_in_force_limits_nothing() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
-    assert about("wake-ups", plain=late).verdict is Verdict.GOOD
+    assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
     without = WANTED._replace(realtime=False)
-    assert about("wake-ups", without, plain=late).verdict is Verdict.LIMITED
-    assert about("wake-ups", without, realtime=late).verdict is Verdict.GOOD
+    assert about("wake-ups", without, plain=late).verdict is FindingStatus.LIMITED
+    assert about("wake-ups", without, realtime=late).verdict is FindingStatus.GOOD
     refused = {"sched_fifo": "refused: Operation not permitted"}
-    assert about("real-time", without, granted=refused).verdict is Verdict.GOOD
+    assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
 
 
 def test_wake_ups_that_nobody_could_watch_are_not_called_good() -> None:
     assert about("wake-ups with what was granted", realtime="it timed out").verdict is (
-        Verdict.LIMITED
+        FindingStatus.LIMITED
     )
 
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from cosim.live.disk_space import require_room, spool_bytes
+from cosim.live.disk_space import require_disk_space, spool_bytes
 from cosim.live.launcher import launch
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -52,5 +52,5 @@ def test_a_run_that_may_not_fit_begins_with_a_warning(
     resolved = resolve(scenario_of(content, 1000.0))
     for share, warned in ((1.0, True), (2.9, True), (3.0, False)):
         with_free(monkeypatch, int(share * spool_bytes(resolved)))
-        require_room(resolved, tmp_path / "not" / "yet")
+        require_disk_space(resolved, tmp_path / "not" / "yet")
         assert ("warning: " in capsys.readouterr().err) == warned

@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 import cosim.live.finalize
-from cosim.live.finalize import conclude, reopen
+from cosim.live.finalize import finalize, reopen
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
-from cosim.record.run_ending import Ending, EndingFile
+from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -75,20 +75,20 @@ def test_a_replay_that_crashes_is_no_crash(run_dir: Path, monkeypatch: pytest.Mo
     assert outcome.summary | {"replay": None} == unharmed.summary | {"replay": None}
 
 
-def ended_well(run_dir: Path) -> Ending:
-    return Ending(run_dir, 0, ExitStatus.OK, "horizon")
+def ended_well(run_dir: Path) -> RunEnding:
+    return RunEnding(run_dir, 0, ExitStatus.OK, "horizon")
 
 
 def test_a_run_that_cannot_be_replayed_fails(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert conclude(ended_well(run_dir), report=False).status == ExitStatus.OK
+    assert finalize(ended_well(run_dir), report=False).status == ExitStatus.OK
 
     def crash(record: object) -> None:
         raise RuntimeError("a mistake of ours")
 
     monkeypatch.setattr(cosim.live.finalize, "replay", crash)
-    outcome = conclude(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
     assert outcome.reason == ("the run cannot be replayed: RuntimeError('a mistake of ours')")
     assert summary_of(run_dir)["exit"] == {"status": 1, "reason": outcome.reason}
@@ -99,7 +99,7 @@ def test_a_run_whose_record_is_lost_fails(run_dir: Path) -> None:
     no_rows = {table: record[table][:0] for table in record.tables}
     write_record(RunRecord(record.scenario, no_rows, [], {}), run_dir)
     (run_dir / REPORTS_FILE).unlink()  # of how much there was, nobody knows
-    outcome = conclude(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
     assert outcome.reason == "the run cannot be replayed: the record has no inputs"
 
@@ -111,11 +111,11 @@ def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
     lost = len(rows[PLANT_STEP][cut])
     rows[PLANT_STEP] = np.delete(rows[PLANT_STEP], cut)
     write_record(RunRecord(record.scenario, rows, [], record.reports), run_dir)
-    outcome = conclude(ended_well(run_dir), report=False)
+    outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
     assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
-    stopped = Ending(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
-    assert conclude(stopped, report=False).status == ExitStatus.INTERRUPTED
+    stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
+    assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED
 
 
 def test_an_interrupted_replay_leaves_a_summary(

@@ -43,7 +43,7 @@ class Barrier:
     def gone(self) -> dict[str, str]:
         return {}
 
-    def incarnation(self, role: str) -> None:
+    def generation(self, role: str) -> None:
         return None
 
     def is_leaving(self, role: str) -> bool:

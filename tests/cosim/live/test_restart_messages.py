@@ -10,14 +10,14 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.protocol.machine_interface import INCARNATION, RESTART
+from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 
 
 def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any]) -> None:
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()
-    rows["input"][50:] = 2 * INCARNATION + np.arange(len(rows) - 50)
+    rows["input"][50:] = 2 * GENERATION + np.arange(len(rows) - 50)
     said = [
         {"process": "sensor", "level": RESTART, "t_ns": k * 10_000_000, "text": f"after {k}"}
         for k in (1, 2)
@@ -25,7 +25,7 @@ def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any
     tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
     restarts = summarise(RunRecord(record.scenario, tables, said, {}), 0, "")["restarts"]
     last_s = rows["now_ns"][49] * 1e-9
-    found = {one["incarnation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
+    found = {one["generation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
     assert found == {
         1: (last_s, None, "after 1"),
         2: (last_s, rows["now_ns"][50] * 1e-9, "after 2"),
@@ -37,8 +37,8 @@ def test_rows_are_missing_of_one_whose_first_ones_are(content: dict[str, Any], n
     """It died before a recorder was back to which it could have sent them again."""
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()
-    rows["input"][50:80] = INCARNATION + 7 + np.arange(30)
-    rows["input"][80:] = newest * INCARNATION + 37 + np.arange(len(rows) - 80)
+    rows["input"][50:80] = GENERATION + 7 + np.arange(30)
+    rows["input"][80:] = newest * GENERATION + 37 + np.arange(len(rows) - 80)
     if newest == 2:
         rows["input"][80:] -= 37
     said = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]

@@ -17,7 +17,7 @@ from cosim.output.viewer.recording import ViewError
 from cosim.record.run_directory import SCENARIO_FILE, SPOOL
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
-from noack.protocol.machine_interface import BEGINNING, INCARNATION, Start
+from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
 from noack.runtime.spool import read_chunks
@@ -51,25 +51,25 @@ class Run:
         self.recorder.abandon()
         self.begin(start, instance, present)
 
-    def say(self, table: str, first: int, payload: bytes, role: str, incarnation: int = 0) -> None:
-        header = json.dumps({"first": first, "incarnation": incarnation}).encode()
+    def say(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
+        header = json.dumps({"first": first, "generation": generation}).encode()
         self.plane.put("telemetry", Sample(f"t/{role}/{table}", payload, header))
         self.recorder.poll()
 
-    def rows(self, table: str, count: int, incarnation: int = 0) -> None:
+    def rows(self, table: str, count: int, generation: int = 0) -> None:
         rows = np.zeros(count, self.recorder._types[table])
-        rows["input"] = incarnation * INCARNATION + np.arange(count)
-        self.say(table, 0, rows.tobytes(), OWNER[table], incarnation)
+        rows["input"] = generation * GENERATION + np.arange(count)
+        self.say(table, 0, rows.tobytes(), OWNER[table], generation)
 
-    def notice(self, role: str, incarnation: int = 0) -> None:
+    def notice(self, role: str, generation: int = 0) -> None:
         line = {"t_ns": 0, "level": "info", "text": role}
-        self.say(NOTICES, 0, json.dumps(line).encode(), role, incarnation)
+        self.say(NOTICES, 0, json.dumps(line).encode(), role, generation)
 
-    def goodbye(self, role: str, incarnation: int = 0, **rows: int) -> Any:
+    def goodbye(self, role: str, generation: int = 0, **rows: int) -> Any:
         tables = {table: 0 for table in OWNER if OWNER[table] == role}
         report = {
             "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
-            "incarnation": incarnation, "instance": role,
+            "generation": generation, "instance": role,
         }  # fmt: skip
         query = Query(f"goodbye/{role}", json.dumps(report).encode())
         self.plane.put("goodbye", query)
@@ -97,12 +97,12 @@ def test_it_asks_for_nothing_that_is_on_disk(run: Run) -> None:
 def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run) -> None:
     run.rows(SENSOR_MEASUREMENT, 7)
     run.follow(Start(1, 0), "b")
-    run.rows(SENSOR_MEASUREMENT, 3, incarnation=1)
+    run.rows(SENSOR_MEASUREMENT, 3, generation=1)
     run.follow(Start(2, 0), "a")
     run.rows(PLANT_STEP, 2)
     run.recorder.confirm()
-    assert run.plane.kept["sensor"] == {"incarnation": 1, "rows": {SENSOR_MEASUREMENT: [[0, 3]]}}
-    assert run.plane.kept["plant"] == {"incarnation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
+    assert run.plane.kept["sensor"] == {"generation": 1, "rows": {SENSOR_MEASUREMENT: [[0, 3]]}}
+    assert run.plane.kept["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
 
 
 def test_it_does_not_wait_for_who_has_left(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

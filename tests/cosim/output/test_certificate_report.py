@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.cli import app
 from cosim.output.certificate_report import IDEAL, SCHEDULE, Study, study, with_weight
 from cosim.simulation.virtual_time import simulate
@@ -16,7 +16,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.errors import CallerError
-from noack.theory.assumptions import Verdict
+from noack.theory.assumptions import AssumptionStatus
 from noack.theory.run_conditions import ideal_conditions
 from noack.theory.scenario_certificates import certify_box, outside_box
 
@@ -139,7 +139,7 @@ def test_the_command_prints_one_document() -> None:
     assert first["constants"]["delta"] > 1
     assert first["floor_from_s"] == pytest.approx(np.log(0.02 / 0.001) / 0.3)
     assert first["floor_constants"]["rate_per_s"] == 0
-    assert {a["verdict"] for a in first["assumptions"]} <= {str(v) for v in Verdict}
+    assert {a["verdict"] for a in first["assumptions"]} <= {str(v) for v in AssumptionStatus}
     assert document["limits"]["the scenario's plant"]["sampling_s"] > 0.002
 
 
@@ -218,7 +218,9 @@ def test_a_plant_outside_its_box_is_named() -> None:
     )  # fmt: skip
     said = outside_box(outside)
     assert said == ("the plant lies outside: A[2, 1] is 2 from the model's, the half-width is 0.3")
-    claims = [c for c in Claims(simulate(outside)).judge() if c.source == "box certificate"]
+    claims = [
+        c for c in ClaimEvaluation(simulate(outside)).judge() if c.source == "box certificate"
+    ]
     assert claims
     assert {(c.verdict, c.since_s) for c in claims} == {("void", 0.0)}
 

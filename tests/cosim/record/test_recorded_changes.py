@@ -20,7 +20,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import Shuttle, _Gathered, _report, simulate
 from netem.duplex_link import network_of
 from netem.link_machine import Datagram, update_link_of
-from noack.config.parameter_changes import Change
+from noack.config.parameter_changes import ParameterChange
 from noack.config.resolution import loop_of, resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
@@ -142,7 +142,7 @@ def test_a_cap_that_shrinks_in_the_middle_of_a_burst_lets_the_next_datagram_pass
     runs = []
     for number in range(12):
         if number == 5:  # one passed, and four have been lost
-            link.announce(Change(0, 50 * MS, {"network.mansd": 2}), 45 * MS)
+            link.announce(ParameterChange(0, 50 * MS, {"network.mansd": 2}), 45 * MS)
         (row,) = [one.row for one in link.handle(Datagram(0, b"x"), number * 10 * MS)
                   if isinstance(one, Record)]  # fmt: skip
         runs.append((int(row[5]), int(row[6])))
@@ -160,7 +160,7 @@ def test_dropouts_are_held_against_the_caps_of_their_time() -> None:
         return [one.text for one in controller.handle(message, t_ns) if isinstance(one, Notice)]
 
     assert delivered(0, 0) == []
-    controller.announce(Change(0, 50 * MS, {"network.mansd": 1}), 0)
+    controller.announce(ParameterChange(0, 50 * MS, {"network.mansd": 1}), 0)
     assert delivered(5, 60 * MS) == []  # four were lost while five might be
     (text,) = delivered(8, 90 * MS)
     assert "2 successive dropouts" in text
@@ -169,7 +169,7 @@ def test_dropouts_are_held_against_the_caps_of_their_time() -> None:
 
 def test_who_is_started_anew_is_told_and_applies_what_is_in_force() -> None:
     resolved = resolve(validate(CONTENT, "here"))
-    change = Change(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
+    change = ParameterChange(0, 500 * MS, {"trigger.beta": 0.5, "controller.setpoint": [2.0, 0.0]})
     sensor = sensor_of(resolved, Start(1, 2_000 * MS))
     (said,) = sensor.announce(change, 2_000 * MS)
     assert isinstance(said, Record)
@@ -198,7 +198,7 @@ def test_processes_that_were_told_otherwise_are_found() -> None:
 def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> None:
     """The controller is told at 1 s of what was to be so from 0.9 s on."""
     resolved = resolve(validate(CONTENT, "here"))
-    change = Change(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
+    change = ParameterChange(0, 900 * MS, {"controller.setpoint": [2.0, 0.0]})
     told_ns = {"sensor": 500 * MS, "netem": 500 * MS, "controller": 1_000 * MS}
     gathered = _Gathered(tables_of(resolved))
     machines: dict[str, Any] = {
@@ -249,7 +249,7 @@ def test_the_machines_of_the_baseline_refuse(machine_of: Callable[[Scenario], An
     content = CONTENT | {"network": CONTENT["network"] | {"protocol": "ack"}}
     machine = machine_of(resolve(validate(content, "here")))
     with pytest.raises(CallerError, match="changed"):
-        machine.announce(Change(0, MS, {"network.mansd": 1}), 0)
+        machine.announce(ParameterChange(0, MS, {"network.mansd": 1}), 0)
 
 
 def test_who_decides_every_fate_cannot_have_changes() -> None:

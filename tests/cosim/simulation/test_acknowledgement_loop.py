@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.live.simulated_run import simulate_run
@@ -18,7 +18,7 @@ from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from netem.duplex_link import ACKNOWLEDGEMENT_LINK, Duplex, network_of
 from netem.link_machine import Datagram, Link
-from noack.config.impairments import Bernoulli, LinkSettings, LossOf
+from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
     Fate,
 )
 from noack.protocol.wire_format import Flow, read_header
-from noack.theory.assumptions import Verdict, assumptions
+from noack.theory.assumptions import AssumptionStatus, assumptions
 
 SCENARIOS = Path(__file__).parents[3] / "scenarios"
 COARSE = ("plant.rate_hz=100", "controller.rate_hz=100", "horizon_s=10")
@@ -184,7 +184,7 @@ def test_each_direction_has_its_own_random_stream() -> None:
     count = min(len(fates(record, UPDATES)), len(fates(other, UPDATES)))
     assert count > 5
     assert fates(record, UPDATES)[:count] == fates(other, UPDATES)[:count]
-    settings = LinkSettings(impairments=(LossOf(loss=Bernoulli(probability=0.5)),))
+    settings = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=0.5)),))
     link = Link(settings, record.scenario.seeds.loss, ACKNOWLEDGEMENT_LINK)
     answers = fates(record, ACKNOWLEDGEMENTS)
     expected = [Fate(link.decide(ACKNOWLEDGEMENTS, 48, 0).fate) for _ in answers]
@@ -275,12 +275,12 @@ def test_a_record_survives_its_files(tmp_path: Path) -> None:
 
 def test_nothing_is_claimed_of_it() -> None:
     record = simulate(acknowledged())
-    (claim,) = Claims(record).judge()
+    (claim,) = ClaimEvaluation(record).judge()
     assert claim.verdict is ClaimVerdict.VOID
     assert 'network.protocol = "ack"' in claim.why
-    assert Claims(record).envelopes() == []
+    assert ClaimEvaluation(record).envelopes() == []
     (assumption,) = [a for a in assumptions(record.scenario) if "acknowledged" in a.what]
-    assert assumption.verdict is Verdict.VIOLATED
+    assert assumption.verdict is AssumptionStatus.VIOLATED
     for refuse in (continuous_loop_of, lambda scenario: study(scenario, 2)):
         with pytest.raises(CallerError, match=r'network\.protocol: .*"none".* has "ack"'):
             refuse(record.scenario)

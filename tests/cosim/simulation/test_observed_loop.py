@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from cosim.analysis.claims.claim_evaluation import Claims
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.analysis.step_schedule import live_run
@@ -17,7 +17,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.batch.batch_interface import setting_of
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.design.candidate_measures import Limits
+from cosim.studies.design.candidate_measures import DesignLimits
 from cosim.studies.design.design_run import design
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -25,7 +25,7 @@ from noack.config.scenario_file import dumps, validate
 from noack.config.state_estimation import steady_state
 from noack.core.errors import CallerError
 from noack.core.linear_systems import row_norms
-from noack.protocol.machine_interface import INCARNATION, RESTART, Start
+from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import NO_SEQUENCE, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.theory.assumptions import assumptions
 from sensor_node.sensor import sensor_of
@@ -132,9 +132,9 @@ def test_a_sensor_in_anothers_place_estimates_anew_and_is_replayed(
     said = [one for one in record.notices if "observer" in one["text"]]
     assert [(one["t_ns"], one["process"]) for one in said] == [(at_ns, "sensor")]
     rows = record[SENSOR_MEASUREMENT]
-    again = np.flatnonzero(rows["input"] >= INCARNATION)[0]
+    again = np.flatnonzero(rows["input"] >= GENERATION)[0]
     assert rows["t_ns"][again] == at_ns
-    assert rows["event"][again] == INCARNATION
+    assert rows["event"][again] == GENERATION
     weight = 0.4**2 / (0.4**2 + 0.02**2)  # of the first estimate against the first output
     expected = 0.5 + weight * (rows["y"][again, 0] - 0.5)
     np.testing.assert_allclose(rows["x"][again], [expected, 0.0], rtol=1e-12)
@@ -144,7 +144,7 @@ def test_a_sensor_in_anothers_place_estimates_anew_and_is_replayed(
     found = replay(again_record)
     assert found.bit_exact, found.first_difference
     assert found.inputs == sum(map(len, tables.values()))
-    verdicts = {str(claim.verdict) for claim in Claims(again_record).judge()}
+    verdicts = {str(claim.verdict) for claim in ClaimEvaluation(again_record).judge()}
     assert verdicts <= {"held", "void"}
 
 
@@ -168,7 +168,7 @@ def test_what_follows_from_i1_is_judged_against_the_estimate_and_nothing_else_is
 ) -> None:
     observed["horizon_s"] = 4.0
     record = run(observed)
-    claims = Claims(record)
+    claims = ClaimEvaluation(record)
     found = claims.judge()
     assert [claim.source for claim in found] == ["(I1)", "(I1)"]
     assert all(claim.verdict == "held" for claim in found)
@@ -192,7 +192,7 @@ def test_with_noise_but_no_observer_what_is_measured_is_taken_for_x(
     assert (np.abs(error) > 0).all()
     sizes = error.std(axis=0)
     assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
-    assert [claim.source for claim in Claims(record).judge()] == ["(I1)", "(I1)"]
+    assert [claim.source for claim in ClaimEvaluation(record).judge()] == ["(I1)", "(I1)"]
     assert summarise(record, 0, "horizon")["estimation"]["observer"] is None
 
 
@@ -203,7 +203,7 @@ def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line
     del observed["plant"]["measurement"]
     record = run(observed)
     assert record.scenario.knows_state
-    sources = [claim.source for claim in Claims(record).judge()]
+    sources = [claim.source for claim in ClaimEvaluation(record).judge()]
     assert sources == ["(I1)", "(I1)", "eq:LossEv3"]
     summary = summarise(record, 0, "horizon")
     assert summary["estimation"] is None
@@ -247,7 +247,7 @@ def test_what_is_exact_or_certified_is_refused_in_one_line(observed: dict[str, A
     with pytest.raises(CallerError, match=r"plant\.disturbances: "):
         live_run(record)
     with pytest.raises(CallerError, match=r"plant\.disturbances: "):
-        design({("K", "W"): scenario}, Limits(0.5, 0.9, 0.1, {}), draws=100, seed=0)
+        design({("K", "W"): scenario}, DesignLimits(0.5, 0.9, 0.1, {}), draws=100, seed=0)
 
 
 def verdict_on_noise(content: dict[str, Any]) -> str:

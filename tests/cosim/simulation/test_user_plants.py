@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.cli import app
-from cosim.live.finalize import conclude
+from cosim.live.finalize import finalize
 from cosim.live.simulated_run import simulate_run
 from cosim.record.run_record import load_record
 from noack.config.resolution import resolve
@@ -121,7 +121,7 @@ def test_a_plant_that_fails_ends_the_motion_and_not_the_run(
     path = prepared(tmp_path, FMU if kind == "fmu" else PYTHON, parameters)
     build(tmp_path, 2).rename(tmp_path / "models" / "oscillator.fmu")
     ending = simulate_run(load(path), tmp_path / "runs")
-    outcome = conclude(ending)
+    outcome = finalize(ending)
     assert outcome.status == 1
     assert outcome.reason == expected
     record = load_record(ending.run_dir)

@@ -170,7 +170,7 @@ def test_a_violation_that_no_delivery_follows_is_reported(busy_content: dict[str
     events = record[SENSOR_MEASUREMENT]
     event_ns = events["t_ns"][events["event"] >= 0]
     assert violation["t_s"] == pytest.approx(event_ns[3] * 1e-9)  # t_0 passes, two may be lost
-    assert summary["longest_drop_run"] == len(event_ns) - 1 > 2
+    assert summary["longest_loss_burst"] == len(event_ns) - 1 > 2
 
 
 def test_a_loop_that_diverges_has_a_record(content: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from tests.fuzz.plane import FakePlane, Query, Sample
 from tests.fuzz.tables import damaged
 
 HELLO = {"pid": 1, "instance": "one", "address": ["127.0.0.1", 47001]}
-PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_drop_run": 0, "x_norm": None}
+PROGRESS = {"t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None}
 KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 
 

@@ -7,12 +7,22 @@ from typing import Any
 from unittest.mock import patch
 
 from cosim.live import coordinator
-from noack.config.parameter_changes import Change, Schedule, settings_bytes, settings_of
+from noack.config.parameter_changes import (
+    ChangeSchedule,
+    ParameterChange,
+    settings_bytes,
+    settings_of,
+)
 from noack.config.runtime_parameters import SHORT
 from noack.core.clock import RunClock
 from noack.core.errors import PeerError
 from noack.runtime import run_registry
-from noack.runtime.control_messages import Announced, Answer, Asked, heard
+from noack.runtime.control_messages import (
+    ChangeAnnouncement,
+    ChangeReply,
+    ChangeRequest,
+    parse_message,
+)
 from noack.runtime.private_folder import open_private
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
@@ -30,7 +40,13 @@ SETTINGS: dict[str, Any] = {
 ANNOUNCED = {
     "number": 0, "t_ns": 10**9, "settings": SETTINGS, "said_ns": 0, "said_at": "now",
 }  # fmt: skip
-ANSWER = {"name": "x", "run_dir": "runs/x", "t_s": 0.5, "from_s": 0.7, "knobs": SETTINGS}
+ANSWER = {
+    "name": "x",
+    "run_dir": "runs/x",
+    "t_s": 0.5,
+    "from_s": 0.7,
+    "runtime_parameters": SETTINGS,
+}
 RUN = {
     "run_id": "00", "run_dir": "runs/x", "session": None, "endpoint": "tcp/127.0.0.1:1",
     "user": "u", "password": "p",
@@ -49,7 +65,9 @@ def one_input(data: bytes) -> None:
             _announced(_bytes(choices, ANNOUNCED))
         case 2:
             with refusal("no answer"):
-                assert isinstance(heard(Answer, _bytes(choices, ANSWER))["run_dir"], str)
+                assert isinstance(
+                    parse_message(ChangeReply, _bytes(choices, ANSWER))["run_dir"], str
+                )
         case _:
             _found(_bytes(choices, RUN))
 
@@ -61,17 +79,17 @@ def _asked(question: bytes) -> None:
         centre = coordinator.Coordinator(_TICKET)
     centre._clock = RunClock(0, 1.0, lambda: 0)
     query = Query("noack/0/knobs", question)
-    plane.put("knobs", query)
+    plane.put("runtime_parameters", query)
     centre.poll()
     assert query.answered == 1
     assert query.error is None or query.error.strip()
     for content in plane.announced:
-        one = heard(Announced, json.dumps(content))
-        Schedule(_TICKET.scenario).announce(
-            "t", Change(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
+        one = parse_message(ChangeAnnouncement, json.dumps(content))
+        ChangeSchedule(_TICKET.scenario).announce(
+            "t", ParameterChange(one["number"], one["t_ns"], one["settings"]), 0, 0, -1
         )
     try:
-        settings = heard(Asked, question).get("settings", {})
+        settings = parse_message(ChangeRequest, question).get("settings", {})
     except PeerError:
         assert not plane.announced
     else:
@@ -81,9 +99,9 @@ def _asked(question: bytes) -> None:
 def _announced(said: bytes) -> None:
     """A process takes it, or refuses it in one line and is as it was."""
     with refusal("no announced"):
-        one = heard(Announced, said)
-        schedule = Schedule(_TICKET.scenario)
-        change = Change(one["number"], one["t_ns"], one["settings"])
+        one = parse_message(ChangeAnnouncement, said)
+        schedule = ChangeSchedule(_TICKET.scenario)
+        change = ParameterChange(one["number"], one["t_ns"], one["settings"])
         with refusal(("the change", "a change"), lines=True):
             schedule.announce("t", change, 0, 0, -1)
             assert settings_of(settings_bytes(one["settings"])) == one["settings"]

@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from netem.control.control_server import Change, ControlServer
+from netem.control.control_server import ControlServer, SettingsChange
 from netem.engine.relay_interface import DIRECTIONS
 from noack.config.impairments import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
@@ -14,7 +14,7 @@ from tests.fuzz.tables import damaged
 from tests.netem.control.relays import FakeRelay
 
 TOKEN = "00" * 32
-_SCHEMA = vocabulary(Change.model_json_schema())
+_SCHEMA = vocabulary(SettingsChange.model_json_schema())
 KNOWN = Vocabulary(("token", *_SCHEMA.keys), (*_SCHEMA.words, TOKEN, "up", "down", *EXAMPLES))
 BASES: list[dict[str, Any]] = [
     {"token": TOKEN, "link": "up", "direction": "both", "words": "loss 5% mansd 4"},

@@ -28,7 +28,7 @@ from cosim.record.run_directory import (
     SPOOL,
     SUMMARY_FILE,
 )
-from cosim.record.run_ending import Ending
+from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import finish_record, load_record, write_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -163,7 +163,7 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 def _show(run_dir: Path) -> None:
     """What `noack summary` does with a summary that is there."""
 
-    def conclude(ending: Ending) -> Outcome:
+    def conclude(ending: RunEnding) -> Outcome:
         assert isinstance(ending.reason, str)
         return Outcome(run_dir, ending.status, ending.reason, {})
 

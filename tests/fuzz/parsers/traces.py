@@ -3,7 +3,7 @@
 import json
 
 from noack.config.impairment_files import read_files
-from noack.config.impairments import Delay, LinkSettings, LossOf, Trace
+from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
 from tests.fuzz.harness import refusal, workspace
 
 SEEDS = [
@@ -19,7 +19,7 @@ def one_input(data: bytes) -> None:
     impairment = {
         b"\1": Delay(distribution="empirical", file=name),
         b"\2": Delay(jitter_s=0.5, distribution="empirical", file=name),
-    }.get(kind, LossOf(loss=Trace(file=name, repeat=kind == b"\0")))
+    }.get(kind, LossOf(loss=TraceLoss(file=name, repeat=kind == b"\0")))
     settings = LinkSettings(impairments=(impairment,))
     with refusal("links.toml: forward.impairments.0"):
         read = read_files(settings, workspace(), "links.toml: forward")

@@ -8,11 +8,14 @@ import numpy as np
 from hypothesis import strategies as st
 
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import Interface, Section
+from netem.capture.pcapng import PcapngInterface, PcapngSection
 from netem.relay_events import EVENT
 
 T_NS = 1_767_225_600_123_456_789
-INTERFACES = (Interface("link0 client", "where the clients are"), Interface("link0 server"))
+INTERFACES = (
+    PcapngInterface("link0 client", "where the clients are"),
+    PcapngInterface("link0 server"),
+)
 USUAL = {
     "t_ns": T_NS, "family": 4, "source_port": 40_001, "destination_port": 40_002,
     "source": "192.0.2.1", "destination": "198.51.100.7", "flow": 3, "packet": 17,
@@ -25,7 +28,7 @@ SHARED = {
     "direction": st.integers(0, 1), "fate": st.integers(0, 5), "copy": st.integers(0, 1),
     "stale": st.integers(0, 1), "source_port": st.integers(0, 65_535),
     "destination_port": st.integers(0, 65_535), "flow": i64, "packet": i64, "run": i64,
-    "mansd": st.integers(-1, 2**63 - 1), "delay_ns": i64, "held_ns": i64,
+    "mansd": st.integers(-1, 2**63 - 1), "delay_ns": i64, "hold_back_ns": i64,
     "bit": st.integers(-1, 2**63 - 1),
 }  # fmt: skip
 
@@ -69,6 +72,6 @@ def batch(*described: dict[str, Any], snap_bytes: int = 2**18) -> tuple[Events, 
 
 def file_of(*described: dict[str, Any], snap_bytes: int = 2**18) -> bytes:
     """A whole capture file."""
-    section = Section(INTERFACES, snap_bytes)
+    section = PcapngSection(INTERFACES, snap_bytes)
     packets = section.packets(*batch(*described, snap_bytes=snap_bytes))
     return section.header() + bytes(packets) + section.statistics()

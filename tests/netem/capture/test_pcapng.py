@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from netem.capture import pcapng
 from netem.capture.packet_blocks import put_blocks
-from netem.capture.pcapng import Interface, Section
+from netem.capture.pcapng import PcapngInterface, PcapngSection
 from noack.protocol.record_tables import Fate
 from tests.netem.capture.batches import INTERFACES, T_NS, batch, events, file_of
 from tests.netem.capture.reader import Datagram, datagram, read
@@ -49,7 +49,7 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
     described: list[dict[str, Any]], cut: int, snap_bytes: int
 ) -> None:
     whole = file_of(*described, snap_bytes=snap_bytes)
-    section = Section(INTERFACES, snap_bytes)
+    section = PcapngSection(INTERFACES, snap_bytes)
     parts = section.header()
     for part in (described[:cut], described[cut:]):
         table, data = batch(*part, snap_bytes=snap_bytes)
@@ -59,8 +59,11 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
 
 
 def test_a_file_says_who_wrote_it_and_describes_the_interfaces() -> None:
-    interfaces = (Interface("link0 client", "[::]:5000 → here"), Interface("link0 server"))
-    section = Section(interfaces, 100)
+    interfaces = (
+        PcapngInterface("link0 client", "[::]:5000 → here"),
+        PcapngInterface("link0 server"),
+    )
+    section = PcapngSection(interfaces, 100)
     file = read(section.header() + section.statistics())
     assert file.section[4][0].startswith(b"noack netem ")
     assert set(file.section) == {2, 3, 4}
@@ -82,7 +85,7 @@ TAIL = "; forward, flow 3, datagram 17"
         ({}, "delivered"),
         (LOST, "dropped by the loss model, 2 in a row"),
         (LOST | {"mansd": 4}, "dropped by the loss model, 2 of at most 4 in a row"),
-        (LOST | {"delay_ns": 10, "held_ns": 10}, "dropped by the loss model, 2 in a row"),
+        (LOST | {"delay_ns": 10, "hold_back_ns": 10}, "dropped by the loss model, 2 in a row"),
         ({"fate": Fate.FORCED}, "forced: delivered by the cap"),
         (
             {"fate": Fate.FORCED, "packet": 0, "mansd": 4},
@@ -100,7 +103,7 @@ TAIL = "; forward, flow 3, datagram 17"
         ({"fate": 5, "run": 12}, "dropped in a blackout, 12 in a row"),
         ({"fate": 99}, "of unknown fate"),
         (
-            {"delay_ns": 12_345_000, "held_ns": 1_200_000, "run": 1, "mansd": 4},
+            {"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "run": 1, "mansd": 4},
             "delivered, delayed 12.345 ms, held back 1.2 ms so that the cap holds",
         ),
         ({"departure": 1, "delay_ns": 12_345_678}, "delivered, after 12.346 ms"),
@@ -180,7 +183,7 @@ def test_a_checksum_of_0_is_sent_as_ffff() -> None:
 @pytest.mark.parametrize(("family", "most"), [(4, 65_507), (6, 65_527)])
 def test_the_largest_datagram_fits(family: int, most: int) -> None:
     table, data = batch({"family": family, "payload": bytes(most)})
-    section = Section(INTERFACES)
+    section = PcapngSection(INTERFACES)
     file = read(section.header() + bytes(section.packets(table, data)))
     assert len(datagram(file.packets[0].frame).payload) == most
     table["size_bytes"] += 1
@@ -198,14 +201,14 @@ def test_the_largest_datagram_fits(family: int, most: int) -> None:
 def test_an_impossible_event_is_refused(field: str, value: int) -> None:
     table, data = batch({}, {})
     table, data = table[:1], data[:18]
-    Section(INTERFACES).packets(table, data)
+    PcapngSection(INTERFACES).packets(table, data)
     table[field] = value
     with pytest.raises(ValueError, match="event 0 of a batch is impossible"):
-        Section(INTERFACES).packets(table, data)
+        PcapngSection(INTERFACES).packets(table, data)
 
 
 def test_missing_events_are_told_where_they_are_missing_and_at_the_end() -> None:
-    section = Section(INTERFACES)
+    section = PcapngSection(INTERFACES)
     data = section.header()
     data += bytes(section.packets(*batch({}, {"interface": 1})))
     section.miss(np.array([0, 2**33 + 5]))
@@ -237,7 +240,7 @@ def test_a_wait_for_the_compiler_is_explained(
     monkeypatch.setattr(pcapng, "is_kept", lambda folder, function: kept)
     for digest, about_s in (("0", 10), ("1", 42)):
         monkeypatch.setattr(pcapng, "FOLDER", tmp_path / f"capture-{digest}")
-        Section([Interface("a", "b")])
+        PcapngSection([PcapngInterface("a", "b")])
         line = (
             "noack netem: compiling the capture for this machine, once; "
             f"this takes about {about_s} s\n"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from netem.capture.pcapng import Section
+from netem.capture.pcapng import PcapngSection
 from tests.netem.capture.batches import INTERFACES, T_NS, batch, file_of
 from tests.netem.capture.conftest import Tshark
 
@@ -116,7 +116,7 @@ def test_tshark_accepts_truncated_datagrams(tshark: Tshark, tmp_path: Path, addr
 
 
 def test_tshark_shows_how_many_events_are_missing(tshark: Tshark, tmp_path: Path) -> None:
-    section = Section(INTERFACES)
+    section = PcapngSection(INTERFACES)
     section.miss(np.array([7, 0]))
     path = tmp_path / "capture.pcapng"
     path.write_bytes(

@@ -13,7 +13,7 @@ import pytest
 
 from netem.capture.capture_writer import CaptureWriter
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import Section
+from netem.capture.pcapng import PcapngSection
 from noack.core.errors import CallerError
 from tests.netem.capture.batches import INTERFACES, batch, file_of
 from tests.netem.capture.reader import read
@@ -204,7 +204,7 @@ def test_the_section_is_made_before_the_file_is_touched(
 
     path = tmp_path / "capture.pcapng"
     path.write_bytes(b"older")
-    monkeypatch.setattr(Section, "packets", fail)
+    monkeypatch.setattr(PcapngSection, "packets", fail)
     with pytest.raises(RuntimeError):
         CaptureWriter(path, INTERFACES)
     assert path.read_bytes() == b"older"

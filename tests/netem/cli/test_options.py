@@ -14,7 +14,7 @@ from netem.engine.relay_interface import LinkSpec
 from netem.words.loss_words import LOSS_MODELS
 from netem.words.word_examples import EXAMPLES
 from netem.words.words_to_settings import KEYWORDS, parse, settings_of
-from noack.config.impairments import LinkSettings, LossOf, Scripted
+from noack.config.impairments import LinkSettings, LossOf, ScriptedLoss
 from noack.core.errors import CallerError
 
 ADDRESSES = ["--listen", ":9000", "--to", ":9001"]
@@ -84,7 +84,7 @@ def test_files_in_words_lie_in_the_working_directory(
     (tmp_path / "lost.txt").write_text("010")
     monkeypatch.chdir(tmp_path)
     (link,) = specs([*ADDRESSES, "--back", "loss", "trace", "lost.txt"])
-    assert link.back.impairments == (LossOf(loss=Scripted(lost=(1,), repeat_every=3)),)
+    assert link.back.impairments == (LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)
 
 
 def test_links_come_from_a_file(tmp_path: Path) -> None:

@@ -16,10 +16,11 @@ def direction(**changes: Any) -> Any:
     nothing = {"p50": None, "p99": None, "p999": None, "max": None}
     given = {
         "words": "", "arrived": 0, "arrived_bytes": 0, "forwarded": 0, "forwarded_bytes": 0,
-        "duplicated": 0, "overtaken": 0, "held_back": 0, "longest_run": 0, "mansd": None,
+        "duplicated": 0, "delivered_out_of_order": 0, "held_back": 0,
+        "longest_loss_burst": 0, "mansd": None,
         "loss": {"realised": None, "lost": None, "predicted": 0.0}, "arrived_before": 0,
         "unintended": {"lost_in_kernel": 0},
-        "under_way": 0, "most_under_way": 0, "flows": [], "delay_ns": nothing,
+        "in_flight": 0, "most_in_flight": 0, "flows": [], "delay_ns": nothing,
         "lateness_ns": nothing, "recent": None,
     }  # fmt: skip
     return given | {"fates": fates | changes.pop("fates", {})} | changes
@@ -43,7 +44,7 @@ def printed(document: Statistics, *, predicted: bool = True) -> list[str]:
 
 LOSSY = direction(
     words="loss 5% mansd 4", arrived=2000, forwarded=1900, fates={"dropped": 100, "forced": 3},
-    longest_run=4, mansd=4, loss={"realised": 0.05, "lost": 0.05, "predicted": 0.0499},
+    longest_loss_burst=4, mansd=4, loss={"realised": 0.05, "lost": 0.05, "predicted": 0.0499},
     delay_ns={"p50": 10_000, "p99": 2_000_000, "p999": 1, "max": 1},
 )  # fmt: skip
 
@@ -65,7 +66,7 @@ def test_what_happened_is_told_and_nothing_else() -> None:
 
 def test_what_is_overtaken_is_not_called_lost() -> None:
     late = LOSSY | {
-        "overtaken": 100, "loss": {"realised": 0.1, "lost": 0.05, "predicted": 0.0499},
+        "delivered_out_of_order": 100, "loss": {"realised": 0.1, "lost": 0.05, "predicted": 0.0499},
         "lateness_ns": {"p50": 20_000, "p99": 90_000, "p999": 1, "max": 1},
     }  # fmt: skip
     lines = printed(totals(late, direction()))

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
 from tests.netem.control.relays import FakeRelay, running
 
@@ -23,14 +23,14 @@ def relay() -> FakeRelay:
 
 
 @pytest.fixture
-def errands(relay: FakeRelay) -> Iterator[Errands]:
+def errands(relay: FakeRelay) -> Iterator[CommandQueue]:
     """Of a relay that runs."""
     with running(relay) as errands:
         yield errands
 
 
 @pytest.fixture
-def server(errands: Errands) -> Iterator[ControlServer]:
+def server(errands: CommandQueue) -> Iterator[ControlServer]:
     """Of an emulator named ``lab``."""
     with ControlServer("lab", errands) as server:
         yield server

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.engine import histogram
 from netem.engine.relay_interface import (
     DIRECTIONS,
@@ -98,9 +98,9 @@ _: Relay = FakeRelay()
 
 
 @contextmanager
-def running(relay: Relay) -> Iterator[Errands]:
+def running(relay: Relay) -> Iterator[CommandQueue]:
     """Run a relay in a thread of its own."""
-    errands, stopping = Errands(relay), threading.Event()
+    errands, stopping = CommandQueue(relay), threading.Event()
     thread = threading.Thread(target=relay.run, args=(stopping.is_set, errands.run))
     thread.start()
     try:

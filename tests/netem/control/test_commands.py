@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from netem.control import emulator_commands
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import ExitStatus
@@ -163,7 +163,9 @@ def test_a_reader_that_has_seen_enough_is_no_error(relay: FakeRelay, server: Con
         assert process.stderr.read() == b""
 
 
-def test_a_watcher_hears_that_the_emulator_has_ended(relay: FakeRelay, errands: Errands) -> None:
+def test_a_watcher_hears_that_the_emulator_has_ended(
+    relay: FakeRelay, errands: CommandQueue
+) -> None:
     relay.counters["up", "forward"].arrived = 7
     with ExitStack() as emulator:
         emulator.enter_context(ControlServer("lab", errands))

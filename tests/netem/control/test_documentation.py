@@ -11,12 +11,12 @@ import pytest
 
 from netem.control.control_server import ControlServer
 from netem.control.emulator_statistics import (
+    DelayQuantiles,
     DirectionStatistics,
-    Flow,
+    FlowStatistics,
     LinkStatistics,
-    Loss,
-    Quantiles,
-    Recent,
+    LossStatistics,
+    RecentRates,
     Statistics,
 )
 from netem.engine.relay_interface import LinkSpec
@@ -46,7 +46,7 @@ def names(text: str) -> set[str]:
         ("document", get_type_hints(Statistics)),
         ("link", get_type_hints(LinkStatistics)),
         ("direction", get_type_hints(DirectionStatistics)),
-        ("recent", get_type_hints(Recent)),
+        ("recent", get_type_hints(RecentRates)),
         ("column", dict.fromkeys(SCHEMA.names)),
         ("key", dict.fromkeys(("report", "settings", "change", "statistics"))),
     ],
@@ -57,9 +57,9 @@ def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) 
 
 def test_what_lies_deeper_is_documented() -> None:
     said = rows("direction")
-    assert names(said["`loss`"]) == set(get_type_hints(Loss))
-    assert names(said["`flows`"]) == set(get_type_hints(Flow))
-    assert names(said["`delay_ns`"]) == set(get_type_hints(Quantiles))
+    assert names(said["`loss`"]) == set(get_type_hints(LossStatistics))
+    assert names(said["`flows`"]) == set(get_type_hints(FlowStatistics))
+    assert names(said["`delay_ns`"]) == set(get_type_hints(DelayQuantiles))
 
 
 def programs() -> list[str]:

@@ -53,7 +53,7 @@ def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixt
             "delivered": 0, "dropped": 200, "forced": 100, "corrupted": 0, "overflowed": 0,
             "blacked_out": 0,
         }  # fmt: skip
-        assert (found["longest_run"], found["mansd"]) == (2, 2)
+        assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
         assert found["loss"]["realised"] == pytest.approx(2 / 3)
         assert found["loss"]["predicted"] == pytest.approx(2 / 3)
         assert sum(found["unintended"].values()) == 0
@@ -141,7 +141,7 @@ def run_through(
         send_through(address, payloads)
         while True:
             found = shown(capsys)["links"][0]["forward"]
-            if found["arrived"] == len(payloads) and found["under_way"] == 0:
+            if found["arrived"] == len(payloads) and found["in_flight"] == 0:
                 return [server.recv(100) for _ in range(found["forwarded"])]
 
 

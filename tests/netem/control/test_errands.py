@@ -2,21 +2,23 @@ import threading
 
 import pytest
 
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
 from tests.netem.control.relays import FakeRelay
 
 
-def test_the_relay_is_touched_in_its_own_thread_only(relay: FakeRelay, errands: Errands) -> None:
+def test_the_relay_is_touched_in_its_own_thread_only(
+    relay: FakeRelay, errands: CommandQueue
+) -> None:
     errands.snapshot()
     errands.change("up", ["forward"], settings_of("loss 50%"))
     (thread,) = relay.threads
     assert thread != threading.get_ident()
 
 
-def test_a_change_says_since_when_it_holds(relay: FakeRelay, errands: Errands) -> None:
+def test_a_change_says_since_when_it_holds(relay: FakeRelay, errands: CommandQueue) -> None:
     relay.counters["up", "back"] = Counters(arrived=17)
     errands.change("up", ["back"], settings_of("loss 50% mansd 1"))
     relay.counters["up", "back"].arrived = 20
@@ -27,7 +29,7 @@ def test_a_change_says_since_when_it_holds(relay: FakeRelay, errands: Errands) -
     assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
 
 
-def test_an_errands_error_is_the_askers(errands: Errands) -> None:
+def test_an_errands_error_is_the_askers(errands: CommandQueue) -> None:
     def refuse() -> None:
         raise CallerError("no")
 
@@ -42,7 +44,7 @@ def test_an_errands_error_is_the_askers(errands: Errands) -> None:
 
 
 def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
-    errands = Errands(relay)
+    errands = CommandQueue(relay)
     found: list[BaseException] = []
 
     def ask() -> None:
@@ -63,7 +65,7 @@ def test_a_relay_that_is_stuck_is_not_waited_for_forever(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("netem.control.command_queue._PATIENCE_S", 0.01)
-    errands = Errands(relay)
+    errands = CommandQueue(relay)
     with pytest.raises(PeerError, match="has not answered for"):
         errands.snapshot()
     errands.run()  # what nobody waits for any more is not done

@@ -9,7 +9,7 @@ import pytest
 import zenoh
 from zenoh.handlers import FifoChannel
 
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.control.control_client import Client
 from netem.control.control_server import ControlServer, secret_of
 from netem.control.emulator_session import Session, find, running
@@ -18,7 +18,7 @@ from netem.words.words_to_settings import settings_of
 from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
 from noack.runtime.private_folder import private_folder
-from noack.runtime.zenoh_session import open_star, star_config
+from noack.runtime.zenoh_session import open_session, session_config
 from tests.netem.control.relays import SETTINGS, FakeRelay
 
 
@@ -123,7 +123,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_changed(
 def ask_with(session: Session, payload: str | bytes | None, what: str = "change") -> str:
     """Ask on a connection that is let in; return the error."""
     secret = secret_of(session.token)
-    with open_star(session.endpoint, secret, listen=False) as connection:
+    with open_session(session.endpoint, secret, listen=False) as connection:
         key = f"netem/{session.name}/{what}"
         replies = connection.get(key, FifoChannel(4), payload=payload, timeout=60)
         (error,) = [reply.err for reply in replies if reply.err is not None]
@@ -160,7 +160,7 @@ def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict
     more: dict[str, Any] = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
     more["connect/timeout_ms"] = 500
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
-        zenoh.open(star_config(session.endpoint, listen=False, more=more))
+        zenoh.open(session_config(session.endpoint, listen=False, more=more))
 
 
 def test_it_listens_on_loopback_only(server: ControlServer) -> None:
@@ -174,13 +174,13 @@ def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) ->
     folder = private_folder() / "netem"
     assert [path.name for path in folder.iterdir()] == ["lab.json"]
     with pytest.raises(CallerError, match="runs; choose another name"):
-        ControlServer("lab", Errands(FakeRelay("up"))).__enter__()
+        ControlServer("lab", CommandQueue(FakeRelay("up"))).__enter__()
     assert [path.name for path in folder.iterdir()] == ["lab.json"]
     assert running() == ["lab"]
 
 
 def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
-    errands: Errands, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+    errands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held, free = threading.Event(), threading.Event()
 
@@ -197,10 +197,10 @@ def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
         free.set()
 
 
-def test_when_it_ends_nothing_is_left(errands: Errands) -> None:
+def test_when_it_ends_nothing_is_left(errands: CommandQueue) -> None:
     with ControlServer("lab", errands):
         session = find("lab")
     assert running() == []
     more = {"connect/timeout_ms": 500}
     with pytest.raises(zenoh.ZError):
-        zenoh.open(star_config(session.endpoint, listen=False, more=more))
+        zenoh.open(session_config(session.endpoint, listen=False, more=more))

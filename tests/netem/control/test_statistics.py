@@ -4,8 +4,13 @@ from typing import Any, get_type_hints
 import numpy as np
 import pytest
 
-from netem.control.command_queue import InForce, Snapshot
-from netem.control.emulator_statistics import DirectionStatistics, Recent, Statistics, statistics
+from netem.control.command_queue import AppliedSettings, Snapshot
+from netem.control.emulator_statistics import (
+    DirectionStatistics,
+    RecentRates,
+    Statistics,
+    statistics,
+)
 from netem.engine.relay_interface import DIRECTIONS, FlowReport
 from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
@@ -17,7 +22,7 @@ UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000
 
 def look(relay: FakeRelay, elapsed_s: float, since: Any = None) -> Snapshot:
     in_force = {
-        key: InForce(settings, (since or {}).get(key, Counters()))
+        key: AppliedSettings(settings, (since or {}).get(key, Counters()))
         for key, settings in relay.settings.items()
     }
     return Snapshot(relay.engine, relay.report(), in_force, round(elapsed_s * NS_PER_S), UNIX_NS)
@@ -31,7 +36,7 @@ def test_everything_that_a_relay_counts_is_there(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
         arrived=100, arrived_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
         overflowed=2, blacked_out=1, duplicated=3, held_back=6, forwarded=91,
-        forwarded_bytes=6552, overtaken=9, longest_run=2, most_under_way=17,
+        forwarded_bytes=6552, delivered_out_of_order=9, longest_loss_burst=2, most_in_flight=17,
     )  # fmt: skip
     relay.flows = [FlowReport(3, ("::1", 4000), 60, 2)]
     relay.unintended["lost_in_kernel"] = 7
@@ -49,12 +54,12 @@ def test_everything_that_a_relay_counts_is_there(relay: FakeRelay) -> None:
         "delivered": 80, "dropped": 8, "forced": 5, "corrupted": 4, "overflowed": 2,
         "blacked_out": 1,
     }  # fmt: skip
-    assert (found["duplicated"], found["overtaken"], found["held_back"]) == (3, 9, 6)
-    assert (found["longest_run"], found["mansd"]) == (2, 2)
-    assert (found["under_way"], found["most_under_way"]) == (5, 17)
+    assert (found["duplicated"], found["delivered_out_of_order"], found["held_back"]) == (3, 9, 6)
+    assert (found["longest_loss_burst"], found["mansd"]) == (2, 2)
+    assert (found["in_flight"], found["most_in_flight"]) == (5, 17)
     assert found["unintended"] == {"lost_in_kernel": 7, "send_errors": 0}
     assert found["flows"] == [
-        {"flow": 3, "client": "[::1]:4000", "packets": 60, "longest_run": 2}
+        {"flow": 3, "client": "[::1]:4000", "packets": 60, "longest_loss_burst": 2}
     ]  # fmt: skip
     assert found["loss"]["realised"] == pytest.approx((100 - 80 - 5 + 9) / 100)
     assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
@@ -74,7 +79,7 @@ def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> N
         found = document["links"][0][way]
         assert set(found) == set(get_type_hints(DirectionStatistics))
         assert found["recent"] is not None
-        assert set(found["recent"]) == set(get_type_hints(Recent))
+        assert set(found["recent"]) == set(get_type_hints(RecentRates))
 
 
 def test_rates_are_those_between_two_documents(relay: FakeRelay) -> None:
@@ -115,7 +120,7 @@ def test_the_prediction_is_that_of_the_settings_in_force(relay: FakeRelay) -> No
 
 def test_what_is_overtaken_late_is_no_loss_beyond_everything(relay: FakeRelay) -> None:
     before = look(relay, 1)
-    relay.counters["up", "forward"] = Counters(arrived=1, delivered=1, overtaken=5)
+    relay.counters["up", "forward"] = Counters(arrived=1, delivered=1, delivered_out_of_order=5)
     recent = forward(statistics(look(relay, 2), before))["recent"]
     assert recent is not None
     assert recent["loss"] == 1

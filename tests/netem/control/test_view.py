@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import pytest
 from rich.console import Console
 
-from netem.control.command_queue import Errands
+from netem.control.command_queue import CommandQueue
 from netem.control.emulator_statistics import Statistics, statistics
 from netem.control.statistics_history import History
 from netem.control.statistics_view import plain_lines, render
@@ -19,7 +19,7 @@ from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
     """In the k-th second, from 0, 1000 k datagrams of 100 bytes come on each link."""
-    errands, found, before = Errands(relay), [], None
+    errands, found, before = CommandQueue(relay), [], None
     for second in range(seconds):
         for name, way in relay.counters:
             if way == "forward":
@@ -32,7 +32,7 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
                 counters.delivered += came - came // 5 - came // 10
                 counters.forwarded += came - came // 5
                 counters.forwarded_bytes += 100 * (came - came // 5)
-                counters.longest_run = 2
+                counters.longest_loss_burst = 2
         relay.delays = times(*[10_000_000] * 98, 20_000_000, 20_000_000)
         snapshot = errands.look()._replace(elapsed_ns=(second + 1) * NS_PER_S)
         found.append(statistics(snapshot, before))

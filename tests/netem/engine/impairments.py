@@ -3,20 +3,20 @@
 from hypothesis import strategies as st
 
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     LinkSettings,
     LossOf,
-    Periodic,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    WorstCase,
+    ScriptedLoss,
+    WorstCaseLoss,
 )
 
 probabilities = st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0])
@@ -24,15 +24,19 @@ correlations = st.sampled_from([0.0, 0.0, 0.7])
 times_s = st.sampled_from([0.0, 1e-6, 0.0005, 0.004])
 
 losses = st.one_of(
-    st.builds(Bernoulli, probability=probabilities, correlation=correlations),
+    st.builds(BernoulliLoss, probability=probabilities, correlation=correlations),
     st.builds(
-        GilbertElliott, good_to_bad=probabilities, bad_to_good=probabilities,
+        GilbertElliottLoss, good_to_bad=probabilities, bad_to_good=probabilities,
         loss_in_good=probabilities, loss_in_bad=probabilities,
     ),
-    st.builds(FourState, p13=st.just(0.3), p31=st.just(0.4), p32=st.just(0.2), p14=st.just(0.1)),
-    st.builds(Periodic, period=st.integers(3, 9), burst=st.integers(0, 3)),
-    st.builds(Scripted, lost=st.just((0, 1, 2, 5, 8, 9)), repeat_every=st.sampled_from([0, 11])),
-    st.just(WorstCase()),
+    st.builds(
+        FourStateLoss, p13=st.just(0.3), p31=st.just(0.4), p32=st.just(0.2), p14=st.just(0.1)
+    ),
+    st.builds(PeriodicLoss, period=st.integers(3, 9), burst=st.integers(0, 3)),
+    st.builds(
+        ScriptedLoss, lost=st.just((0, 1, 2, 5, 8, 9)), repeat_every=st.sampled_from([0, 11])
+    ),
+    st.just(WorstCaseLoss()),
 )  # fmt: skip
 delays = st.one_of(
     st.builds(

@@ -16,7 +16,7 @@ from netem.engine.pump.payload_store import drop, keep, pop, push
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_sockets import place_of
 from netem.engine.socket_names import address_of_name, name_of
-from noack.config.impairments import Bernoulli, Delay, Duplicate, LinkSettings, LossOf
+from noack.config.impairments import BernoulliLoss, Delay, Duplicate, LinkSettings, LossOf
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, running
 from tests.netem.engine.relays import name_of as bound_name
 
@@ -95,7 +95,7 @@ def test_memory_stays_flat_over_a_million_datagrams() -> None:
     rounds, size = 100, 10_000
     harsh = LinkSettings(
         impairments=(
-            LossOf(loss=Bernoulli(probability=0.3)),
+            LossOf(loss=BernoulliLoss(probability=0.3)),
             Duplicate(probability=0.3),
             Delay(delay_s=0.001, jitter_s=0.001),
         ),

@@ -12,8 +12,15 @@ from netem.engine.compiled_rules import compile_rule, compiled_program, compiled
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import Counters, Decision, FlowState, Verdict, array_of, dtype_of
-from netem.rules.link_rules import Program, State
+from netem.rule_records import (
+    Counters,
+    FlowState,
+    PacketDecision,
+    RecordedDecision,
+    array_of,
+    dtype_of,
+)
+from netem.rules.link_rules import LinkMemory, LinkProgram
 from netem.rules.settings_change import carry
 from noack.config.impairments import LinkSettings
 from tests.netem.engine import impairments
@@ -30,7 +37,7 @@ class Compiled:
     """A link with compiled rules, whose rows do not lie in the order of its flows."""
 
     def __init__(self, own: LinkSettings, **others: Any) -> None:
-        self.program: Program = compiled_program(plain := program_of(own, 3, "a", **others))
+        self.program: LinkProgram = compiled_program(plain := program_of(own, 3, "a", **others))
         self.state = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
         self._first_delivered = own.first_delivered
         self._seen: set[int] = set()
@@ -40,7 +47,7 @@ class Compiled:
         for flow in set(flows.tolist()) - self._seen:
             self._seen.add(flow)
             set_flow(self.state, row_of(flow), flow, self._first_delivered)
-        verdicts = np.zeros(len(batch), dtype_of(Verdict))
+        verdicts = np.zeros(len(batch), dtype_of(PacketDecision))
         rows = np.array([row_of(flow) for flow in range(FLOWS)])[flows]
         compile_rule(admit_many)(self.program, self.state, rows, sizes, times, verdicts)
         return [tuple(verdict) for verdict in verdicts.tolist()]
@@ -48,7 +55,7 @@ class Compiled:
     def change(self, own: LinkSettings) -> None:
         self._first_delivered = own.first_delivered
         plain = program_of(own, 3, "a", tracks=self.program.tracks)
-        state: State = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
+        state: LinkMemory = compiled_state(plain, empty_state(plain), FLOWS, recent_width(plain))
         np.asarray(state.recent_ns)[:] = -1
         state = state._replace(
             flows=self.state.flows, link=self.state.link, counters=self.state.counters
@@ -106,14 +113,14 @@ def test_batches_do_not_matter(
 @pytest.mark.parametrize("mansd", [None, 2])
 def test_recorded_decisions_are_repeated_by_flow_not_by_row(mansd: int | None) -> None:
     own = LinkSettings(mansd=mansd)
-    recorded = [[Decision(0, 5 * flow, -1, -1, -1)] * 3 for flow in range(FLOWS)]
+    recorded = [[RecordedDecision(0, 5 * flow, -1, -1, -1)] * 3 for flow in range(FLOWS)]
     compiled = Compiled(own, decisions=recorded)
     verdicts = compiled.decide([(flow, 10, 1000) for flow in range(FLOWS)])
-    names = list(Verdict.__slots__)
+    names = list(PacketDecision.__slots__)
     releases = [verdict[names.index("release_ns")] for verdict in verdicts]
     assert releases == [1000 + 5 * flow for flow in range(FLOWS)]
 
 
 def test_records_and_rows_hold_the_same() -> None:
-    rows = array_of(Verdict, [Verdict(*range(9))])
-    assert [rows[0][name] for name in dtype_of(Verdict).names or ()] == list(range(9))
+    rows = array_of(PacketDecision, [PacketDecision(*range(9))])
+    assert [rows[0][name] for name in dtype_of(PacketDecision).names or ()] == list(range(9))

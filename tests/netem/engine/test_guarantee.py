@@ -28,7 +28,7 @@ def number_of(payload: bytes) -> int | None:
     return int.from_bytes(payload[8:12], "big") if intact else None
 
 
-def longest_run(received: Sequence[bytes], sent: int) -> int:
+def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
     """Most in a row of ``sent`` that a receiver who wants the newest gets no use of."""
     newest, longest = -1, 0
     for payload in received:
@@ -80,26 +80,26 @@ def test_the_cap_holds_in_both_directions_for_every_client(
                 by_source[source].append(payload)
             assert len(by_source) == CLIENTS
             for received in by_source.values():
-                assert longest_run(received, sent) <= forward_cap
+                assert longest_loss_burst(received, sent) <= forward_cap
             for number in range(sent):
                 for source in by_source:
                     server.sendto(sealed(number, "back", 30), source)
             one.settled(sent * CLIENTS, "back")
             for client in clients:
                 received = [payload for payload, _ in drain(client)]
-                assert longest_run(received, sent) <= back_cap
+                assert longest_loss_burst(received, sent) <= back_cap
             report = one.report()
-    assert report.forward.counters.longest_run <= forward_cap
-    assert report.back.counters.longest_run <= back_cap
+    assert report.forward.counters.longest_loss_burst <= forward_cap
+    assert report.back.counters.longest_loss_burst <= back_cap
     for way in (report.forward, report.back):
         assert way.unintended == {"lost_in_kernel": 0}
 
 
 def test_the_judge_sees_what_is_missing_damaged_or_stale() -> None:
     all_of_them = [sealed(number, "there", 20) for number in range(6)]
-    assert longest_run(all_of_them, 6) == 0
-    assert longest_run(all_of_them[:2] + all_of_them[4:], 6) == 2
-    assert longest_run(all_of_them[:3], 6) == 3
-    assert longest_run([all_of_them[k] for k in (0, 3, 1, 2, 4, 5)], 6) == 2
+    assert longest_loss_burst(all_of_them, 6) == 0
+    assert longest_loss_burst(all_of_them[:2] + all_of_them[4:], 6) == 2
+    assert longest_loss_burst(all_of_them[:3], 6) == 3
+    assert longest_loss_burst([all_of_them[k] for k in (0, 3, 1, 2, 4, 5)], 6) == 2
     damaged = bytes([all_of_them[1][0] ^ 4]) + all_of_them[1][1:]
-    assert longest_run([all_of_them[0], damaged, *all_of_them[2:]], 6) == 1
+    assert longest_loss_burst([all_of_them[0], damaged, *all_of_them[2:]], 6) == 1

@@ -37,4 +37,4 @@ def test_what_there_is_no_memory_for_is_dropped_and_counted(engine: Engine) -> N
                 assert sent < MOST
                 send_through(address, [bytes(SIZE_BYTES)] * BATCH)
                 sent += BATCH
-        assert forward["under_way"] == forward["arrived"] > 100
+        assert forward["in_flight"] == forward["arrived"] > 100

@@ -21,16 +21,16 @@ from netem.engine import engine_choice as starting
 from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_interface import LinkSpec
 from netem.engine.relay_sockets import raise_file_limit
-from netem.rule_records import Decision
+from netem.rule_records import RecordedDecision
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Corrupt,
     Delay,
     Duplicate,
     LinkSettings,
     LossOf,
-    Periodic,
-    WorstCase,
+    PeriodicLoss,
+    WorstCaseLoss,
 )
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import Fate
@@ -38,7 +38,7 @@ from tests.netem.engine.relays import HOSTS, KeepAll, drain, endpoints, link, na
 
 ENGINES: Sequence[Engine] = ("batched", "plain")
 pytestmark = pytest.mark.parametrize("engine", ENGINES)
-HALF = LossOf(loss=Bernoulli(probability=0.5))
+HALF = LossOf(loss=BernoulliLoss(probability=0.5))
 UDP_SEGMENT, SEGMENTS = 103, 64
 
 
@@ -181,7 +181,7 @@ def test_any_size_comes_through_with_its_copy(engine: Engine, size: int, delay_s
 
 def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> None:
     late = LinkSettings(impairments=(Delay(delay_s=0.05),), mansd=1)
-    lossy = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=1)
+    lossy = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=1)
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
         running([link(name_of(server), late)], engine) as one,
@@ -193,7 +193,7 @@ def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> No
                 client.sendto(number.to_bytes(4, "big"), there)
 
         send(0)
-        one.until(lambda: one.relay.report()[0].forward.under_way == 4)
+        one.until(lambda: one.relay.report()[0].forward.in_flight == 4)
         one.ask(lambda: one.relay.change("test", "forward", lossy))
         send(4)
         one.settled(8)
@@ -207,7 +207,7 @@ def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> No
 
 
 def test_idle_clients_are_forgotten_and_come_back_as_new_flows(engine: Engine) -> None:
-    third = LinkSettings(impairments=(LossOf(loss=Periodic(period=3)),))
+    third = LinkSettings(impairments=(LossOf(loss=PeriodicLoss(period=3)),))
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
         running([link(name_of(server), third, idle_s=0.05)], engine) as one,
@@ -238,7 +238,7 @@ def test_a_client_with_something_under_way_is_not_idle(engine: Engine) -> None:
 
 def test_a_client_is_not_idle_for_what_was_not_read(engine: Engine) -> None:
     """An emulator that was stopped for longer than clients may be idle finds their datagrams."""
-    cap = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=3)
+    cap = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=3)
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
         running([link(name_of(server), cap, idle_s=0.3)], engine) as one,
@@ -374,7 +374,7 @@ def all_of(way: Any) -> int:
 @pytest.mark.parametrize("segment", [False, True])
 def test_segments_are_datagrams_of_their_own(engine: Engine, segment: bool) -> None:
     """What a client sends as one message that the kernel cuts."""
-    third = LinkSettings(impairments=(LossOf(loss=Periodic(period=3)),))
+    third = LinkSettings(impairments=(LossOf(loss=PeriodicLoss(period=3)),))
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
         running([link(name_of(server), third)], engine, segment=segment) as one,
@@ -571,10 +571,10 @@ def test_it_goes_on_if_nobody_can_hear_what_it_says(
 
 
 def test_a_change_leaves_the_record_that_is_repeated_alone(engine: Engine) -> None:
-    lost = Decision(Fate.DROPPED, -1, -1, -1, -1)
-    passed = Decision(Fate.DELIVERED, 0, -1, -1, -1)
+    lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
+    passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
     record = [lost, passed, lost, lost, passed, lost]
-    worst = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=3)
+    worst = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=3)
     with endpoints(*[HOSTS[4]] * 2) as (server, client):
         spec = link(name_of(server), decisions={"forward": [record]})
         with running([spec], engine) as one:

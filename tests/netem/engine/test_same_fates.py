@@ -17,7 +17,7 @@ from tests.netem.engine import impairments
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
 
 CLIENTS = 3
-DECIDED = ("packet", "fate", "run", "held_ns", "bit", "copy_bit")
+DECIDED = ("packet", "fate", "run", "hold_back_ns", "bit", "copy_bit")
 
 
 def replayed(

@@ -13,33 +13,33 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
-from netem.rule_records import Verdict
+from netem.rule_records import PacketDecision
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    GilbertElliott,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     LossOf,
-    Periodic,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    WorstCase,
+    ScriptedLoss,
+    WorstCaseLoss,
 )
 
 US = 1e-6
 shares = st.floats(0, 1)
 times_s = st.floats(0, 50 * US)
 losses = st.one_of(
-    st.builds(Bernoulli, probability=shares, correlation=st.sampled_from([0.0, 0.5])),
-    st.builds(GilbertElliott, good_to_bad=shares, bad_to_good=shares),
-    st.builds(Periodic, period=st.just(4), burst=st.integers(0, 4)),
-    st.builds(Scripted, lost=st.sets(st.integers(0, 30)).map(sorted).map(tuple)),
-    st.just(WorstCase()),
+    st.builds(BernoulliLoss, probability=shares, correlation=st.sampled_from([0.0, 0.5])),
+    st.builds(GilbertElliottLoss, good_to_bad=shares, bad_to_good=shares),
+    st.builds(PeriodicLoss, period=st.just(4), burst=st.integers(0, 4)),
+    st.builds(ScriptedLoss, lost=st.sets(st.integers(0, 30)).map(sorted).map(tuple)),
+    st.just(WorstCaseLoss()),
 )
 impairments: st.SearchStrategy[Impairment] = st.one_of(
     st.builds(LossOf, loss=losses),
@@ -97,7 +97,7 @@ def payload(flow: int, packet: int, size_bytes: int) -> bytes:
 class Run:
     """What a link did."""
 
-    verdicts: list[Verdict] = field(default_factory=list)
+    verdicts: list[PacketDecision] = field(default_factory=list)
     arrivals: list[tuple[int, int, int]] = field(default_factory=list)
     """Time in ns, flow, size in bytes."""
     departures: list[tuple[int, int, bytes]] = field(default_factory=list)
@@ -110,7 +110,7 @@ class Run:
         for event, verdict, came in zip(events, self.verdicts, self.arrivals, strict=True):
             now_ns, event["flow"], event["size_bytes"] = came
             event["t_ns"] = 10**18 + now_ns
-            for name in ("packet", "run", "fate", "bit", "copy_bit", "held_ns"):
+            for name in ("packet", "run", "fate", "bit", "copy_bit", "hold_back_ns"):
                 event[name] = getattr(verdict, name)
             gone, copied = verdict.release_ns != -1, verdict.copy_ns != -1
             event["delay_ns"] = verdict.release_ns - now_ns if gone else -1
@@ -137,7 +137,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
         counts[arrival.flow] += 1
         leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
-        run.verdicts.append(Verdict(**asdict(link.verdict)))
+        run.verdicts.append(PacketDecision(**asdict(link.verdict)))
         run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
     release(float("inf"))
     return run

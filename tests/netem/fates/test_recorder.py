@@ -43,7 +43,7 @@ def test_a_row_says_what_an_event_says(path: Path) -> None:
     event = arrivals(1, link=1, direction=1)
     told = {
         "t_ns": 1_790_000_000_123_456_789, "size_bytes": 1400, "fate": Fate.CORRUPTED, "run": 2,
-        "delay_ns": 5, "copy_delay_ns": 2**40, "bit": 17, "copy_bit": 11_199, "held_ns": 3,
+        "delay_ns": 5, "copy_delay_ns": 2**40, "bit": 17, "copy_bit": 11_199, "hold_back_ns": 3,
     }  # fmt: skip
     for name, value in told.items():
         event[name] = value

@@ -10,23 +10,23 @@ from hypothesis import strategies as st
 
 from netem.fates.fate_replay import read_fates
 from netem.link_machine import Link
-from netem.rule_records import Decision
+from netem.rule_records import RecordedDecision
 from noack.config.impairments import (
     Corrupt,
     Delay,
     Duplicate,
-    GilbertElliott,
+    GilbertElliottLoss,
     LinkSettings,
     LossOf,
     Rate,
-    WorstCase,
+    WorstCaseLoss,
 )
 from noack.protocol.record_tables import Fate
 from tests.netem.fates.links import Arrival, Run, arrivals, drive, payload, record, settings
 
 BAD = LinkSettings(
     impairments=(
-        LossOf(loss=GilbertElliott(good_to_bad=0.2, bad_to_good=0.4)),
+        LossOf(loss=GilbertElliottLoss(good_to_bad=0.2, bad_to_good=0.4)),
         Duplicate(probability=0.4),
         Corrupt(probability=0.4),
         Delay(delay_s=100e-6, jitter_s=100e-6),
@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fates")
 
 
-def fates_of(folder: Path) -> Sequence[Sequence[Decision]]:
+def fates_of(folder: Path) -> Sequence[Sequence[RecordedDecision]]:
     return read_fates(folder / "fates.parquet").decisions["a", "forward"]
 
 
@@ -102,7 +102,10 @@ def moved_to(came: Sequence[Arrival], gaps_ns: Sequence[int]) -> list[Arrival]:
 
 
 def check_moved(
-    before: Run, moved: list[Arrival], link: LinkSettings, fates: Sequence[Sequence[Decision]]
+    before: Run,
+    moved: list[Arrival],
+    link: LinkSettings,
+    fates: Sequence[Sequence[RecordedDecision]],
 ) -> None:
     again = drive(Link(link, 8, "b", decisions=fates), moved)
     for old, old_came, new, new_came in zip(
@@ -111,14 +114,14 @@ def check_moved(
         if old.fate == new.fate and old.release_ns >= 0:
             delay_ns = new.release_ns - new_came[0]
             assert delay_ns >= old.release_ns - old_came[0]
-            assert new.held_ns or delay_ns == old.release_ns - old_came[0]
+            assert new.hold_back_ns or delay_ns == old.release_ns - old_came[0]
         lost = (Fate.DROPPED, Fate.CORRUPTED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
         assert old.fate == new.fate or (old.fate in lost and new.fate == Fate.FORCED)
     if link.mansd is not None:
-        assert longest_run(again) <= link.mansd
+        assert longest_loss_burst(again) <= link.mansd
 
 
-def longest_run(run: Run) -> int:
+def longest_loss_burst(run: Run) -> int:
     """Most successive datagrams of a flow that a receiver which wants the newest does not get."""
     longest = 0
     for flow in {flow for _, flow, _ in run.arrivals}:
@@ -158,7 +161,7 @@ def test_what_is_not_in_the_trace_meets_the_links_own_settings(folder: Path) -> 
     record(folder / "fates.parquet", BAD, [Arrival(1000, 0, 8)] * 5)
     again = drive(
         Link(
-            LinkSettings(impairments=(LossOf(loss=WorstCase()),)), 8, "b",
+            LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),)), 8, "b",
             decisions=fates_of(folder),
         ),
         [Arrival(1000, 0, 8)] * 8 + [Arrival(1000, 1, 8)] * 3,

@@ -64,7 +64,7 @@ def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, rever
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
     direction = "back" if reverse else "forward"
     of = ran.link[direction]
-    assert of["longest_run"] <= 3
+    assert of["longest_loss_burst"] <= 3
     assert of["fates"]["dropped"] == of["arrived"] - of["forwarded"] > 0
     dropped_of_all = 0
     for stream, connected in enumerate(ran.iperf.client["start"]["connected"]):
@@ -90,15 +90,19 @@ def test_iperf3_sees_the_order_in_which_the_emulator_lets_out(
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
     direction = "back" if reverse else "forward"
     of = ran.link[direction]
-    assert of["longest_run"] <= 5
-    assert of["overtaken"] > 50
+    assert of["longest_loss_burst"] <= 5
+    assert of["delivered_out_of_order"] > 50
     departures = ran.emulator.departures(direction)
-    overtaken = copies = newest = 0
+    delivered_out_of_order = copies = newest = 0
     for departure in departures:
-        overtaken += departure.packet < newest
+        delivered_out_of_order += departure.packet < newest
         copies += departure.packet == newest > 0
         newest = max(newest, departure.packet)
-    assert of["overtaken"] <= overtaken <= of["overtaken"] + of["duplicated"]
+    assert (
+        of["delivered_out_of_order"]
+        <= delivered_out_of_order
+        <= of["delivered_out_of_order"] + of["duplicated"]
+    )
     assert of["duplicated"] > 0
     told = ran.iperf.counts(0, reverse)
     states = list(counted(departures))

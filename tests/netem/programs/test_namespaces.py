@@ -165,7 +165,7 @@ def test_each_client_address_is_a_flow_with_a_way_back(
             text for text, fate in zip(passed, back_fates, strict=True) if fate in LET_OUT
         ]
         assert Fate.DROPPED in there_fates
-        assert flow["longest_run"] <= 2
+        assert flow["longest_loss_burst"] <= 2
     assert len(ports) == len(outer.clients)
     assert len(seen) == link["forward"]["forwarded"]
 

@@ -96,5 +96,5 @@ def test_content_comes_through_unchanged_both_ways(
         assert of["fates"]["dropped"] > 0
         assert of["fates"]["corrupted"] > 0
         assert of["duplicated"] > 0
-        assert of["overtaken"] > 0
-        assert of["longest_run"] <= 3
+        assert of["delivered_out_of_order"] > 0
+        assert of["longest_loss_burst"] <= 3

@@ -4,14 +4,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.impairments import Bernoulli, LinkSettings, LossOf
+from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.8])
 def test_it_loses_at_its_rate_and_without_memory(
     decide: Any, share_is: Callable[..., None], p: float
 ) -> None:
-    lost = decide([LossOf(loss=Bernoulli(probability=p))], 400_000).fates == 1
+    lost = decide([LossOf(loss=BernoulliLoss(probability=p))], 400_000).fates == 1
     share_is(lost, p)
     for lag in (1, 2, 7):
         share_is(lost[lag:] & lost[:-lag], p * p)
@@ -23,7 +23,7 @@ def test_under_a_cap_the_rate_is_the_predicted_one(
     decide: Any, share_is: Callable[..., None], p: float, mansd: int
 ) -> None:
     """p (1 − pᵐ)/(1 − pᵐ⁺¹): from delivery to delivery Σ pᵏ, k = 1 … m, are lost."""
-    loss = LossOf(loss=Bernoulli(probability=p))
+    loss = LossOf(loss=BernoulliLoss(probability=p))
     decided = decide(LinkSettings(impairments=(loss,), mansd=mansd), 400_000)
     lost = decided.fates == 1
     if mansd == 0:

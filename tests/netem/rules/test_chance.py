@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from noack.config.impairments import Bernoulli, LossOf
+from noack.config.impairments import BernoulliLoss, LossOf
 
 COUNT = 400_000
 
 
 def lost(decide: Any, p: float, correlation: float, seed: int = 0) -> Any:
-    loss = Bernoulli(probability=p, correlation=correlation)
+    loss = BernoulliLoss(probability=p, correlation=correlation)
     return decide([LossOf(loss=loss)], COUNT, seed=seed).fates == 1
 
 
@@ -37,7 +37,7 @@ def test_probability_and_correlation_are_exact(
 
 def test_the_first_datagram_has_the_probability_too(decide: Any) -> None:
     """The latent process begins stationary: over many flows, not over time."""
-    loss = LossOf(loss=Bernoulli(probability=0.2, correlation=0.95))
+    loss = LossOf(loss=BernoulliLoss(probability=0.2, correlation=0.95))
     flows = np.tile(np.arange(20_000), 2)
     fates = decide([loss], len(flows), flows=flows).fates.reshape(2, -1)
     for of_flow in fates:

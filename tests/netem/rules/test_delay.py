@@ -13,10 +13,10 @@ from scipy.integrate import quad
 from netem.rule_program import program_of
 from netem.rules.delay import quantile_ns
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Delay,
     Duplicate,
-    GilbertElliott,
+    GilbertElliottLoss,
     LinkSettings,
     LossOf,
 )
@@ -135,7 +135,7 @@ def test_flows_have_delays_of_their_own(decide: Any) -> None:
 def test_delays_know_of_the_losses(decide: Any, of_loss: float, correlation: float) -> None:
     """E[z; lost] = −ρ φ(Φ⁻¹(p))…: what survives has mean score −ρ φ(t)/(1 − p), P(s > t) = p."""
     p = 0.3
-    loss = LossOf(loss=Bernoulli(probability=p, correlation=correlation))
+    loss = LossOf(loss=BernoulliLoss(probability=p, correlation=correlation))
     found = delays(decide, loss, distribution="normal", loss_correlation=of_loss)
     z = (found + 0.5 - FIXED_NS) / JITTER_NS
     expected = -of_loss * stats.norm.pdf(stats.norm.ppf(p)) / (1 - p)
@@ -147,8 +147,8 @@ def test_delays_know_of_the_losses(decide: Any, of_loss: float, correlation: flo
 
 def test_without_losses_the_distribution_stays(decide: Any) -> None:
     """A loss of probability 0 tells how bad times are, too; Gilbert and Elliott's as well."""
-    calm = GilbertElliott(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.0)
-    for loss in (Bernoulli(probability=0.0), calm):
+    calm = GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.0)
+    for loss in (BernoulliLoss(probability=0.0), calm):
         found = delays(
             decide, LossOf(loss=loss), distribution="normal", loss_correlation=0.8, count=400_000
         )
@@ -158,7 +158,7 @@ def test_without_losses_the_distribution_stays(decide: Any) -> None:
 
 def test_the_bad_state_is_late(decide: Any) -> None:
     """With correlation 1 the delay of what survives in the bad state is among the worst quarter."""
-    chain = GilbertElliott(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.5)
+    chain = GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.5)
     found = delays(decide, LossOf(loss=chain), distribution="uniform", loss_correlation=1.0)
     late = (found - FIXED_NS) / JITTER_NS > 0.5  # the upper quarter of uniform within ± 1
     survive_bad, survive_good = 0.25 * 0.5, 0.75

@@ -3,7 +3,7 @@ from typing import Any
 
 import numpy as np
 
-from noack.config.impairments import Bernoulli, Delay, Duplicate, LossOf
+from noack.config.impairments import BernoulliLoss, Delay, Duplicate, LossOf
 
 
 def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> None:
@@ -15,7 +15,7 @@ def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> No
 
 
 def test_what_is_lost_has_no_copy(decide: Any) -> None:
-    loss = LossOf(loss=Bernoulli(probability=0.5))
+    loss = LossOf(loss=BernoulliLoss(probability=0.5))
     for order in ((loss, Duplicate(probability=1.0)), (Duplicate(probability=1.0), loss)):
         decided = decide(order, 1000)
         assert ((decided.verdicts["copy_ns"] >= 0) == (decided.fates == 0)).all()

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.impairments import FourState, LossOf
+from noack.config.impairments import FourStateLoss, LossOf
 
 LOSES = np.array([False, False, True, True])
 
 
-def matrix(chain: FourState) -> Any:
+def matrix(chain: FourStateLoss) -> Any:
     """Row i: from state i + 1."""
     c = chain
     return np.array(
@@ -25,15 +25,15 @@ def matrix(chain: FourState) -> Any:
 
 
 CHAINS = [
-    FourState(p13=0.05, p31=0.2),
-    FourState(p13=0.02, p31=0.1, p32=0.3, p23=0.4, p14=0.03),
-    FourState(p13=0.1, p31=0.5, p32=0.5, p23=0.9, p14=0.9),
+    FourStateLoss(p13=0.05, p31=0.2),
+    FourStateLoss(p13=0.02, p31=0.1, p32=0.3, p23=0.4, p14=0.03),
+    FourStateLoss(p13=0.1, p31=0.5, p32=0.5, p23=0.9, p14=0.9),
 ]
 
 
 @pytest.mark.parametrize("chain", CHAINS, ids=("two states", "all", "full rows"))
 def test_it_loses_as_the_chain_says(
-    decide: Any, share_is: Callable[..., None], chain: FourState
+    decide: Any, share_is: Callable[..., None], chain: FourStateLoss
 ) -> None:
     lost = decide([LossOf(loss=chain)], 1_000_000).fates == 1
     P = matrix(chain)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.config.impairments import GilbertElliott, LossOf
+from noack.config.impairments import GilbertElliottLoss, LossOf
 
 ERRORS = 5
 
 
-def lost(decide: Any, chain: GilbertElliott, count: int = 400_000, **more: Any) -> Any:
+def lost(decide: Any, chain: GilbertElliottLoss, count: int = 400_000, **more: Any) -> Any:
     return decide([LossOf(loss=chain)], count, **more).fates == 1
 
 
@@ -28,7 +28,7 @@ def test_bursts_last_as_long_as_the_bad_state(
     decide: Any, share_is: Callable[..., None], p: float, r: float
 ) -> None:
     """Nothing lost in the good state, all in the bad: bursts are geometric with mean 1/r."""
-    flags = lost(decide, GilbertElliott(good_to_bad=p, bad_to_good=r))
+    flags = lost(decide, GilbertElliottLoss(good_to_bad=p, bad_to_good=r))
     share_is(flags, p / (p + r))
     bursts = burst_lengths(flags)
     error = np.sqrt(1 - r) / r / np.sqrt(len(bursts))  # bursts are independent of each other
@@ -41,7 +41,7 @@ def test_both_states_may_lose_some(decide: Any, share_is: Callable[..., None]) -
     """Rate π₁λ₁ + π₂λ₂; P(lost, then not) = π Λ P (1 − Λ) 1, which fixes the mean burst."""
     p, r = 0.1, 0.3
     rates = np.array([0.05, 0.6])
-    chain = GilbertElliott(good_to_bad=p, bad_to_good=r, loss_in_good=0.05, loss_in_bad=0.6)
+    chain = GilbertElliottLoss(good_to_bad=p, bad_to_good=r, loss_in_good=0.05, loss_in_bad=0.6)
     flags = lost(decide, chain)
     stationary = np.array([r, p]) / (p + r)
     P = np.array([[1 - p, p], [r, 1 - r]])
@@ -53,7 +53,7 @@ def test_both_states_may_lose_some(decide: Any, share_is: Callable[..., None]) -
 def test_mean_loss_and_mean_burst(
     decide: Any, share_is: Callable[..., None], loss: float, burst: float
 ) -> None:
-    flags = lost(decide, GilbertElliott(mean_loss=loss, mean_burst=burst))
+    flags = lost(decide, GilbertElliottLoss(mean_loss=loss, mean_burst=burst))
     share_is(flags, loss)
     lengths = burst_lengths(flags)
     assert abs(lengths.mean() - burst) <= ERRORS * lengths.std() / np.sqrt(len(lengths))
@@ -61,12 +61,12 @@ def test_mean_loss_and_mean_burst(
 
 def test_the_chain_starts_in_the_good_state(decide: Any) -> None:
     """It moves before each datagram, so that the first of a flow is lost with probability p."""
-    chain = GilbertElliott(good_to_bad=0.2, bad_to_good=0.01)
+    chain = GilbertElliottLoss(good_to_bad=0.2, bad_to_good=0.01)
     first = lost(decide, chain, 20_000, flows=np.arange(20_000))
     assert abs(first.mean() - 0.2) <= ERRORS * np.sqrt(0.2 * 0.8 / len(first))
 
 
 def test_a_chain_that_never_moves_never_loses(decide: Any) -> None:
-    assert not lost(decide, GilbertElliott(good_to_bad=0.0, bad_to_good=0.0), 10_000).any()
-    assert not lost(decide, GilbertElliott(mean_loss=0.0, mean_burst=1.0), 10_000).any()
-    assert lost(decide, GilbertElliott(good_to_bad=1.0, bad_to_good=0.0), 10_000).all()
+    assert not lost(decide, GilbertElliottLoss(good_to_bad=0.0, bad_to_good=0.0), 10_000).any()
+    assert not lost(decide, GilbertElliottLoss(mean_loss=0.0, mean_burst=1.0), 10_000).any()
+    assert lost(decide, GilbertElliottLoss(good_to_bad=1.0, bad_to_good=0.0), 10_000).all()

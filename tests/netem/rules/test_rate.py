@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from netem.rule_program import empty_state, program_of
 from netem.rules.rate import enters, serve
-from noack.config.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCase
+from noack.config.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCaseLoss
 
 NS = 10**9
 Queue = tuple[Rate, list[tuple[int, int, bool]]]
@@ -114,7 +114,7 @@ def test_a_forced_one_has_its_turn_behind_a_full_queue(decide: Any) -> None:
 
 def test_what_is_lost_before_takes_no_time_and_after_it_does(decide: Any) -> None:
     rate = Rate(rate_bps=8_000, queue=100, overhead_bytes=0)
-    lost = LossOf(loss=WorstCase())
+    lost = LossOf(loss=WorstCaseLoss())
     for impairments, last_s in (((lost, rate), 2), ((rate, lost), 5)):
         settings = LinkSettings(impairments=impairments, mansd=1, first_delivered=True)
         decided = decide(settings, 5, sizes_bytes=1000, arrivals_ns=0)

@@ -34,10 +34,10 @@ def test_only_delays_before_it_are_skipped(decide: Any) -> None:
 def test_overtaking_is_counted_and_held_within_the_guarantee(decide: Any) -> None:
     """Every fifth would overtake all four before it; under a cap of 2 it waits for the second."""
     freely = decide(LinkSettings(impairments=(FIXED, Reorder(gap=5)), mansd=4), 50)
-    assert freely.verdicts["overtakes"].reshape(-1, 5).tolist() == [[0, 0, 0, 0, 4]] * 10
+    assert freely.verdicts["makes_stale"].reshape(-1, 5).tolist() == [[0, 0, 0, 0, 4]] * 10
     capped = decide(LinkSettings(impairments=(FIXED, Reorder(gap=5)), mansd=2), 50)
     of_five = capped.verdicts.reshape(-1, 5)
-    assert (of_five["overtakes"] == [0, 0, 0, 0, 2]).all()
+    assert (of_five["makes_stale"] == [0, 0, 0, 0, 2]).all()
     assert (of_five["release_ns"][:, 4] == of_five["release_ns"][:, 1]).all()
-    assert (of_five["held_ns"][:, 4] > 0).all()
-    assert (of_five["held_ns"][:, :4] == 0).all()
+    assert (of_five["hold_back_ns"][:, 4] > 0).all()
+    assert (of_five["hold_back_ns"][:, :4] == 0).all()

@@ -8,11 +8,18 @@ from hypothesis import strategies as st
 
 from netem.rule_program import program_of
 from netem.rules.scripted_losses import lost
-from noack.config.impairments import LinkSettings, Loss, LossOf, Periodic, Scripted, WorstCase
+from noack.config.impairments import (
+    LinkSettings,
+    Loss,
+    LossOf,
+    PeriodicLoss,
+    ScriptedLoss,
+    WorstCaseLoss,
+)
 
 
 def flags(loss: Loss, packets: Any) -> list[bool]:
-    settings = LinkSettings(impairments=(LossOf(loss=Scripted(lost=(1, 4))), LossOf(loss=loss)))
+    settings = LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1, 4))), LossOf(loss=loss)))
     program = program_of(settings, 0, "a")
     return [lost(program.scripts[1], program.integers, packet) for packet in packets]
 
@@ -21,9 +28,9 @@ def flags(loss: Loss, packets: Any) -> list[bool]:
 def test_exactly_the_named_ones_are_lost(names: set[int], extra: int) -> None:
     """Played once, and again and again."""
     script = tuple(sorted(names))
-    assert flags(Scripted(lost=script), range(80)) == [k in names for k in range(80)]
+    assert flags(ScriptedLoss(lost=script), range(80)) == [k in names for k in range(80)]
     every = max(names, default=0) + 1 + extra
-    again = flags(Scripted(lost=script, repeat_every=every), range(300))
+    again = flags(ScriptedLoss(lost=script, repeat_every=every), range(300))
     assert again == [k % every in names for k in range(300)]
 
 
@@ -31,23 +38,23 @@ def test_exactly_the_named_ones_are_lost(names: set[int], extra: int) -> None:
 def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first: int) -> None:
     burst = data.draw(st.integers(0, period))
     expected = {first + k * period + j for k in range(200) for j in range(burst)}
-    found = flags(Periodic(period=period, burst=burst, first=first), range(200))
+    found = flags(PeriodicLoss(period=period, burst=burst, first=first), range(200))
     assert found == [k in expected for k in range(200)]
 
 
 def test_great_numbers() -> None:
-    assert flags(Scripted(lost=(0, 2**40 - 1)), [0, 1, 2**40 - 2, 2**40 - 1, 2**40]) == [
+    assert flags(ScriptedLoss(lost=(0, 2**40 - 1)), [0, 1, 2**40 - 2, 2**40 - 1, 2**40]) == [
         True, False, False, True, False,
     ]  # fmt: skip
 
 
 def test_each_flow_has_its_own_count(decide: Any) -> None:
     flows = np.array([0, 1, 1, 0, 1, 0, 0, 1])
-    decided = decide([LossOf(loss=Scripted(lost=(0, 2)))], len(flows), flows=flows)
+    decided = decide([LossOf(loss=ScriptedLoss(lost=(0, 2)))], len(flows), flows=flows)
     assert (decided.fates == 1).tolist() == [
         packet in (0, 2) for packet in decided.verdicts["packet"]
     ]
 
 
 def test_the_worst_case_loses_all_that_may_be_lost(decide: Any) -> None:
-    assert (decide([LossOf(loss=WorstCase())], 1000).fates == 1).all()
+    assert (decide([LossOf(loss=WorstCaseLoss())], 1000).fates == 1).all()

@@ -38,7 +38,7 @@ def assert_the_same(settings: imp.LinkSettings, request: Request | None, overhea
     assert request.jitter_s == pytest.approx(delay.jitter_s, abs=TIME_S)
     assert request.delay_correlation == pytest.approx(delay.correlation, abs=SHARE)
 
-    loss = kinds.get("loss", imp.LossOf(loss=imp.Lossless()))
+    loss = kinds.get("loss", imp.LossOf(loss=imp.NoLoss()))
     assert isinstance(loss, imp.LossOf)
     assert_the_same_loss(loss.loss, request)
 
@@ -63,18 +63,18 @@ def assert_the_same(settings: imp.LinkSettings, request: Request | None, overhea
 
 
 def assert_the_same_loss(loss: imp.Loss, request: Request) -> None:
-    if isinstance(loss, imp.Bernoulli):
+    if isinstance(loss, imp.BernoulliLoss):
         found = (request.loss, request.loss_correlation)
         assert found == pytest.approx((loss.probability, loss.correlation), abs=SHARE)
-    elif isinstance(loss, imp.GilbertElliott):
+    elif isinstance(loss, imp.GilbertElliottLoss):
         p, r = loss.transitions
         expected = (p, r, 1 - loss.loss_in_bad, loss.loss_in_good)
         assert request.gemodel == pytest.approx(expected, abs=SHARE)
-    elif isinstance(loss, imp.FourState):
+    elif isinstance(loss, imp.FourStateLoss):
         order = (loss.p13, loss.p31, loss.p32, loss.p14, loss.p23)
         assert request.state == pytest.approx(order, abs=SHARE)
     else:
-        assert isinstance(loss, imp.Lossless)
+        assert isinstance(loss, imp.NoLoss)
         assert (request.loss, request.gemodel, request.state) == (0, None, None)
 
 
@@ -123,9 +123,9 @@ def test_what_tc_takes_and_this_emulator_cannot_do_is_refused(tc: Tc, words: str
 times_s = st.floats(3e-6, 200)
 """From tc's smallest to its largest, of 32 bits."""
 tcs_losses = st.one_of(
-    st.just(imp.Lossless()),
+    st.just(imp.NoLoss()),
     st.builds(
-        imp.Bernoulli,
+        imp.BernoulliLoss,
         probability=any_settings.probabilities,
         correlation=any_settings.correlations,
     ),
@@ -227,7 +227,7 @@ def test_where_nothing_remains_there_is_no_command(words: str) -> None:
 @given(settings=any_settings.settings)
 def test_nothing_is_left_out_in_silence(settings: imp.LinkSettings) -> None:
     command = tc_command(settings)
-    wanted = [one for one in settings.impairments if one != imp.LossOf(loss=imp.Lossless())]
+    wanted = [one for one in settings.impairments if one != imp.LossOf(loss=imp.NoLoss())]
     kept = 0
     if command.words is not None:
         kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")

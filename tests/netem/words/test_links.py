@@ -16,7 +16,7 @@ from netem.words.links_file import LinksFile, json_schema, load_links
 from netem.words.settings_to_words import text_of
 from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
-from noack.config.impairments import Delay, LinkSettings, LossOf, Scripted
+from noack.config.impairments import Delay, LinkSettings, LossOf, ScriptedLoss
 from noack.core.errors import CallerError
 from tests.netem.any_settings import settings, words_can_say
 
@@ -67,7 +67,7 @@ def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
         listen=("::1", 0),
         to=("::1", 9003),
         forward=settings_of("loss burst 5% 3 delay 20ms"),
-        back=LinkSettings(impairments=(LossOf(loss=Scripted(lost=(1,), repeat_every=3)),)),
+        back=LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)),
         return_path=False,
         idle_s=5.0,
         most_clients=10,

@@ -10,24 +10,24 @@ from netem.words.quantities import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percen
 from netem.words.settings_to_words import text_of
 from netem.words.words_to_settings import parse, settings_of
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Blackout,
     Corrupt,
     Delay,
     Duplicate,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     Impairment,
     LinkSettings,
     Loss,
-    Lossless,
     LossOf,
-    Periodic,
+    NoLoss,
+    PeriodicLoss,
     Rate,
     Reorder,
-    Scripted,
-    Trace,
-    WorstCase,
+    ScriptedLoss,
+    TraceLoss,
+    WorstCaseLoss,
 )
 from noack.core.errors import CallerError
 from tests.netem.any_settings import settings, words_can_say
@@ -41,28 +41,28 @@ def loss(model: Loss) -> tuple[Impairment, ...]:
     ("words", "impairments"),
     [
         # The manual page of tc-netem, and what it says of what is left out.
-        ("loss 5%", loss(Bernoulli(probability=0.05))),
-        ("loss 5", loss(Bernoulli(probability=0.05))),
-        ("loss 0.3% 25%", loss(Bernoulli(probability=0.003, correlation=0.25))),
-        ("loss random 5%", loss(Bernoulli(probability=0.05))),
-        ("drop 5%", loss(Bernoulli(probability=0.05))),
-        ("loss state 10%", loss(FourState(p13=0.1, p31=0.9))),
-        ("loss state 10% 20%", loss(FourState(p13=0.1, p31=0.2))),
-        ("loss state 10% 20% 3%", loss(FourState(p13=0.1, p31=0.2, p32=0.03))),
+        ("loss 5%", loss(BernoulliLoss(probability=0.05))),
+        ("loss 5", loss(BernoulliLoss(probability=0.05))),
+        ("loss 0.3% 25%", loss(BernoulliLoss(probability=0.003, correlation=0.25))),
+        ("loss random 5%", loss(BernoulliLoss(probability=0.05))),
+        ("drop 5%", loss(BernoulliLoss(probability=0.05))),
+        ("loss state 10%", loss(FourStateLoss(p13=0.1, p31=0.9))),
+        ("loss state 10% 20%", loss(FourStateLoss(p13=0.1, p31=0.2))),
+        ("loss state 10% 20% 3%", loss(FourStateLoss(p13=0.1, p31=0.2, p32=0.03))),
         (
             "loss state 10% 20% 3% 40% 5%",
-            loss(FourState(p13=0.1, p31=0.2, p32=0.03, p23=0.4, p14=0.05)),
+            loss(FourStateLoss(p13=0.1, p31=0.2, p32=0.03, p23=0.4, p14=0.05)),
         ),
-        ("loss gemodel 1%", loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.99))),
-        ("loss gemodel 1% 10%", loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.1))),
+        ("loss gemodel 1%", loss(GilbertElliottLoss(good_to_bad=0.01, bad_to_good=0.99))),
+        ("loss gemodel 1% 10%", loss(GilbertElliottLoss(good_to_bad=0.01, bad_to_good=0.1))),
         (
             "loss gemodel 1% 10% 70%",
-            loss(GilbertElliott(good_to_bad=0.01, bad_to_good=0.1, loss_in_bad=0.7)),
+            loss(GilbertElliottLoss(good_to_bad=0.01, bad_to_good=0.1, loss_in_bad=0.7)),
         ),
         (
             "loss gemodel 1% 10% 70% 0.1%",
             loss(
-                GilbertElliott(
+                GilbertElliottLoss(
                     good_to_bad=0.01, bad_to_good=0.1, loss_in_bad=0.7, loss_in_good=0.001
                 )
             ),
@@ -97,16 +97,16 @@ def loss(model: Loss) -> tuple[Impairment, ...]:
         ),
         ("rate 1mbit -14", (Rate(rate_bps=1_000_000, overhead_bytes=-14),)),
         # What tc has no words for.
-        ("loss none", loss(Lossless())),
-        ("loss burst 5% 2.5", loss(GilbertElliott(mean_loss=0.05, mean_burst=2.5))),
-        ("loss periodic 2/100", loss(Periodic(period=100, burst=2))),
-        ("loss periodic 2/100 from 7", loss(Periodic(period=100, burst=2, first=7))),
-        ("loss trace a.txt", loss(Trace(file="a.txt"))),
-        ("loss trace 'a file.txt' once", loss(Trace(file="a file.txt", repeat=False))),
-        ("loss script 3,4,17", loss(Scripted(lost=(3, 4, 17)))),
-        ("loss script 3,4 every 20", loss(Scripted(lost=(3, 4), repeat_every=20))),
-        ("loss script none", loss(Scripted(lost=()))),
-        ("loss worst", loss(WorstCase())),
+        ("loss none", loss(NoLoss())),
+        ("loss burst 5% 2.5", loss(GilbertElliottLoss(mean_loss=0.05, mean_burst=2.5))),
+        ("loss periodic 2/100", loss(PeriodicLoss(period=100, burst=2))),
+        ("loss periodic 2/100 from 7", loss(PeriodicLoss(period=100, burst=2, first=7))),
+        ("loss trace a.txt", loss(TraceLoss(file="a.txt"))),
+        ("loss trace 'a file.txt' once", loss(TraceLoss(file="a file.txt", repeat=False))),
+        ("loss script 3,4,17", loss(ScriptedLoss(lost=(3, 4, 17)))),
+        ("loss script 3,4 every 20", loss(ScriptedLoss(lost=(3, 4), repeat_every=20))),
+        ("loss script none", loss(ScriptedLoss(lost=()))),
+        ("loss worst", loss(WorstCaseLoss())),
         ("rate 1mbit queue 20", (Rate(rate_bps=1_000_000, queue=20),)),
         ("blackout 2s-3s", (Blackout(intervals_s=((2.0, 3.0),)),)),
         (
@@ -120,12 +120,15 @@ def loss(model: Loss) -> tuple[Impairment, ...]:
         (
             "loss 5% delay 10ms 1ms lossrel 80%",
             (
-                LossOf(loss=Bernoulli(probability=0.05)),
+                LossOf(loss=BernoulliLoss(probability=0.05)),
                 Delay(delay_s=0.01, jitter_s=1e-3, loss_correlation=0.8),
             ),
         ),
         # Words may be shortened as long as it is clear which is meant.
-        ("dup 1% lo 5%", (Duplicate(probability=0.01), LossOf(loss=Bernoulli(probability=0.05)))),
+        (
+            "dup 1% lo 5%",
+            (Duplicate(probability=0.01), LossOf(loss=BernoulliLoss(probability=0.05))),
+        ),
     ],
 )
 def test_what_words_say(words: str, impairments: tuple[Impairment, ...]) -> None:
@@ -153,7 +156,7 @@ def test_settings_stand_anywhere_and_impairments_in_their_order() -> None:
     ],
 )
 def test_words_may_be_joined(words: str | list[str]) -> None:
-    assert settings_of(words) == LinkSettings(impairments=loss(Trace(file="my file")), mansd=4)
+    assert settings_of(words) == LinkSettings(impairments=loss(TraceLoss(file="my file")), mansd=4)
 
 
 @given(settings, st.none() | st.integers(0, 2**64 - 1))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from netem.link_machine import Link
 from noack.config.impairment_files import read_files, read_loss
-from noack.config.impairments import Delay, LinkSettings, LossOf, Rate, Scripted, Trace
+from noack.config.impairments import Delay, LinkSettings, LossOf, Rate, ScriptedLoss, TraceLoss
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
@@ -28,7 +28,7 @@ def the_delay(settings: LinkSettings) -> Delay:
 @pytest.mark.parametrize("repeat", [True, False])
 def test_a_trace_loses_what_it_marks(repeat: bool, tmp_path: Path) -> None:
     (tmp_path / "trace.txt").write_text("0100 1\n11\t0\r\n")
-    settings = LinkSettings(impairments=(LossOf(loss=Trace(file="trace.txt", repeat=repeat)),))
+    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="trace.txt", repeat=repeat)),))
     link = Link(read_files(settings, tmp_path), 0, "test")
     fates = [link.decide(0, 100, 0).fate for _ in range(20)]
     marks = [int(mark) for mark in "01001110"]
@@ -40,8 +40,8 @@ def test_a_trace_loses_what_it_marks(repeat: bool, tmp_path: Path) -> None:
 def test_any_trace(tmp_path_factory: pytest.TempPathFactory, lost: list[bool]) -> None:
     path = tmp_path_factory.getbasetemp() / "any.txt"
     path.write_text("\n".join("01"[flag] for flag in lost))
-    script = read_loss(Trace(file=str(path)), Path("/"))
-    assert isinstance(script, Scripted)
+    script = read_loss(TraceLoss(file=str(path)), Path("/"))
+    assert isinstance(script, ScriptedLoss)
     assert script.repeat_every == len(lost)
     assert [number in script.lost for number in range(len(lost))] == lost
 
@@ -112,7 +112,7 @@ def test_a_mistake_in_a_trace_gets_one_line(
 ) -> None:
     if content is not None:
         (tmp_path / "t").write_bytes(content)
-    settings = LinkSettings(impairments=(LossOf(loss=Trace(file="t")),))
+    settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
     with pytest.raises(CallerError) as caught:
         read_files(settings, tmp_path, "l.toml: link.0.back")
     assert str(caught.value).startswith(
@@ -164,7 +164,7 @@ def scenario_with_files(content: dict[str, Any], tmp_path: Path) -> Path:
 
 def test_a_loaded_scenario_needs_its_files_no_more(scenario_with_files: Path) -> None:
     scenario = load(scenario_with_files)
-    assert scenario.network.loss == Scripted(lost=(2, 3), repeat_every=4)
+    assert scenario.network.loss == ScriptedLoss(lost=(2, 3), repeat_every=4)
     assert scenario.network.impairments == (
         Delay(distribution="empirical", samples_s=(0.001, 0.002)),
     )

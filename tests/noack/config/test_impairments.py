@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.impairments import Delay, GilbertElliott, Impairment, LinkSettings, Loss, Rate
+from noack.config.impairments import Delay, GilbertElliottLoss, Impairment, LinkSettings, Loss, Rate
 
 LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
 ONE: TypeAdapter[Impairment] = TypeAdapter(Impairment)
@@ -140,9 +140,9 @@ def test_means_determine_the_chain(loss: float, burst: float) -> None:
     """Bursts last 1/r and p/(p + r) is lost; refused exactly if p were above 1."""
     if loss / (1 - loss) > burst:
         with pytest.raises(ValidationError, match="needs longer bursts"):
-            GilbertElliott(mean_loss=loss, mean_burst=burst)
+            GilbertElliottLoss(mean_loss=loss, mean_burst=burst)
         return
-    p, r = GilbertElliott(mean_loss=loss, mean_burst=burst).transitions
+    p, r = GilbertElliottLoss(mean_loss=loss, mean_burst=burst).transitions
     assert 1 / r == pytest.approx(burst)
     assert p / (p + r) == pytest.approx(loss)
 

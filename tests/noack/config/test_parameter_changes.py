@@ -4,12 +4,12 @@ from typing import Any
 
 import pytest
 
-from noack.config.impairments import Bernoulli, GilbertElliott
+from noack.config.impairments import BernoulliLoss, GilbertElliottLoss
 from noack.config.parameter_changes import (
-    Change,
-    Schedule,
+    ChangeSchedule,
+    ParameterChange,
     changed,
-    knobs_of,
+    current_parameters,
     settings_bytes,
     settings_of,
 )
@@ -57,7 +57,7 @@ def test_a_mistaken_change_is_one_line(
 def test_the_rest_stays_as_it_is(scenario: Scenario) -> None:
     settings = {"network.loss.probability": 0.9, "network.mansd": 1, "trigger.beta": 0.25}
     found = changed(scenario, settings)
-    assert found.network.loss == Bernoulli(probability=0.9)
+    assert found.network.loss == BernoulliLoss(probability=0.9)
     assert (found.network.mansd, found.decaying.beta) == (1, 0.25)
     back = {"network.loss.probability": 0.5, "network.mansd": 2, "trigger.beta": 0.5}
     assert changed(found, back) == scenario
@@ -70,7 +70,7 @@ def test_another_loss_model_begins_without_the_keys_of_the_one_before(scenario: 
         "network.loss.mean_burst": 3.0,
     }
     loss = changed(scenario, settings).network.loss
-    assert loss == GilbertElliott(mean_loss=0.5, mean_burst=3.0)
+    assert loss == GilbertElliottLoss(mean_loss=0.5, mean_burst=3.0)
 
 
 def test_a_change_is_valid_if_the_whole_scenario_is(scenario: Scenario) -> None:
@@ -120,9 +120,9 @@ def test_mistakes_in_what_changes_are_told(
 
 
 def test_short_names_are_names_of_what_can_be_changed(scenario: Scenario) -> None:
-    knobs = knobs_of(scenario)
+    names = current_parameters(scenario)
     for short in ("loss", "mansd", "beta", "alpha", "floor", "setpoint"):
-        assert full_key(short) in knobs
+        assert full_key(short) in names
     assert full_key("loss.p") == "network.loss.probability"
     assert full_key("loss.mean_burst") == "network.loss.mean_burst"
     assert full_key("trigger.beta") == "trigger.beta"
@@ -142,9 +142,9 @@ def test_settings_are_recorded_in_full() -> None:
 
 
 def test_a_later_change_that_is_told_first_builds_on_an_earlier_one(scenario: Scenario) -> None:
-    schedule = Schedule(scenario)
-    schedule.announce("t", Change(0, 200, {"trigger.beta": 0.1}), 0, 0, -1)
-    schedule.announce("t", Change(1, 100, {"network.mansd": 5}), 1, 0, -1)
+    schedule = ChangeSchedule(scenario)
+    schedule.announce("t", ParameterChange(0, 200, {"trigger.beta": 0.1}), 0, 0, -1)
+    schedule.announce("t", ParameterChange(1, 100, {"network.mansd": 5}), 1, 0, -1)
     assert schedule.next_ns == 100
     assert schedule.take(99) is None
     first, second = schedule.take(250), schedule.take(250)
@@ -161,8 +161,10 @@ def test_a_later_change_that_is_told_first_builds_on_an_earlier_one(scenario: Sc
 
 
 def test_what_is_heard_of_too_late_is_applied_late_and_said(scenario: Scenario) -> None:
-    schedule = Schedule(scenario)
-    record, notice = schedule.announce("t", Change(0, 100, {"trigger.beta": 0.1}), 7, 350, 300)
+    schedule = ChangeSchedule(scenario)
+    record, notice = schedule.announce(
+        "t", ParameterChange(0, 100, {"trigger.beta": 0.1}), 7, 350, 300
+    )
     assert isinstance(record, Record)
     assert isinstance(notice, Notice)
     assert record.row[:5] == (7, 0, 100, 350, 301)
@@ -171,8 +173,8 @@ def test_what_is_heard_of_too_late_is_applied_late_and_said(scenario: Scenario) 
 
 
 def test_an_impossible_change_changes_nothing(scenario: Scenario) -> None:
-    schedule = Schedule(scenario)
+    schedule = ChangeSchedule(scenario)
     with pytest.raises(CallerError):
-        schedule.announce("t", Change(0, 100, {"trigger.beta": -1.0}), 0, 0, -1)
+        schedule.announce("t", ParameterChange(0, 100, {"trigger.beta": -1.0}), 0, 0, -1)
     assert schedule.next_ns is None
     assert schedule.last is scenario

@@ -9,7 +9,7 @@ from scipy import signal
 
 from noack.config.matrix_files import read_matrices
 from noack.config.named_file import NamedFile
-from noack.config.sections.model_section import Model
+from noack.config.sections.model_section import ModelSection
 from noack.config.state_space import model_of, save_model
 from noack.core.errors import CallerError
 
@@ -17,7 +17,7 @@ A = np.array([[0.0, 1.0], [4.0, 0.0]])
 B = np.array([[0.0], [1.0]])
 C, D = np.eye(2), np.zeros((2, 1))
 K = np.array([[-8.0, -4.0]])
-EXPECTED = Model(A=((0.0, 1.0), (4.0, 0.0)), B=((0.0,), (1.0,)), gain=((-8.0, -4.0),))
+EXPECTED = ModelSection(A=((0.0, 1.0), (4.0, 0.0)), B=((0.0,), (1.0,)), gain=((-8.0, -4.0),))
 
 
 def control_object(**names: Any) -> Any:

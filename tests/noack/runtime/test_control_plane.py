@@ -22,14 +22,14 @@ from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import NoAnswerError, PeerError
 from noack.protocol.topology import COORDINATOR, LOOP_ROLES
-from noack.runtime.control_messages import Admission, Begin, Missing, heard
-from noack.runtime.control_plane import Plane, secret_of
+from noack.runtime.control_messages import Admission, MissingRows, RunStart, parse_message
+from noack.runtime.control_plane import ControlPlane, secret_of
 from noack.runtime.join_ticket import Ticket, new_ticket
 from noack.runtime.process_entry import _admitted
-from noack.runtime.process_life import Node
+from noack.runtime.process_life import RunProcess
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import free_tcp_port
-from noack.runtime.zenoh_session import Secret, open_star, star_config
+from noack.runtime.zenoh_session import SessionSecret, open_session, session_config
 from tests.fuzz.plane import FakePlane
 from tests.integration.conftest import wait_for
 
@@ -54,9 +54,9 @@ def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
     """What a stranger shows at the door."""
     own = secret_of(ticket)
     secrets = {
-        "wrong password": Secret(own.user, "0" * len(own.password)),
-        "wrong user": Secret("root", own.password),
-        "no password": Secret(own.user, ""),
+        "wrong password": SessionSecret(own.user, "0" * len(own.password)),
+        "wrong user": SessionSecret("root", own.password),
+        "no password": SessionSecret(own.user, ""),
         "another run's": secret_of(ticket._replace(key=bytes(32), run_id=ticket.run_id ^ 1)),
     }
     if stranger not in secrets:
@@ -69,7 +69,7 @@ def test_a_stranger_is_not_let_in(coordinator: Coordinator, ticket: Ticket, stra
     for mode in ("client", "peer", "router"):
         more = {"mode": mode, "connect/timeout_ms": 200, **shown_by(stranger, ticket)}
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
-            zenoh.open(star_config(ticket.endpoint, listen=False, more=more))
+            zenoh.open(session_config(ticket.endpoint, listen=False, more=more))
 
 
 def test_who_is_not_let_in_neither_hears_nor_says_anything(
@@ -80,16 +80,18 @@ def test_who_is_not_let_in_neither_hears_nor_says_anything(
     for stranger in STRANGERS:
         more = {"connect/exit_on_failure": False, "connect/timeout_ms": 0, "mode": "peer"}
         more |= shown_by(stranger, ticket)
-        config = star_config(ticket.endpoint, listen=False, more=more)
+        config = session_config(ticket.endpoint, listen=False, more=more)
         strangers.append(zenoh.open(config))
-    with Plane(ticket, "plant") as plant:
+    with ControlPlane(ticket, "plant") as plant:
         batches = coordinator.plane.session.declare_subscriber(
             plant.key("telemetry", "**"), RingChannel(100)
         )
         goodbyes = coordinator.plane.session.declare_queryable(
             plant.key("goodbye", "*"), FifoChannel(100)
         )
-        heard = [session.declare_subscriber("**", RingChannel(100)) for session in strangers]
+        parse_message = [
+            session.declare_subscriber("**", RingChannel(100)) for session in strangers
+        ]
         lives = [
             session.liveliness().declare_subscriber("**", RingChannel(100), history=True)
             for session in strangers
@@ -119,7 +121,7 @@ def test_who_is_not_let_in_neither_hears_nor_says_anything(
         assert coordinator.progress() is None
         assert plant.stop_requested() is None
         assert plant.kept() is None
-        for channel in (*heard, *lives):  # each hears itself, and nobody else
+        for channel in (*parse_message, *lives):  # each hears itself, and nobody else
             while (sample := channel.try_recv()) is not None:
                 assert sample.payload.to_bytes() in (b"", b"evil")
                 assert sample.payload.to_bytes() or "alive/sensor" in str(sample.key_expr)
@@ -139,9 +141,9 @@ def test_a_process_does_not_go_in_where_nothing_is_asked_of_it(ticket: Ticket) -
     secret = secret_of(ticket)._asdict()
     shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
     more = {"connect/timeout_ms": 200, **shown}
-    config = star_config(ticket.endpoint, listen=False, more=more)
+    config = session_config(ticket.endpoint, listen=False, more=more)
     with (
-        zenoh.open(star_config(ticket.endpoint, listen=True)),
+        zenoh.open(session_config(ticket.endpoint, listen=True)),
         pytest.raises(zenoh.ZError, match="Unable to connect"),
     ):
         zenoh.open(config)
@@ -181,7 +183,7 @@ def test_no_zenoh_is_opened_but_with_a_secret() -> None:
 def test_the_password_is_on_no_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
     own = psutil.Process()
     before = [file.path for file in own.open_files()], pipes()
-    with open_star(ticket.endpoint, secret_of(ticket), listen=True):
+    with open_session(ticket.endpoint, secret_of(ticket), listen=True):
         assert not [f for f in own.open_files() if "password" in f.path]
         assert pipes() == before[1]
 
@@ -203,16 +205,16 @@ def pipes() -> set[str]:
         ("{", Admission, "no admission of this version of noack: "),
         (b"\xff\xfe", Admission, "no admission of this version of noack: "),
         ("[" * 100_000, Admission, "no admission of this version of noack: "),
-        ("{}", Begin, "epoch_ns: "),
-        ('{"epoch_ns": -1, "addresses": {}}', Begin, "epoch_ns: "),
-        ('{"epoch_ns": 1.5, "addresses": {}}', Begin, "epoch_ns: "),
-        ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', Begin, "plant"),
-        ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', Begin, "plant"),
-        ("null", Missing, "no missing of this version of noack: "),
-        ("[]", Missing, "no missing of this version of noack: "),
-        ('{"rows": {"plant_step": 5}}', Missing, "plant_step: "),
-        ('{"rows": {"plant_step": [[0]]}}', Missing, "plant_step"),
-        ('{"rows": {"plant_step": [[0, -5]]}}', Missing, "plant_step"),
+        ("{}", RunStart, "epoch_ns: "),
+        ('{"epoch_ns": -1, "addresses": {}}', RunStart, "epoch_ns: "),
+        ('{"epoch_ns": 1.5, "addresses": {}}', RunStart, "epoch_ns: "),
+        ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', RunStart, "plant"),
+        ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', RunStart, "plant"),
+        ("null", MissingRows, "no missing rows of this version of noack: "),
+        ("[]", MissingRows, "no missing rows of this version of noack: "),
+        ('{"rows": {"plant_step": 5}}', MissingRows, "plant_step: "),
+        ('{"rows": {"plant_step": [[0]]}}', MissingRows, "plant_step"),
+        ('{"rows": {"plant_step": [[0, -5]]}}', MissingRows, "plant_step"),
     ],
 )
 def test_an_answer_that_is_none_is_a_line(
@@ -227,8 +229,8 @@ def test_an_answer_that_is_none_is_a_line(
             query.reply(query.key_expr, answer)
 
     threading.Thread(target=serve, daemon=True).start()
-    with Plane(ticket, "plant") as plant, pytest.raises(PeerError) as caught:
-        heard(kind, plant.request("ask", {}, timeout_s=30))
+    with ControlPlane(ticket, "plant") as plant, pytest.raises(PeerError) as caught:
+        parse_message(kind, plant.request("ask", {}, timeout_s=30))
     assert line in str(caught.value)
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 500
@@ -240,9 +242,9 @@ def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticke
     queries = coordinator.plane.session.declare_queryable(
         coordinator.plane.key("ask", "*"), FifoChannel(4)
     )
-    threading.Thread(target=lambda: Plane.answer(queries.recv(), said), daemon=True).start()
-    with Plane(ticket, "plant") as plant:
-        told = heard(Begin, plant.request("ask", {}, timeout_s=30))
+    threading.Thread(target=lambda: ControlPlane.answer(queries.recv(), said), daemon=True).start()
+    with ControlPlane(ticket, "plant") as plant:
+        told = parse_message(RunStart, plant.request("ask", {}, timeout_s=30))
     assert told["epoch_ns"] == 7
     assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
 
@@ -258,11 +260,11 @@ def test_a_question_whose_answer_was_lost_is_asked_again(
 
     def serve() -> None:
         kept.append(queries.recv())
-        Plane.answer(queries.recv(), "heard")
+        ControlPlane.answer(queries.recv(), "parse_message")
 
     threading.Thread(target=serve, daemon=True).start()
-    with Plane(ticket, "plant") as plant:
-        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "heard"
+    with ControlPlane(ticket, "plant") as plant:
+        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "parse_message"
     kept.clear()
 
 
@@ -285,10 +287,10 @@ def test_a_launched_process_connects_anew_until_it_is_let_in(
                 raise NoAnswerError(f"no answer to {what!r}")
             address = after = None
             return json.dumps({
-                "incarnation": 0, "admitted_ns": 0, "from_ns": 0, "address": address, "after": after
+                "generation": 0, "admitted_ns": 0, "from_ns": 0, "address": address, "after": after
             }).encode()  # fmt: skip
 
-    monkeypatch.setattr(noack.runtime.process_entry, "Plane", Silent)
+    monkeypatch.setattr(noack.runtime.process_entry, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)
     asking = partial(_admitted, "plant", ticket._replace(launched=launched), Signals())
     if launched:
@@ -299,7 +301,7 @@ def test_a_launched_process_connects_anew_until_it_is_let_in(
             asking()
 
 
-def meet(plane: Plane) -> None:
+def meet(plane: ControlPlane) -> None:
     """Wait until a process knows that there is a coordinator."""
     everyone = plane.key("alive", COORDINATOR, "*")
     wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
@@ -308,7 +310,7 @@ def meet(plane: Plane) -> None:
 def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> None:
     """As when the machine did not run one end of a connection for a lease."""
     first = Coordinator(ticket)
-    with Plane(ticket, "plant") as plant:
+    with ControlPlane(ticket, "plant") as plant:
         meet(plant)
         assert not plant.coordinator_gone()
         first.close()
@@ -324,12 +326,12 @@ def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> No
 def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> None:
     ticket = ticket._replace(launched=False)
     first = Coordinator(ticket)
-    with Plane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
-        node = Node("plant", ticket, plane, Signals())
+    with ControlPlane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
+        node = RunProcess("plant", ticket, plane, Signals())
         meet(plane)
         first.close()
         wait_for(plane.coordinator_gone)
-        knocking = pool.submit(node.knock)
+        knocking = pool.submit(node.request_admission)
         second = Coordinator(ticket)
         while not knocking.done():
             second.poll()
@@ -342,7 +344,7 @@ def test_a_process_that_gets_no_answer_is_named_by_who_reports_it(
 ) -> None:
     """So that nobody reads ``noack sensor: sensor: no answer``."""
     with (
-        Plane(ticket, "sensor") as plane,
+        ControlPlane(ticket, "sensor") as plane,
         pytest.raises(PeerError, match=r"^no answer to 'nothing'"),
     ):
         plane.request("nothing", {}, timeout_s=0.05)

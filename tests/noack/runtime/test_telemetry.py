@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from noack.protocol.machine_interface import Notice, Record
 from noack.runtime import telemetry
-from noack.runtime.telemetry import NOTICES, Received, TelemetryBuffer, first_row, notices_of
+from noack.runtime.telemetry import NOTICES, ReceivedRows, TelemetryBuffer, first_row, notices_of
 
 ROW = np.dtype([("number", "<i8"), ("x", "<f8", (2,))])
 TABLES = {"one": ROW, "two": ROW}
@@ -24,7 +24,7 @@ class Wire:
 
     def __call__(self, table: str, header: bytes, payload: bytes) -> None:
         fields = json.loads(header)
-        assert first_row(header) == (fields["incarnation"], fields["first"])
+        assert first_row(header) == (fields["generation"], fields["first"])
         self.batches.append((table, fields["first"], fields["rows"], payload))
 
     def rows(self, table: str) -> list[tuple[int, Any]]:
@@ -110,7 +110,7 @@ def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject)
     sent = len(wire.batches)
     lost = data.draw(st.sets(st.integers(0, sent - 1)))
     arrived = [batch for k, batch in enumerate(wire.batches) if k not in lost]
-    received = Received()
+    received = ReceivedRows()
     for _, first, n, _ in data.draw(st.permutations(arrived)):
         received.add(first, first + n)
     missing = received.missing(count)
@@ -131,7 +131,7 @@ def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject)
 def test_what_was_received_is_known_in_as_few_ranges_as_can_be(
     parts: list[tuple[int, int]], total: int
 ) -> None:
-    received, numbers = Received(), set[int]()
+    received, numbers = ReceivedRows(), set[int]()
     for first, count in parts:
         received.add(first, first + count)
         numbers |= set(range(first, first + count))

@@ -11,7 +11,7 @@ from cosim.simulation.continuous.continuous_run import (
     TooManyEventsError,
     simulate_continuous,
 )
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 from tests.noack.theory.loops import System
@@ -29,10 +29,10 @@ class Observed(NamedTuple):
         return self.run.system.norms(errors)
 
 
-def loop_of(system: System) -> Loop:
+def loop_of(system: System) -> LoopMatrices:
     plain = np.array_equal(system.weight, np.eye(len(system.A)))
     names = tuple(f"x_{i}" for i in range(len(system.A)))
-    return Loop(
+    return LoopMatrices(
         A_model=system.H - system.B @ system.K, B_model=system.B, K=system.K, H=system.H,
         A=system.A, B=system.B, x0=system.x0, weight=None if plain else system.weight,
         state_names=names, input_names=names[: len(system.K)],

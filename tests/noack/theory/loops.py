@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import Conditions, Constants, Level, solve
+from noack.theory.certificate import Constants, Level, NetworkConditions, solve
 from noack.theory.gains import ErrorGains, PlantGains
 
 Reals = NDArray[np.float64]
@@ -47,21 +47,21 @@ class System:
     """Steps by which an input is late."""
 
     @property
-    def conditions(self) -> Conditions:
+    def conditions(self) -> NetworkConditions:
         """What the certificate may presuppose of :func:`simulate`."""
         steps = Steps(self)
-        felt = steps.delay + (steps.hold - 1 + steps.lag if steps.hold else 0)
+        applied_input = steps.delay + (steps.hold - 1 + steps.lag if steps.hold else 0)
         sampling_s = self.sample_steps * self.step_s
-        return Conditions(
+        return NetworkConditions(
             dropouts=self.mansd,
             sampling_s=sampling_s,
             spacing_s=sampling_s,
-            delay_s=felt * self.step_s,
+            delay_s=applied_input * self.step_s,
             hold_s=(steps.hold + steps.lag) * self.step_s,
-            start_s=felt * self.step_s,
+            start_s=applied_input * self.step_s,
         )
 
-    def certify(self, conditions: Conditions | None = None) -> Constants:
+    def certify(self, conditions: NetworkConditions | None = None) -> Constants:
         error = ErrorGains(self.H, self.K, self.weight, self.alpha)
         plant = PlantGains(error, self.A, self.B, self.x0[:, None], self.alpha)
         level = Level(self.beta, self.beta)
@@ -161,9 +161,9 @@ def simulate(
             )
             x_s, last_event = np.where(event[:, None], x, x_s), np.where(event, step, last_event)
             put = np.flatnonzero(event & delivered[every, events])
-            under_way = delays[put, events[put]]
-            slot = (step + under_way) % (steps.delay + 1)
-            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model[0].late[under_way])
+            in_flight = delays[put, events[put]]
+            slot = (step + in_flight) % (steps.delay + 1)
+            arriving[put, slot] = np.einsum("ri,rij->rj", x[put], model[0].late[in_flight])
             arrives[put, slot] = events[put] + 1
             events = events + event
         slot_now = step % (steps.delay + 1)

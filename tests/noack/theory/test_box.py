@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 from noack.theory.box import BoxGains
-from noack.theory.certificate import Conditions, Constants, Level, VoidError, solve
+from noack.theory.certificate import Constants, Level, NetworkConditions, VoidError, solve
 from noack.theory.enclosure import NotDecayingError
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import RUNS, STEPS, Plants, System, networks, simulate, systems
@@ -44,7 +44,7 @@ class Case(NamedTuple):
         )  # fmt: skip
 
     def certify(
-        self, conditions: Conditions | None = None, box: type[BoxGains] = BoxGains
+        self, conditions: NetworkConditions | None = None, box: type[BoxGains] = BoxGains
     ) -> Constants:
         level = Level(self.system.beta, self.system.beta)
         plant = self.gains(box)
@@ -214,7 +214,7 @@ def test_a_box_with_a_plant_that_does_not_decay_is_refused(
     wide = case._replace(halfwidth_A=size * case.halfwidth_A / 0.05,
                          halfwidth_B=size * case.halfwidth_B / 0.05)  # fmt: skip
     try:
-        wide.certify(Conditions(case.system.mansd))
+        wide.certify(NetworkConditions(case.system.mansd))
     except (VoidError, NotDecayingError):
         return
     for A, B in wide.plants(np.random.default_rng(seed)):
@@ -241,10 +241,10 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
         return Case(system, np.array([[half_A]]), np.array([[half_B]]))
 
     with pytest.raises(NotDecayingError, match="box is too large"):
-        case(1.005).certify(Conditions(2))
+        case(1.005).certify(NetworkConditions(2))
     for size in (0.1, 0.5, 0.95):
         found = case(size)
-        certified = found.certify(Conditions(2))
+        certified = found.certify(NetworkConditions(2))
         margin = whole * (1 - size)
         pushed = (1.0 + found.halfwidth_B.item()) * certified.input_error
         start = x0 * whole / margin  # its mistakes are those of a state that never falls
@@ -262,7 +262,7 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
 def test_a_box_of_nothing_is_the_model(system: System) -> None:
     n, m = system.B.shape
     box = Case(system, np.zeros((n, n)), np.zeros((n, m)))
-    for conditions in (Conditions(system.mansd), system.conditions):
+    for conditions in (NetworkConditions(system.mansd), system.conditions):
         try:
             own = system.certify(conditions)
         except VoidError:

@@ -18,12 +18,12 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load, validate
 from noack.core.linear_systems import spectral_abscissa
-from noack.theory.assumptions import Verdict
-from noack.theory.certificate import Conditions, Constants, VoidError
+from noack.theory.assumptions import AssumptionStatus
+from noack.theory.certificate import Constants, NetworkConditions, VoidError
 from noack.theory.gains import ErrorGains
 from noack.theory.paper_bounds import theorem_2
 from noack.theory.run_conditions import ideal_conditions
-from noack.theory.scenario_certificates import OWN_PLANT, Certificate, certify, certify_box
+from noack.theory.scenario_certificates import OWN_PLANT, ScenarioCertificate, certify, certify_box
 from tests.noack.theory.loops import STEPS, System, Trace, networks, simulate, systems, times_s
 
 ROUNDING = 1 + 1e-9
@@ -54,7 +54,7 @@ def scenario(system: System, *, mode: str = "model", **changes: Any) -> Scenario
     return resolve(validate(content, "test"))
 
 
-def exceeded(system: System, certificate: Certificate, trace: Trace) -> list[str]:
+def exceeded(system: System, certificate: ScenarioCertificate, trace: Trace) -> list[str]:
     """The envelopes that some run leaves at some step, and the distance of events."""
     t_s = times_s(system)
     bounds = {
@@ -73,7 +73,7 @@ def run(system: System, seed: int, floor: float = 0.0) -> Trace:
     return simulate(system, *networks(np.random.default_rng(seed), system), floor=floor)
 
 
-def standing(certificate: Certificate) -> Certificate:
+def standing(certificate: ScenarioCertificate) -> ScenarioCertificate:
     assume(certificate.constants is not None)
     return certificate
 
@@ -144,7 +144,7 @@ def test_a_loop_without_events_has_a_floor_all_the_same() -> None:
         ),
         trigger={"floor": 0.45},
     )  # fmt: skip
-    certificate = certify(content, Conditions(0, sampling_s=1e-6, spacing_s=1e-6))
+    certificate = certify(content, NetworkConditions(0, sampling_s=1e-6, spacing_s=1e-6))
     assert certificate.constants is not None
     assert certificate.floor_constants is not None
 
@@ -187,7 +187,7 @@ def test_where_alpha_is_too_large_bounds_fall_more_slowly(
     assert certificate.inter_event_s is None
     assert exceeded(system, certificate, run(system, seed)) == []
     verdicts = {a.what: a.verdict for a in certificate.assumptions}
-    assert Verdict.VIOLATED in verdicts.values()
+    assert AssumptionStatus.VIOLATED in verdicts.values()
 
 
 @settings(SEARCH, max_examples=8)
@@ -268,12 +268,12 @@ def test_a_certificate_survives_json(name: str) -> None:
     resolved = resolve(load(ROOT / f"scenarios/{name}.toml"))
     for conditions in (
         ideal_conditions(resolved),
-        Conditions(4, 0.002, 0.002, 0.004, 0.005, 0.004),
+        NetworkConditions(4, 0.002, 0.002, 0.004, 0.005, 0.004),
     ):
         for found in (certify(resolved, conditions), certify_box(resolved, conditions)):
             assert found is not None
             document = json.loads(json.dumps(found.to_json(), allow_nan=False))
-            assert Conditions(**document["conditions"]) == conditions
+            assert NetworkConditions(**document["conditions"]) == conditions
             for key in ("constants", "floor_constants"):
                 constants = getattr(found, key)
                 if constants is None:
@@ -325,23 +325,25 @@ def test_a_void_certificate_says_why_and_bounds_nothing() -> None:
     for envelope in (found.sensor_error, found.controller_error, found.state):
         assert np.isnan(envelope(np.linspace(0, 9, 4))).all()
     assert (found.assumptions[-2].what, found.assumptions[-2].verdict) == (
-        "there is a certificate", Verdict.VIOLATED,
+        "there is a certificate", AssumptionStatus.VIOLATED,
     )  # fmt: skip
-    slow = certify(resolve(load(ROOT / "scenarios/lane_following.toml")), Conditions(4, 0.5, 0.5))
+    slow = certify(
+        resolve(load(ROOT / "scenarios/lane_following.toml")), NetworkConditions(4, 0.5, 0.5)
+    )
     assert slow.void is not None
     assert "not below 1" in slow.void
 
 
 def test_verdicts_of_the_assumptions() -> None:
     resolved = resolve(load(ROOT / "scenarios/lane_following.toml"))
-    found = certify(resolved, Conditions(4, 0.002, 0.002, 0.004, 0.005, 0.004))
+    found = certify(resolved, NetworkConditions(4, 0.002, 0.002, 0.004, 0.005, 0.004))
     verdicts = [assumption.verdict for assumption in found.assumptions]
-    assert verdicts == [Verdict.HOLDS] * 3 + [Verdict.PRESUPPOSED] * 4 + [
-        Verdict.HOLDS, Verdict.NOT_NEEDED,
+    assert verdicts == [AssumptionStatus.HOLDS] * 3 + [AssumptionStatus.PRESUPPOSED] * 4 + [
+        AssumptionStatus.HOLDS, AssumptionStatus.NOT_NEEDED,
     ]  # fmt: skip
     free = resolved.network.model_copy(update={"enforce_mansd": False})
     found = certify(resolved.model_copy(update={"network": free}), ideal_conditions(resolved))
-    assert found.assumptions[2].verdict == Verdict.PRESUPPOSED
+    assert found.assumptions[2].verdict == AssumptionStatus.PRESUPPOSED
 
 
 def test_the_lane_example_in_a_weight_from_any_lyapunov_function() -> None:

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.contraction import decay_of
 from noack.theory.enclosure import (
-    Kernel,
+    KernelBounds,
     NotDecayingError,
     constant_kernel,
     factors,
@@ -91,11 +91,11 @@ def times(G: Matrix, end_s: float) -> NDArray[np.float64]:
     )
 
 
-def cell_of(kernel: Kernel, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
+def cell_of(kernel: KernelBounds, t_s: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.searchsorted(kernel.edges_s, t_s, side="right") - 1
 
 
-def peak(kernel: Kernel, C: Matrix, G: Matrix, D: Matrix) -> float:
+def peak(kernel: KernelBounds, C: Matrix, G: Matrix, D: Matrix) -> float:
     """The largest value where the enclosure has its own."""
     cell = int(kernel.highest.argmax())
     return float(values(C, G, D, np.linspace(*kernel.edges_s[cell : cell + 2], 50)).max())

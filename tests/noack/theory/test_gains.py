@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from noack.core.linear_systems import Matrix
-from noack.theory.certificate import Conditions, VoidError, first_passage_s
+from noack.theory.certificate import NetworkConditions, VoidError, first_passage_s
 from noack.theory.gains import ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import System, systems
 
@@ -172,8 +172,8 @@ def test_the_constants_solve_the_inequalities(system: System) -> None:
         raise
     assert found.inter_event_s is not None
     spacing_s, hold_s = found.inter_event_s, conditions.hold_s
-    under_way = math.ceil(conditions.delay_s / spacing_s - 1e-9)
-    assert found.missing_events == conditions.dropouts + under_way
+    in_flight = math.ceil(conditions.delay_s / spacing_s - 1e-9)
+    assert found.missing_events == conditions.dropouts + in_flight
     beta_tilde, push = found.overshoot * system.beta, found.input_error
     before, start = plant.start_up(conditions.start_s)
 
@@ -239,7 +239,7 @@ def test_without_mismatch_or_push_nothing_is_ever_passed() -> None:
     )  # fmt: skip
     _, plant = gains(system)
     assert first_passage_s(plant, 0.1, 0.0, 0.0, 0.0) >= 1e6
-    found = system.certify(Conditions(0))
+    found = system.certify(NetworkConditions(0))
     assert found.inter_event_s is not None
     assert found.inter_event_s >= 1e6
     # ρ = π'(1 − e^{−t}): never beyond π', and ln 2 to the half of it.

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, assume, find, given, settings
 from hypothesis import strategies as st
 
-from noack.theory.certificate import Conditions, Constants, VoidError
+from noack.theory.certificate import Constants, NetworkConditions, VoidError
 from tests.noack.theory.exact_loops import observe
 from tests.noack.theory.loops import System, systems
 
@@ -22,7 +22,7 @@ seeds = st.integers(0, 2**32)
 
 def certified(system: System, dropouts: int | None = None) -> Constants:
     try:
-        return system.certify(Conditions(system.mansd if dropouts is None else dropouts))
+        return system.certify(NetworkConditions(system.mansd if dropouts is None else dropouts))
     except VoidError:
         assume(False)
         raise

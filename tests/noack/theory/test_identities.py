@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from noack.theory.identities import MissedJumps
+from noack.theory.identities import ModelDifference
 
 H = np.array([[-0.3, 1.0, 0.2], [-2.0, -0.1, 0.0], [0.5, 0.0, 0.4]])
 GROWTH = max(float(np.linalg.norm(expm(H * t), 2)) for t in np.linspace(0, 13 * 0.4, 100))
@@ -25,7 +25,7 @@ def test_the_sum_is_the_sum_of_the_propagated_jumps(
     history: list[tuple[int, int | None]], after_ns: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    missed = MissedJumps(H)
+    missed = ModelDifference(H)
     jumps: list[tuple[int, np.ndarray]] = []
     t_ns, newest = 0, -1
     for sequence, (wait_ns, received) in enumerate(history):
@@ -47,7 +47,7 @@ def test_the_sum_is_the_sum_of_the_propagated_jumps(
 
 
 def test_nothing_missed_is_nothing() -> None:
-    missed = MissedJumps(H)
+    missed = ModelDifference(H)
     missed.advance_to(10**9)
     assert missed.total().tolist() == [0.0, 0.0, 0.0]
     missed.event(0, np.ones(3))
@@ -58,7 +58,7 @@ def test_nothing_missed_is_nothing() -> None:
 
 
 def test_a_scalar_jump_decays_with_the_model() -> None:
-    missed = MissedJumps(np.array([[-2.0]]))
+    missed = ModelDifference(np.array([[-2.0]]))
     missed.event(0, np.array([3.0]))
     missed.advance_to(500_000_000)
     missed.event(1, np.array([1.0]))

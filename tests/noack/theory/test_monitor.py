@@ -54,7 +54,7 @@ def histories(draw: st.DrawFn) -> History:
     x = rng.normal(size=n)
     x_s, x_c = x.copy(), x.copy()
     t_ns, received, moments = 0, -1, []
-    under_way: list[tuple[int, int, Vector]] = []
+    in_flight: list[tuple[int, int, Vector]] = []
     sent = 0
     for _ in range(draw(st.integers(1, 25))):
         step_ns = int(rng.integers(0, 300_000_000))
@@ -66,9 +66,9 @@ def histories(draw: st.DrawFn) -> History:
             event, x_s = sent, x.copy()
             sent += 1
             if rng.uniform() < 0.6:  # the others are lost
-                under_way.append((event, t_ns, x.copy()))
-        for update in [u for u in under_way if rng.uniform() < 0.5]:
-            under_way.remove(update)
+                in_flight.append((event, t_ns, x.copy()))
+        for update in [u for u in in_flight if rng.uniform() < 0.5]:
+            in_flight.remove(update)
             sequence, then_ns, state = update
             if sequence > received:
                 received, x_c = sequence, expm(H * (t_ns - then_ns) * NS) @ state

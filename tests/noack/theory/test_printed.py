@@ -11,9 +11,9 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from cosim.simulation.continuous.continuous_run import ContinuousRun
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
-from noack.theory.certificate import Conditions, VoidError
+from noack.theory.certificate import NetworkConditions, VoidError
 from noack.theory.paper_bounds import Interval, Theorem2, longest_interval_s, theorem_1, theorem_2
 from tests.noack.theory.exact_loops import loop_of, observe
 from tests.noack.theory.loops import System, systems
@@ -33,13 +33,13 @@ def norm(matrix: Matrix) -> float:
 def uniform_delta(system: System) -> float:
     """Δ that holds for every run, from (I1)."""
     try:
-        return system.certify(Conditions(system.mansd)).delta
+        return system.certify(NetworkConditions(system.mansd)).delta
     except VoidError:
         assume(False)
         raise
 
 
-def of(system: System) -> tuple[Loop, Theorem2]:
+def of(system: System) -> tuple[LoopMatrices, Theorem2]:
     loop = loop_of(system)
     found = theorem_2(loop, system.beta, system.alpha, uniform_delta(system))
     assert found is not None
@@ -101,7 +101,9 @@ def test_where_f_bar_is_negative_the_time_is_that_of_the_far_future() -> None:
     """From x(0) = 0, F grows with t_i, and its limit is what bounds it."""
     one = np.ones((1, 1))
     names = ("x",)
-    loop = Loop(one, one, -3 * one, -2 * one, 1.2 * one, one, np.zeros(1), None, names, names)
+    loop = LoopMatrices(
+        one, one, -3 * one, -2 * one, 1.2 * one, one, np.zeros(1), None, names, names
+    )
     beta, alpha, delta = 0.1, 0.5, 3.0
     found = theorem_2(loop, beta, alpha, delta)
     assert found is not None
@@ -121,7 +123,7 @@ def test_where_f_bar_is_negative_the_time_is_that_of_the_far_future() -> None:
 def test_theorem_2_presupposes_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
     one = np.ones((1, 1))
     names = ("x",)
-    loop = Loop(one, one, -3 * one, -2 * one, one, one, np.ones(1), None, names, names)
+    loop = LoopMatrices(one, one, -3 * one, -2 * one, one, one, np.ones(1), None, names, names)
     assert theorem_2(loop, 0.1, 1.99, 1.0) is not None
     assert theorem_2(loop, 0.1, 2.0, 1.0) is None
     assert theorem_2(loop, 0.1, 0.0, 1.0) is None

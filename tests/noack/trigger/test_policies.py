@@ -87,7 +87,7 @@ def test_the_dynamic_rule_saves_and_spends(
     samples: list[tuple[Vector, Vector]], theta_s: float
 ) -> None:
     """η between samples as the solution of η̇ = −λη + w with w held."""
-    policy = DynamicTrigger(0.3, theta_s, 0.8, P, Q, BK, first_reserve=0.2)
+    policy = DynamicTrigger(0.3, theta_s, 0.8, P, Q, BK, initial_dynamic_variable=0.2)
     trigger, eta, w = Trigger(policy), 0.2, 0.0
     trigger.start(0, np.zeros(2))
     for number, (x, e) in enumerate(samples, 1):
@@ -103,7 +103,9 @@ def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
     """Girard (2015), Proposition: with any η ≥ 0, an event is also one of the rule w < 0."""
     rng = np.random.default_rng(1)
     for _ in range(200):
-        trigger = Trigger(DynamicTrigger(0.3, 1.0, 0.5, P, Q, BK, first_reserve=rng.uniform(0, 1)))
+        trigger = Trigger(
+            DynamicTrigger(0.3, 1.0, 0.5, P, Q, BK, initial_dynamic_variable=rng.uniform(0, 1))
+        )
         trigger.start(0, rng.normal(size=2))
         x, e = rng.normal(size=(2, 2))
         if trigger.test(MS, x, e).event:
@@ -169,7 +171,7 @@ def test_a_self_triggered_error_stays_below_the_threshold(
 ) -> None:
     """The extreme error d|e|/dt = L|e| + a|x| + b reaches it at the event, and not before."""
     policy = SelfTrigger(0.5, 0.25, floor, L, a, b, shortest_ns=1000, longest_ns=10 * S)
-    event_s = policy.guards(len(x)).after(t_s * 1e9, x).latest_ns * 1e-9
+    event_s = policy.trigger_rule(len(x)).after(t_s * 1e9, x).latest_ns * 1e-9
     tau_s = event_s - t_s
 
     def error(tau: float) -> float:

@@ -8,7 +8,7 @@ import pytest
 
 from noack.config.scenario_file import validate
 from noack.core.errors import CallerError
-from noack.trigger.trigger_condition import Form
+from noack.trigger.trigger_condition import QuadraticForm
 
 DYNAMIC = {"policy": "dynamic", "sigma": 0.5, "theta_s": 0.5, "decay_per_s": 0.5}
 RULE = {"policy": "quadratic", "Q": [[0.0] * 4] * 4, "period_s": 0.003}
@@ -45,5 +45,5 @@ def test_a_mistake_names_the_key_where_it_lies(
 
 
 def test_what_a_diverging_loop_saves_up_is_infinite_and_no_exception() -> None:
-    form = Form(np.eye(2), np.zeros((0, 2)))
+    form = QuadraticForm(np.eye(2), np.zeros((0, 2)))
     assert form.value(np.array([1e200, 0.0])) == math.inf

@@ -29,7 +29,7 @@ _BEHIND_M, _AHEAD_M, _HIGH_M = 9.0, 15.0, 5.7
 _GLASS: Colour = (58, 62, 70)
 
 
-class Place(NamedTuple):
+class VehiclePose(NamedTuple):
     """Where a vehicle's own state z has what the picture shows, as indices."""
 
     x_position: int
@@ -42,7 +42,7 @@ class Place(NamedTuple):
     """Heading, rad."""
 
 
-class Lane:
+class LanePicture:
     """A car on a straight lane, by its lateral offset and yaw.
 
     Args:
@@ -58,7 +58,7 @@ class Lane:
     trails: tuple[str, ...] = ()
 
     def __init__(
-        self, lateral: int, yaw: int, *, forward_mps: float = 0.0, place: Place | None = None
+        self, lateral: int, yaw: int, *, forward_mps: float = 0.0, place: VehiclePose | None = None
     ) -> None:
         self._lateral, self._yaw = lateral, yaw
         self._forward_mps, self._place = forward_mps, place

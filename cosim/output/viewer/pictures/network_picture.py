@@ -70,7 +70,7 @@ class _Flying(NamedTuple):
 _NONE = np.zeros(0, np.int64)
 
 
-class Diagram:
+class NetworkDiagram:
     """Boxes, the ways between them, and packets.
 
     Args:

@@ -26,7 +26,7 @@ _WIDTHS: Mapping[str, float] = {"plant": 0.075, "sensor": 0.022, "controller": 0
 _ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 
 
-class Pendulum:
+class PendulumPicture:
     """Poles and carts: the plant's solid, the sensor model's in outline, the controller's dashed.
 
     Args:

@@ -29,7 +29,7 @@ _ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0.014}
 
 
-class Phase:
+class PhasePicture:
     """The first state to the right, the second up, with a trail of the last seconds.
 
     Args:

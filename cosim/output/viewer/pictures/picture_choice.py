@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cosim.output.viewer.pictures.lane_picture import Lane, Place
-from cosim.output.viewer.pictures.pendulum_picture import Pendulum
-from cosim.output.viewer.pictures.phase_picture import Phase
+from cosim.output.viewer.pictures.lane_picture import LanePicture, VehiclePose
+from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
+from cosim.output.viewer.pictures.phase_picture import PhasePicture
 from cosim.output.viewer.pictures.picture import Picture, Reals
-from cosim.output.viewer.pictures.quadrotor_picture import Quadrotor
-from cosim.output.viewer.pictures.tanks_picture import Tanks
-from noack.config.plant_systems import CartPole
-from noack.config.resolution import Loop, loop_of
+from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
+from cosim.output.viewer.pictures.tanks_picture import TanksPicture
+from noack.config.plant_systems import CartPoleSettings
+from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Propagator
 
@@ -26,19 +26,19 @@ def picture_of(scenario: Scenario) -> Picture:
     kind: str = system.kind
     own = system.internal_names
     reach = reach_of(loop, scenario.horizon_ns)
-    if isinstance(system, CartPole):
-        return Pendulum(0, 2, reach_m=float(reach[0]), pole_m=2 * system.length_m)
+    if isinstance(system, CartPoleSettings):
+        return PendulumPicture(0, 2, reach_m=float(reach[0]), pole_m=2 * system.length_m)
     if kind == "quadrotor":
-        return Quadrotor(range(6), float(reach[:3].max()))
+        return QuadrotorPicture(range(6), float(reach[:3].max()))
     if kind == "four_tank" and (at := _places(own, _LEVELS)):
-        return Tanks(range(4), at)
-    if kind == "vehicle" and (at := _places(own, Place._fields)):
+        return TanksPicture(range(4), at)
+    if kind == "vehicle" and (at := _places(own, VehiclePose._fields)):
         # x is that of the lane models: V, r, psi, Y_g.
-        return Lane(3, 2, forward_mps=float(loop.A_model[3, 2]), place=Place(*at))
+        return LanePicture(3, 2, forward_mps=float(loop.A_model[3, 2]), place=VehiclePose(*at))
     return _of_states(loop, reach)
 
 
-def reach_of(loop: Loop, horizon_ns: int) -> Reals:
+def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
     """How far each state goes from 0 in the model's closed loop from x(0), and some room, (n,).
 
     Where a state stays at 0, it is given 1.
@@ -56,19 +56,19 @@ def reach_of(loop: Loop, horizon_ns: int) -> Reals:
     return np.where(known, _ROOM * reach, 1.0)
 
 
-def _of_states(loop: Loop, reach: Reals) -> Picture:
+def _of_states(loop: LoopMatrices, reach: Reals) -> Picture:
     """The picture of a plant that is known by what its states are called."""
     names = loop.state_names
     if at := _places(names, ("psi", "Y_g")):
         # The paper's dY_g/dt = V + U ψ.
-        return Lane(at[1], at[0], forward_mps=float(loop.A_model[at[1], at[0]]))
+        return LanePicture(at[1], at[0], forward_mps=float(loop.A_model[at[1], at[0]]))
     if at := _places(names, ("position", "angle")):
-        return Pendulum(at[0], at[1], reach_m=float(reach[at[0]]))
+        return PendulumPicture(at[0], at[1], reach_m=float(reach[at[0]]))
     if at := _places(names, ("angle",)):
-        return Pendulum(None, at[0])
+        return PendulumPicture(None, at[0])
     if at := _places(names, ("position", "velocity")):
-        return Pendulum(at[0], None, reach_m=float(reach[at[0]]))
-    return Phase(names, reach)
+        return PendulumPicture(at[0], None, reach_m=float(reach[at[0]]))
+    return PhasePicture(names, reach)
 
 
 def _places(names: Sequence[str], wanted: Sequence[str]) -> tuple[int, ...]:

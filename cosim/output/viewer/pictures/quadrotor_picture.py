@@ -23,7 +23,7 @@ _ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 _WIDTHS: Mapping[str, float] = {"plant": 0.2, "sensor": 0.06, "controller": 0.09}
 
 
-class Quadrotor:
+class QuadrotorPicture:
     """Two drawings side by side: from above (x to the right, y up) and from the side (x and z).
 
     Args:

@@ -27,7 +27,7 @@ _STYLES: Mapping[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-class Tanks:
+class TanksPicture:
     """Levels as bars; the models' as a line each, which goes beyond the tank on its own side.
 
     Args:

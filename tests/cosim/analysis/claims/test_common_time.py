@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
 from cosim.record.run_record import RunRecord
@@ -49,7 +49,7 @@ def test_the_time_beyond_the_common_end_would_void_claims(run: RunRecord) -> Non
     """The controller stops first: the plant goes on with its last input."""
     times = dict.fromkeys(LOOP_ROLES, STOP_NS + APART_NS) | {"controller": STOP_NS}
     cut = stopped(run, times)
-    assert ClaimVerdict.VOID in {claim.verdict for claim in Claims(cut).judge()}
+    assert ClaimVerdict.VOID in {claim.verdict for claim in ClaimEvaluation(cut).judge()}
     assert ClaimVerdict.VOID not in {claim.verdict for claim in RunClaims(cut).judge()}
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.claim_evaluation import Claim, Claims, ClaimVerdict, as_json
+from cosim.analysis.claims.claim_evaluation import Claim, ClaimEvaluation, ClaimVerdict, as_json
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -36,7 +36,7 @@ CERTIFIED = (
 
 
 def certified(record: RunRecord) -> dict[str, Claim]:
-    return {c.what: c for c in Claims(record).judge() if c.source == "certificate"}
+    return {c.what: c for c in ClaimEvaluation(record).judge() if c.source == "certificate"}
 
 
 def verdicts(record: RunRecord) -> dict[str, ClaimVerdict]:
@@ -44,7 +44,7 @@ def verdicts(record: RunRecord) -> dict[str, ClaimVerdict]:
 
 
 def from_I1(record: RunRecord) -> list[Claim]:
-    return [claim for claim in Claims(record).judge() if claim.source == "(I1)"]
+    return [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
 
 
 # --- held -----------------------------------------------------------------------------------------
@@ -52,7 +52,7 @@ def from_I1(record: RunRecord) -> list[Claim]:
 
 def test_a_run_that_keeps_to_its_schedule_holds_what_is_certified(run: RunRecord) -> None:
     assert verdicts(run) == dict.fromkeys(CERTIFIED, HELD)
-    for claim in Claims(run).judge():
+    for claim in ClaimEvaluation(run).judge():
         assert claim.since_s is None
         assert claim.ratio is not None
         assert 0 <= claim.ratio <= 1
@@ -127,7 +127,7 @@ def test_a_printed_bound_that_is_exceeded_is_not_refuted(make: Make) -> None:
     lossy = {"loss": {"model": "worst_case"}}
     seldom = make(plant={"measure_every": 20}, network=lossy, trigger={"beta": 1e-3})
     record = simulate(seldom)
-    printed = {c.source: c for c in Claims(record).judge()}
+    printed = {c.source: c for c in ClaimEvaluation(record).judge()}
     exceeded = printed["eq:LossEv3"]
     assert exceeded.verdict is ClaimVerdict.NOT_APPLICABLE
     assert exceeded.ratio is not None
@@ -186,7 +186,7 @@ def test_a_run_that_diverges_is_void_where_it_was_promised_nothing(make: Make) -
         )
     )  # fmt: skip
     with np.errstate(all="ignore"):
-        claims = Claims(record)
+        claims = ClaimEvaluation(record)
         document = as_json(claims.judge())
         envelopes = claims.envelopes()
     assert {claim["verdict"] for claim in document if claim["source"] == "certificate"} == {"void"}
@@ -203,8 +203,8 @@ def without(run: RunRecord, *processes: str) -> RunRecord:
 
 
 def test_nothing_is_claimed_of_a_run_without_measurements(run: RunRecord) -> None:
-    assert Claims(without(run, "sensor")).judge() == []
-    assert Claims(without(run, "sensor", "plant", "controller", "netem")).judge() == []
+    assert ClaimEvaluation(without(run, "sensor")).judge() == []
+    assert ClaimEvaluation(without(run, "sensor", "plant", "controller", "netem")).judge() == []
 
 
 @pytest.mark.parametrize("process", ["plant", "controller"])
@@ -243,7 +243,7 @@ def test_a_controller_that_dies_makes_claims_void_rather_than_violated(make: Mak
 
 
 def test_envelopes_are_at_the_measurements(run: RunRecord) -> None:
-    claims = Claims(run)
+    claims = ClaimEvaluation(run)
     k = len(run[SENSOR_MEASUREMENT])
     found = {(e.label, e.quantity): e for e in claims.envelopes()}
     for envelope in found.values():
@@ -263,9 +263,9 @@ def test_a_long_run_s_clock_does_not_violate_the_distance_of_events(run: RunReco
     """At 1e7 s, a float tells apart 2 ns: differences are taken of whole nanoseconds."""
     rows = run[SENSOR_MEASUREMENT].copy()
     rows["t_ns"] += 10**16
-    shifted = Claims(changed(run, **{SENSOR_MEASUREMENT: rows}))
+    shifted = ClaimEvaluation(changed(run, **{SENSOR_MEASUREMENT: rows}))
     _, passed_s = shifted._inter_event_s
-    np.testing.assert_array_equal(passed_s, Claims(run)._inter_event_s[1])
+    np.testing.assert_array_equal(passed_s, ClaimEvaluation(run)._inter_event_s[1])
 
 
 def test_numbers_that_are_none_are_null() -> None:
@@ -351,7 +351,7 @@ def test_no_simulated_run_violates_its_certificate() -> None:
     )  # fmt: skip
     @given(scenarios(), st.integers(0, 2**32))
     def check(resolved: Scenario, seed: int) -> None:
-        claims = Claims(simulate(resolved, hostile(resolved, seed)))
+        claims = ClaimEvaluation(simulate(resolved, hostile(resolved, seed)))
         for claim in claims.judge():
             if claim.source in ("certificate", "(I1)"):
                 assert claim.verdict is not VIOLATED, claim
@@ -370,7 +370,7 @@ def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
     record = simulate(
         make(network={"loss": {"model": "worst_case"}, "enforce_mansd": False, "mansd": 2})
     )
-    claims = Claims(record).judge()
+    claims = ClaimEvaluation(record).judge()
     since = {claim.since_s for claim in claims if claim.verdict is VOID}
     theorems = [claim for claim in claims if claim.source.startswith("Theorem")]
     assert theorems
@@ -385,7 +385,7 @@ def test_too_many_dropouts_void_the_paper_s_theorems_too(make: Make) -> None:
 def test_nothing_at_all_is_within_every_bound(make: Make) -> None:
     """x(0) = 0: every error, and the bounds that follow from the errors, are 0 all along."""
     record = simulate(make(plant={"initial_state": [0.0, 0.0]}))
-    for claim in Claims(record).judge():
+    for claim in ClaimEvaluation(record).judge():
         assert claim.verdict is HELD, claim
         assert claim.ratio is None or claim.ratio <= 1
 
@@ -397,7 +397,7 @@ def test_what_is_not_on_record_is_not_held(run: RunRecord) -> None:
         run, controller_step=ticks[ticks["t_ns"] < 2_000_000_000],
         controller_delivery=taken[taken["now_ns"] < 2_000_000_000],
     )  # fmt: skip
-    unknown = [c for c in Claims(cut).judge() if "e_c" in c.bound or c.source == "(I1)"]
+    unknown = [c for c in ClaimEvaluation(cut).judge() if "e_c" in c.bound or c.source == "(I1)"]
     assert unknown
     for claim in unknown:
         assert claim.verdict is not HELD
@@ -411,6 +411,6 @@ def test_a_state_beyond_floating_point_is_not_held(make: Make) -> None:
         plant={"A": [[400.0, 0.0], [0.0, 0.0]]}, horizon_s=2.0,
     )  # fmt: skip
     with np.errstate(all="ignore"):
-        claims = Claims(simulate(unstable)).judge()
+        claims = ClaimEvaluation(simulate(unstable)).judge()
     assert claims
     assert all(claim.verdict is not HELD for claim in claims), claims

@@ -9,10 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.assumption_monitor import Guard
-from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
-from cosim.analysis.claims.condition_reader import Observer, observe
-from cosim.analysis.claims.observed_conditions import Departure, Observed, Series
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
+from cosim.analysis.claims.observed_conditions import (
+    AssumptionViolation,
+    ObservedConditions,
+    SampledSeries,
+)
 from cosim.record.run_record import Rows, RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.scenario import Scenario
@@ -53,9 +57,11 @@ def batches(record: RunRecord, seed: int) -> Batches:
             yield None
 
 
-def guarded(record: RunRecord, seed: int = 0) -> tuple[Guard, list[Departure]]:
+def guarded(
+    record: RunRecord, seed: int = 0
+) -> tuple[AssumptionMonitor, list[AssumptionViolation]]:
     """A guard that has seen a run as it went on, and what it said."""
-    guard, said = Guard(record.scenario), []
+    guard, said = AssumptionMonitor(record.scenario), []
     for batch in batches(record, seed):
         if batch is None:
             said += guard.advance()
@@ -112,13 +118,13 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
     @given(scenarios(make), st.integers(0, 2**32))
     def check(resolved: Scenario, seed: int) -> None:
         record = spoilt(simulate(resolved, hostile(seed)), seed)
-        observer, parts = Observer(resolved), []
+        observer, parts = ConditionReader(resolved), []
         for batch in batches(record, seed):
             if batch is None:
                 parts.append(observer.observed())
             else:
                 observer.take(*batch)
-        whole, found = observe(record), joined([*parts, observer.end()])
+        whole, found = read_conditions(record), joined([*parts, observer.end()])
         for one, other in zip(found[1:4], whole[1:4], strict=True):
             np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(found.losses, whole.losses)
@@ -139,10 +145,10 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
 SERIES = ("sampling", "delay", "hold", "watchdog", "safe_input", "restarts")
 
 
-def joined(parts: list[Observed]) -> Observed:
-    def series(name: str) -> Series:
+def joined(parts: list[ObservedConditions]) -> ObservedConditions:
+    def series(name: str) -> SampledSeries:
         found = [getattr(part, name) for part in parts]
-        return Series(*(np.concatenate([one[i] for one in found]) for i in range(2)))
+        return SampledSeries(*(np.concatenate([one[i] for one in found]) for i in range(2)))
 
     losses = [part.losses for part in parts]
     return parts[-1]._replace(
@@ -257,7 +263,7 @@ def test_claims_are_void_from_the_moment_on_and_for_the_reason_that_the_guard_sa
     leave: Callable[[Make], tuple[RunRecord, float]], why: str, make: Make
 ) -> None:
     record, when_s = leave(make)
-    judged = [claim for claim in Claims(record).judge() if claim.source == "certificate"]
+    judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "certificate"]
     assert {claim.verdict for claim in judged} == {ClaimVerdict.VOID}
     # Of ‖e_c‖ nothing is on record while there is no controller.
     claims = [claim for claim in judged if "e_c" not in claim.bound]
@@ -285,7 +291,7 @@ def test_a_number_that_is_none_is_no_measurement(make: Make) -> None:
     guard, said = guarded(record)
     assert ("sampling", pytest.approx(last_s)) in [(one.cause, one.t_s) for one in said]
     with np.errstate(all="ignore"):
-        judged = [claim for claim in Claims(record).judge() if claim.source == "(I1)"]
+        judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
     assert guard.left is not None
     for claim in judged:
         assert claim.verdict is ClaimVerdict.VOID
@@ -310,9 +316,9 @@ def test_nothing_is_said_of_what_is_claimed_nowhere(make: Make) -> None:
 
 
 def _absolute(make: Make) -> Scenario:
-    from noack.config.triggers import Absolute
+    from noack.config.triggers import AbsoluteSettings
 
-    return make().model_copy(update={"trigger": Absolute(policy="absolute", delta=0.02)})
+    return make().model_copy(update={"trigger": AbsoluteSettings(policy="absolute", delta=0.02)})
 
 
 # --- it is said in time, and costs little memory --------------------------------------------------
@@ -321,7 +327,7 @@ def _absolute(make: Make) -> Scenario:
 def test_an_input_that_is_too_old_is_told_while_the_controller_stands_still(make: Make) -> None:
     """Nothing of the controller's own rows is needed for that."""
     record = with_outage(make(), 2.0, 3.0)
-    guard, said = Guard(record.scenario), []
+    guard, said = AssumptionMonitor(record.scenario), []
     for table in record.tables:
         of_controller = OWNER[table] == "controller"
         rows = record[table]
@@ -332,7 +338,7 @@ def test_an_input_that_is_too_old_is_told_while_the_controller_stands_still(make
 
 def test_losses_are_told_once_the_network_has_said_so(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: None if n >= 10 else 0))
-    guard = Guard(record.scenario)
+    guard = AssumptionMonitor(record.scenario)
     until_ns = event_s(record, 13) * 1e9
     for table in record.tables:
         guard.take(table, record[table][record[table]["now_ns"] < until_ns])
@@ -343,7 +349,7 @@ def test_losses_are_told_once_the_network_has_said_so(make: Make) -> None:
 def test_only_what_waits_is_kept(make: Make) -> None:
     """In a run of any length: here every 0.5 s, all processes together."""
     record = simulate(make(horizon_s=30.0, trigger={"beta": 1e-9}), hostile(1))
-    guard, waiting = Guard(record.scenario), []
+    guard, waiting = AssumptionMonitor(record.scenario), []
     for end_ns in range(500_000_000, 30_500_000_000, 500_000_000):
         for table in record.tables:
             t_ns = record[table]["now_ns"]
@@ -356,7 +362,7 @@ def test_only_what_waits_is_kept(make: Make) -> None:
 def test_a_guard_gives_up_rather_than_keep_everything(make: Make) -> None:
     """The controller is not heard of for a quarter of an hour."""
     record = simulate(make(trigger={"beta": 1e-9}, network={"initial_sync": "known_state"}))
-    guard, sensor = Guard(record.scenario), record[SENSOR_MEASUREMENT].copy()
+    guard, sensor = AssumptionMonitor(record.scenario), record[SENSOR_MEASUREMENT].copy()
     sensor["event"] = np.arange(len(sensor))
     for number in range(200):
         rows = sensor.copy()
@@ -374,8 +380,8 @@ def test_what_was_violated_before_stays_violated(make: Make) -> None:
     record, _ = slow_controller(make)
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["e_s_norm"][100] = 5.0
-    claims = {c.what: c for c in Claims(changed(record, **{SENSOR_MEASUREMENT: rows})).judge()
-              if c.source == "certificate"}  # fmt: skip
+    judged = ClaimEvaluation(changed(record, **{SENSOR_MEASUREMENT: rows})).judge()
+    claims = {c.what: c for c in judged if c.source == "certificate"}  # fmt: skip
     violated = claims["the sensor's error follows its threshold"]
     assert (violated.verdict, violated.since_s) == (ClaimVerdict.VIOLATED, pytest.approx(1.0))
     assert claims["the controller's error is bounded"].verdict is ClaimVerdict.VOID

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.condition_reader import observe
-from cosim.analysis.claims.observed_conditions import Observed
+from cosim.analysis.claims.condition_reader import read_conditions
+from cosim.analysis.claims.observed_conditions import ObservedConditions
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.scenario import Scenario
@@ -21,19 +21,19 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
     tables,
 )
-from noack.theory.certificate import Conditions
+from noack.theory.certificate import NetworkConditions
 from noack.theory.run_conditions import nominal_conditions
 from tests.cosim.analysis.claims.conftest import Make, changed, network_of
 
 PERIODS_NS = [1_000_000, 2_000_000, 3_000_000, 5_000_000, 7_000_000, 2_020_000, 13_370_000]
 
 
-def allowed(record: RunRecord) -> Conditions:
+def allowed(record: RunRecord) -> NetworkConditions:
     return nominal_conditions(record.scenario, 0)
 
 
 def left(record: RunRecord) -> tuple[float, str]:
-    found = observe(record).left(allowed(record))
+    found = read_conditions(record).left(allowed(record))
     assert found is not None
     return found
 
@@ -66,7 +66,7 @@ def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make
     def check(step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> None:
         resolved = busy(step_ns, tick_ns, every, phase, sync, 0.3, make)
         record = simulate(resolved)
-        assert observe(record).left(nominal_conditions(resolved, 0)) is None
+        assert read_conditions(record).left(nominal_conditions(resolved, 0)) is None
 
     check()
 
@@ -87,7 +87,10 @@ def test_a_schedule_s_worst_case_really_happens(
 ) -> None:
     """What is presupposed is what occurs, to the nanosecond: nothing is allowed for nothing."""
     resolved = busy(step_ns, tick_ns, every, phase, "first_packet", 1.5, make)
-    seen, presupposed = observe(simulate(resolved)).summary(), nominal_conditions(resolved, 0)
+    seen, presupposed = (
+        read_conditions(simulate(resolved)).summary(),
+        nominal_conditions(resolved, 0),
+    )
     for name in ("sampling_s", "delay_s", "hold_s", "start_s"):
         assert seen[name] == pytest.approx(getattr(presupposed, name), abs=1e-12), name
 
@@ -127,7 +130,7 @@ def test_too_many_losses_in_a_row_are_told_at_the_one_too_many(make: Make) -> No
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 10))
     assert why == "4 updates lost in a row, 2 allowed"
-    assert observe(record).summary()["dropouts"] == 4
+    assert read_conditions(record).summary()["dropouts"] == 4
 
 
 def test_losses_of_the_end_count_although_nothing_follows_them(make: Make) -> None:
@@ -158,10 +161,10 @@ def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
     resolved = make()
     allowance_s = 0.4
     record = simulate(resolved, network_of(lambda n: 500 if n % 2 else 0))
-    observed = observe(record)
+    observed = read_conditions(record)
     taken = set(record[CONTROLLER_DELIVERY]["sequence"].tolist())
-    overtaken = [n for n in range(len(observed.losses.t_s) - 2) if n not in taken]
-    assert overtaken
+    delivered_out_of_order = [n for n in range(len(observed.losses.t_s) - 2) if n not in taken]
+    assert delivered_out_of_order
     assert observed.losses.runs(0.0).largest() == 1
     assert observed.losses.runs(allowance_s).largest() == 0
 
@@ -197,7 +200,7 @@ def held(run: RunRecord, first: int, last: int, by: int) -> RunRecord:
 
 
 def test_an_old_input_is_told_when_it_is_too_old(run: RunRecord) -> None:
-    assert observe(run).summary()["hold_s"] == pytest.approx(0.015)
+    assert read_conditions(run).summary()["hold_s"] == pytest.approx(0.015)
     assert left(held(run, 200, 210, 3)) == (
         pytest.approx(2.0), "an input was 0.045 s old, 0.015 s allowed",
     )  # fmt: skip
@@ -205,7 +208,7 @@ def test_an_old_input_is_told_when_it_is_too_old(run: RunRecord) -> None:
 
 def test_an_input_of_the_future_is_too_far_from_now_as_well(run: RunRecord) -> None:
     """A plant that is late by 3.5 steps latches what the controller meant for later."""
-    assert observe(held(run, 200, 203, -2)).left(allowed(run)) is None
+    assert read_conditions(held(run, 200, 203, -2)).left(allowed(run)) is None
     assert left(held(run, 200, 203, -4)) == (
         pytest.approx(2.0), "an input was 0.035 s old, 0.015 s allowed",
     )  # fmt: skip
@@ -225,7 +228,7 @@ def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
     for sync in ("first_packet", "known_state"):
         resolved = make(network={"initial_sync": sync})
         record = simulate(resolved, network_of(lambda n: 500 if n < 3 else 0))
-        found = observe(record)
+        found = read_conditions(record)
         if sync == "known_state":  # nobody has to tell the controller where to begin
             assert found.start_s == pytest.approx(0.01)
             continue
@@ -239,7 +242,7 @@ def test_what_the_start_brings_late_is_the_start_s(make: Make) -> None:
     """The first update, 60 ms late, is felt with the first input of all."""
     record = simulate(make(trigger={"beta": 0.1}), network_of(lambda n: 0 if n else 60))
     assert event_s(record, 1) > 0.07
-    found = observe(record)
+    found = read_conditions(record)
     assert found.start_s == pytest.approx(0.07)
     assert found.delay.largest() == pytest.approx(0.01)
 
@@ -261,14 +264,14 @@ def test_without_a_process_nothing_is_certain(run: RunRecord, process: str) -> N
 def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
     run: RunRecord,
 ) -> None:
-    whole, blind = observe(run), observe(without(run, "netem"))
+    whole, blind = read_conditions(run), read_conditions(without(run, "netem"))
     assert blind.losses.runs(0.0).largest() == whole.losses.runs(0.0).largest() == 2
     assert blind.hold.largest() == whole.hold.largest()
 
 
 def test_an_empty_record_has_conditions_too(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
-    found = observe(empty)
+    found = read_conditions(empty)
     assert set(found.summary().values()) == {None}
     assert found.left(allowed(run)) is not None
 
@@ -289,7 +292,7 @@ def test_a_controller_that_died_holds_its_last_input_for_ever(make: Make) -> Non
         until(changed(run, **{PLANT_STEP: steps}), died_s, PLANT_ACTUATION),
         known_s, CONTROLLER_STEP, CONTROLLER_DELIVERY,
     )  # fmt: skip
-    found = observe(record)
+    found = read_conditions(record)
     assert found.hold.largest() == pytest.approx(6.01 - 2.985)  # the last tick before it died
     limit = allowed(run)
     late = found.hold.t_s[found.hold.value > limit.hold_s + 1e-9]
@@ -300,7 +303,9 @@ def test_ticks_that_nobody_knows_are_as_old_as_can_be(run: RunRecord) -> None:
     ticks, inputs = run[CONTROLLER_STEP], run[PLANT_ACTUATION]
     gap = slice(300, 310)
     record = changed(run, **{CONTROLLER_STEP: np.delete(ticks, gap)})
-    assert observe(record).hold.largest() == pytest.approx(0.015)  # the plant knows when they were
+    assert read_conditions(record).hold.largest() == pytest.approx(
+        0.015
+    )  # the plant knows when they were
     record = changed(record, **{PLANT_ACTUATION: np.delete(inputs, gap)})
     when_s, why = left(record)
     assert when_s == pytest.approx(3.01)
@@ -317,7 +322,7 @@ def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) ->
         )
     )  # fmt: skip
     with np.errstate(all="ignore"):
-        found: Observed = observe(record)
+        found: ObservedConditions = read_conditions(record)
     when_s, _ = found.left(allowed(record)) or (np.nan, "")
     assert when_s <= 0.4
     assert found.sampling.largest() == pytest.approx(0.65, abs=0.02)
@@ -327,12 +332,12 @@ def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
     resolved = make()
     n, m = 2, 1
     rows = {table: np.zeros(0, dtype) for table, dtype in tables(n, m).items()}
-    found = observe(RunRecord(resolved, rows, [], {}))
+    found = read_conditions(RunRecord(resolved, rows, [], {}))
     assert found.start_s == np.inf
     assert found.losses.runs(0.0).largest() is None
     one = rows | {PLANT_STEP: np.zeros(1, tables(n, m)[PLANT_STEP])}
     one[PLANT_STEP]["actuation"] = NO_SEQUENCE
-    assert observe(RunRecord(resolved, one, [], {})).start_s == np.inf
+    assert read_conditions(RunRecord(resolved, one, [], {})).start_s == np.inf
     assert NETEM_PACKET in rows
 
 
@@ -345,4 +350,4 @@ def test_what_is_overtaken_as_the_run_ends_is_not_lost(make: Make) -> None:
     record = simulate(busy, network_of(lambda n: 18 if n == late else 0))
     assert late not in record[CONTROLLER_DELIVERY]["sequence"]
     assert late + 1 in record[CONTROLLER_DELIVERY]["sequence"]
-    assert observe(record).losses.runs(0.02).largest() == 0
+    assert read_conditions(record).losses.runs(0.02).largest() == 0

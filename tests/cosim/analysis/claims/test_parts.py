@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.assumption_monitor import Guard
-from cosim.analysis.claims.claim_evaluation import Claims, ClaimVerdict
+from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims, _start_error
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -37,7 +37,7 @@ def run_with(*changes: tuple[float, dict[str, Any]], **more: Any) -> RunRecord:
 
 def test_without_changes_the_claims_are_those_of_the_run() -> None:
     record = run_with()
-    assert RunClaims(record).judge() == Claims(record).judge()
+    assert RunClaims(record).judge() == ClaimEvaluation(record).judge()
 
 
 def test_a_change_of_the_loss_alone_touches_no_claim() -> None:
@@ -60,7 +60,7 @@ def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
     assert [one.what for one in before] == [one.what for one in after]
     delta = {one.what: one.certified for one in after}["the controller's error is bounded"]
     # βe^{−αt} in the run's own time: what is certified of its first instant is of that threshold.
-    own = next(part for part in RunClaims(record).parts[1:] if isinstance(part, Claims))
+    own = next(part for part in RunClaims(record).parts[1:] if isinstance(part, ClaimEvaluation))
     beta = 0.04 * np.exp(-0.2 * first_s)
     assert own.record.scenario.decaying.beta == pytest.approx(beta)
     envelope = own.certificates[0].controller_error(np.zeros(1))
@@ -68,7 +68,7 @@ def test_what_follows_a_change_is_judged_as_a_run_of_its_own() -> None:
     # One more may be lost in a row, and is one more that may be missing.
     missing = [
         part.certificates[0].constants for part in RunClaims(record).parts
-        if isinstance(part, Claims)
+        if isinstance(part, ClaimEvaluation)
     ]  # fmt: skip
     assert missing[0] is not None
     assert missing[1] is not None
@@ -97,10 +97,10 @@ def test_two_set_points_at_once_are_neither() -> None:
     # Who reads the deviations from the wrong one sees a state that never decays.
     record = run_with((0.0, {"controller.setpoint": [3.0, 0.0]}), horizon_s=12.0)
     (first, own) = RunClaims(record).parts
-    assert isinstance(own, Claims)
+    assert isinstance(own, ClaimEvaluation)
     assert np.abs(own.record[PLANT_STEP]["x"][-1]).max() < 0.05
     assert np.abs(record[PLANT_STEP]["x"][-1]).max() > 2.9
-    assert isinstance(first, Claims)
+    assert isinstance(first, ClaimEvaluation)
     assert first.judge() == [] or all(one.ratio is None for one in first.judge())
 
 
@@ -143,7 +143,7 @@ def test_the_error_of_the_input_at_the_start_is_that_of_the_steps() -> None:
 
 def test_the_guard_says_no_more_of_what_comes_after() -> None:
     record = run_with(network=CONTENT["network"] | {"enforce_mansd": False, "mansd": 0})
-    free, ended = Guard(record.scenario), Guard(record.scenario)
+    free, ended = AssumptionMonitor(record.scenario), AssumptionMonitor(record.scenario)
     ended.end_at(0.0)
     for table in record.tables:
         free.take(table, record[table])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosim.analysis.claims.theorem_one import _longest, theorem_one
-from cosim.record.align import Joined, join_all
+from cosim.record.align import AlignedRun, join_all
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
@@ -21,7 +21,7 @@ def delta_of(record: RunRecord) -> float | None:
     return theorem_one(record, join_all(record))
 
 
-def by_hand(record: RunRecord, joined: Joined, horizon: int = 10**9) -> float:
+def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
     """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the events that are missing after each event.
 
     Here from real intervals, which the theorem's δ̄_j bound from above.

@@ -9,7 +9,7 @@ from cosim.analysis.replay import replay
 from cosim.record.run_record import RunRecord
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.protocol.machine_interface import INCARNATION, RESTART, Start
+from noack.protocol.machine_interface import GENERATION, RESTART, Start
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP
 from tests.cosim.live.outage import Reborn, simulate_with
 
@@ -26,13 +26,13 @@ def test_an_update_before_its_first_tick_is_replayed(content: dict[str, Any], ti
     successor = controller_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "controller", lambda one: Reborn(one, successor, at_ns))
     rows = {table: record[table] for table in record.tables}
-    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= INCARNATION
-    first = taken[taken["input"] == INCARNATION]
+    taken, again = rows[CONTROLLER_DELIVERY], rows[CONTROLLER_STEP]["input"] >= GENERATION
+    first = taken[taken["input"] == GENERATION]
     assert len(first) == 1
     assert first["now_ns"][0] < rows[CONTROLLER_STEP]["t_ns"][again][0]
     if not ticks:  # it died before it had one
         rows[CONTROLLER_STEP] = rows[CONTROLLER_STEP][~again]
-        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= INCARNATION]
+        rows[CONTROLLER_DELIVERY] = taken[taken["input"] <= GENERATION]
     found = replay(RunRecord(resolved, rows, [NOTICE], {}, "live"))
     assert found.bit_exact, found.verdict()
     assert found.verdict()["inputs"] == sum(map(len, rows.values()))

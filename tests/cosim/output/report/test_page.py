@@ -20,7 +20,7 @@ from cosim.output.report import report_file
 from cosim.output.report.figure_files import inline
 from cosim.output.report.report_file import write_report
 from cosim.record.run_directory import REPORT_FILE
-from cosim.record.run_ending import Ending
+from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord
 from noack.config.scenario_file import dumps as scenario_toml
 from noack.core.errors import ExitStatus, MachineError
@@ -363,7 +363,7 @@ def test_a_run_is_none_the_worse_for_a_report_that_fails(
         raise ZeroDivisionError("no such luck")
 
     monkeypatch.setattr(report_file, "write_report", fail)
-    outcome = concluding.conclude(Ending(dead_run, 0, ExitStatus.OK, "horizon"))
+    outcome = concluding.finalize(RunEnding(dead_run, 0, ExitStatus.OK, "horizon"))
     assert "report" not in outcome.reason
     assert (dead_run / "summary.json").is_file()
     assert not (dead_run / REPORT_FILE).exists()

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.output.viewer.pictures.lane_picture import Lane, Place
-from cosim.output.viewer.pictures.network_picture import LEG_S, Diagram
-from cosim.output.viewer.pictures.pendulum_picture import Pendulum
-from cosim.output.viewer.pictures.phase_picture import Phase
+from cosim.output.viewer.pictures.lane_picture import LanePicture, VehiclePose
+from cosim.output.viewer.pictures.network_picture import LEG_S, NetworkDiagram
+from cosim.output.viewer.pictures.pendulum_picture import PendulumPicture
+from cosim.output.viewer.pictures.phase_picture import PhasePicture
 from cosim.output.viewer.pictures.picture import WHO, Columns, Frames, Picture, panel
 from cosim.output.viewer.pictures.picture_choice import picture_of, reach_of
-from cosim.output.viewer.pictures.quadrotor_picture import Quadrotor
-from cosim.output.viewer.pictures.tanks_picture import Tanks
+from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
+from cosim.output.viewer.pictures.tanks_picture import TanksPicture
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Propagator
@@ -24,15 +24,15 @@ from noack.protocol.record_tables import Fate
 ROOT = Path(__file__).parents[4]
 S = 1_000_000_000
 PICTURES: dict[str, tuple[Picture, int, int]] = {
-    "lane": (Lane(3, 2, forward_mps=-12.0), 4, 0),
-    "vehicle": (Lane(3, 2, forward_mps=-15.0, place=Place(0, 1, 2, 4)), 4, 7),
-    "cart and pole": (Pendulum(0, 2, reach_m=1.0, pole_m=0.6), 4, 0),
-    "pendulum": (Pendulum(None, 0), 2, 0),
-    "cart": (Pendulum(0, None, reach_m=30.0), 2, 0),
-    "quadrotor": (Quadrotor(range(6), 1.0), 12, 12),
-    "tanks": (Tanks(range(4), range(4)), 4, 4),
-    "phase": (Phase(["a", "b", "c"], np.ones(3)), 3, 0),
-    "one state": (Phase(["a"], np.ones(1)), 1, 0),
+    "lane": (LanePicture(3, 2, forward_mps=-12.0), 4, 0),
+    "vehicle": (LanePicture(3, 2, forward_mps=-15.0, place=VehiclePose(0, 1, 2, 4)), 4, 7),
+    "cart and pole": (PendulumPicture(0, 2, reach_m=1.0, pole_m=0.6), 4, 0),
+    "pendulum": (PendulumPicture(None, 0), 2, 0),
+    "cart": (PendulumPicture(0, None, reach_m=30.0), 2, 0),
+    "quadrotor": (QuadrotorPicture(range(6), 1.0), 12, 12),
+    "tanks": (TanksPicture(range(4), range(4)), 4, 4),
+    "phase": (PhasePicture(["a", "b", "c"], np.ones(3)), 3, 0),
+    "one state": (PhasePicture(["a"], np.ones(1)), 1, 0),
 }
 
 
@@ -62,12 +62,12 @@ def pose(columns: Columns) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 @pytest.mark.parametrize(
     ("scenario", "kind", "title"),
     [
-        ("lane_following", Lane, "lane"),
-        ("lane_weighted", Lane, "lane"),
-        ("lane_acknowledged", Lane, "lane"),
-        ("unstable_pendulum", Pendulum, "pendulum"),
-        ("cart_pole", Pendulum, "cart and its pole"),
-        ("tabuada_dynamic", Phase, "phase plot"),
+        ("lane_following", LanePicture, "lane"),
+        ("lane_weighted", LanePicture, "lane"),
+        ("lane_acknowledged", LanePicture, "lane"),
+        ("unstable_pendulum", PendulumPicture, "pendulum"),
+        ("cart_pole", PendulumPicture, "cart and its pole"),
+        ("tabuada_dynamic", PhasePicture, "phase plot"),
     ],
 )
 def test_a_plant_has_the_picture_of_its_kind(scenario: str, kind: type, title: str) -> None:
@@ -133,7 +133,7 @@ def test_a_vehicles_own_place_says_where_it_is() -> None:
 
 
 def test_a_pole_falls_to_the_side_of_its_angle() -> None:
-    picture = Pendulum(0, 2)
+    picture = PendulumPicture(0, 2)
     x = np.array([[0.5, 0.0, 0.1, 0.0]])
     moved = picture.frames(Frames(np.zeros(1), x, x, x))
     assert pose(moved["plant"])[0].tolist() == [[0.5, 0.0]]
@@ -144,7 +144,7 @@ def test_a_pole_falls_to_the_side_of_its_angle() -> None:
 def test_levels_are_as_high_as_they_are() -> None:
     frames = frames_of(4, 4)
     z = np.full((7, 4), 10.0)
-    moved = Tanks(range(4), range(4)).frames(frames._replace(z=z))
+    moved = TanksPicture(range(4), range(4)).frames(frames._replace(z=z))
     drawn = np.array(arrays(moved["sensor/1"])["strips"], dtype=float)[:, 0, 0, 1]
     (low,) = {0.0}
     expected = low + (10.0 + frames.x_s[:, 0] - frames.x[:, 0]) / 20.0 * 1.6
@@ -153,8 +153,8 @@ def test_levels_are_as_high_as_they_are() -> None:
 
 def test_a_trail_goes_on_from_batch_to_batch() -> None:
     frames = frames_of(2, 0, k=12)
-    whole = Phase(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
-    picture = Phase(["a", "b"], np.ones(2))
+    whole = PhasePicture(["a", "b"], np.ones(2)).frames(frames)["plant/trail"]
+    picture = PhasePicture(["a", "b"], np.ones(2))
     pieces = [
         row
         for i in range(0, 12, 4)
@@ -172,7 +172,7 @@ def test_what_a_picture_has_room_for_is_what_the_models_loop_goes_through() -> N
     assert reach[3] < 10.0
 
 
-def rows_of(diagram: Diagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
+def rows_of(diagram: NetworkDiagram, ends_ns: list[int]) -> dict[str, dict[int, list[Any]]]:
     """What each entity shows at which time."""
     found: dict[str, dict[int, list[Any]]] = {}
     for until_ns in ends_ns:
@@ -185,7 +185,9 @@ def rows_of(diagram: Diagram, ends_ns: list[int]) -> dict[str, dict[int, list[An
     return found
 
 
-def sent(diagram: Diagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0) -> Diagram:
+def sent(
+    diagram: NetworkDiagram, packets: list[tuple[float, Fate]], delay_s: float = 0.0
+) -> NetworkDiagram:
     t_ns = np.array([round(t_s * S) for t_s, _ in packets], np.int64)
     fate = np.array([fate for _, fate in packets], np.int64)
     diagram.add(t_ns, t_ns + round(delay_s * S), fate)
@@ -199,7 +201,7 @@ PACKETS = [
 
 
 def test_each_packet_is_seen_to_become_what_it_became() -> None:
-    seen = rows_of(sent(Diagram(), PACKETS), [3 * S])
+    seen = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     assert seen.keys() == {"broadcast", "delivered", "forced", "lost"}
     for entity, count in (("delivered", 2), ("forced", 1), ("lost", 2)):
         shown = [bool(shapes) for _, shapes in sorted(seen[entity].items())]
@@ -212,7 +214,7 @@ def test_each_packet_is_seen_to_become_what_it_became() -> None:
 
 
 def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
-    seen = rows_of(sent(Diagram(), PACKETS[:1], delay_s=0.8), [3 * S])
+    seen = rows_of(sent(NetworkDiagram(), PACKETS[:1], delay_s=0.8), [3 * S])
     inside = [float(np.float32(8.8)), 0.0]
     waiting = [t_ns for t_ns, shapes in seen["broadcast"].items() if inside in shapes]
     assert min(waiting) == pytest.approx((0.5 + LEG_S) * S, abs=S / 50)
@@ -220,13 +222,13 @@ def test_a_packet_waits_inside_the_network_as_long_as_it_did() -> None:
 
 
 def test_batches_leave_no_trace_in_the_diagram() -> None:
-    whole = rows_of(sent(Diagram(), PACKETS), [3 * S])
+    whole = rows_of(sent(NetworkDiagram(), PACKETS), [3 * S])
     steps = [round(t_s * S) for t_s in np.arange(0.013, 3.0, 0.037)]
-    assert rows_of(sent(Diagram(), PACKETS), [*steps, 3 * S]) == whole
+    assert rows_of(sent(NetworkDiagram(), PACKETS), [*steps, 3 * S]) == whole
 
 
 def test_a_flood_of_packets_is_thinned_and_a_quiet_network_costs_nothing() -> None:
-    diagram = sent(Diagram(), [(i / 1000, Fate.DELIVERED) for i in range(2000)])
+    diagram = sent(NetworkDiagram(), [(i / 1000, Fate.DELIVERED) for i in range(2000)])
     seen = rows_of(diagram, [2 * S])
     assert max(len(shapes) for shapes in seen["broadcast"].values()) <= LEG_S / 0.025 + 1
     rows_of(diagram, [3 * S])
@@ -234,7 +236,7 @@ def test_a_flood_of_packets_is_thinned_and_a_quiet_network_costs_nothing() -> No
 
 
 def test_acknowledgements_go_back() -> None:
-    diagram = Diagram(acknowledged=True)
+    diagram = NetworkDiagram(acknowledged=True)
     diagram.add(
         np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),
         back=True,

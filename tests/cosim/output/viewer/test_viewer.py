@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from rerun.error_utils import RerunWarning
 
 from cosim.output.viewer.live_viewer import LiveView, has_display, view_recording
-from cosim.output.viewer.pictures.lane_picture import Lane
-from cosim.output.viewer.pictures.network_picture import Diagram
+from cosim.output.viewer.pictures.lane_picture import LanePicture
+from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Frames, Picture
 from cosim.output.viewer.recording import APPLICATION_ID, RunView, ViewError
 from cosim.output.viewer.viewer_server import RECORDING, RecordingServer
@@ -51,7 +51,7 @@ def new_view(
     *,
     indexed: bool = True,
     picture: Picture | None = None,
-    diagram: Diagram | None = None,
+    diagram: NetworkDiagram | None = None,
 ) -> RunView:
     return RunView(
         path,
@@ -741,8 +741,8 @@ def test_a_browser_is_served_where_there_is_a_display_but_no_window_is_wanted(
 
 def test_a_picture_moves_at_most_so_often_and_goes_on_from_batch_to_batch(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
-    picture = Lane(3, 2, forward_mps=-12.0)
-    with new_view(path, picture=picture, diagram=Diagram()) as view:
+    picture = LanePicture(3, 2, forward_mps=-12.0)
+    with new_view(path, picture=picture, diagram=NetworkDiagram()) as view:
         for first in range(0, 1000, 37):
             t_ns = times(first, min(37, 1000 - first))
             x = np.tile(t_ns[:, None] * 1e-9, (1, 4))

@@ -10,31 +10,31 @@ from cosim.simulation.batch.batch_interface import Population, Setting
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from netem.link_machine import UPDATE_LINK, Link
 from noack.config.impairments import (
-    Bernoulli,
+    BernoulliLoss,
     Corrupt,
-    FourState,
-    GilbertElliott,
+    FourStateLoss,
+    GilbertElliottLoss,
     LinkSettings,
-    Lossless,
     LossOf,
-    Periodic,
-    Scripted,
-    WorstCase,
+    NoLoss,
+    PeriodicLoss,
+    ScriptedLoss,
+    WorstCaseLoss,
 )
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import Fate
 from noack.trigger.decaying import DecayingTrigger
 
 LOSSES = (
-    Lossless(),
-    Bernoulli(probability=0.7),
-    Bernoulli(probability=0.5, correlation=0.8),
-    GilbertElliott(good_to_bad=0.4, bad_to_good=0.3, loss_in_good=0.1, loss_in_bad=0.9),
-    FourState(p13=0.4, p31=0.3, p32=0.4, p23=0.5, p14=0.1),
-    Periodic(period=5, burst=3, first=1),
-    Scripted(lost=(1, 2, 5, 6, 7), repeat_every=9),
-    WorstCase(),
+    NoLoss(),
+    BernoulliLoss(probability=0.7),
+    BernoulliLoss(probability=0.5, correlation=0.8),
+    GilbertElliottLoss(good_to_bad=0.4, bad_to_good=0.3, loss_in_good=0.1, loss_in_bad=0.9),
+    FourStateLoss(p13=0.4, p31=0.3, p32=0.4, p23=0.5, p14=0.1),
+    PeriodicLoss(period=5, burst=3, first=1),
+    ScriptedLoss(lost=(1, 2, 5, 6, 7), repeat_every=9),
+    WorstCaseLoss(),
 )
 SIZES = ((2, 1), (4, 2))
 
@@ -46,7 +46,7 @@ def random_setting(rng: np.random.Generator, n: int, m: int) -> Setting:
     if rng.random() < 0.3:
         impairments.append(Corrupt(probability=0.3))
     if rng.random() < 0.2:
-        impairments.append(LossOf(loss=Bernoulli(probability=0.2)))
+        impairments.append(LossOf(loss=BernoulliLoss(probability=0.2)))
     weight = np.eye(n) + 0.5 * rng.uniform(-1, 1, (n, n)) if rng.random() < 0.5 else None
     Q, R = (part @ part.T for part in (rng.uniform(-1, 1, (n, n)), rng.uniform(-1, 1, (m, m))))
     weighs = rng.random() < 0.5
@@ -87,7 +87,7 @@ def reference(setting: Setting, draw: Population, most_events: int = 2000) -> Co
     (A,), (B,), (x0,), (seed,) = draw
     n, m = B.shape
     names = tuple(f"x_{i}" for i in range(n))
-    loop = Loop(
+    loop = LoopMatrices(
         A, B, setting.K, setting.H, A, B, x0, setting.trigger.weight, names, names[:m] or names
     )
     link, known = Link(setting.link, int(seed), UPDATE_LINK), []
@@ -134,8 +134,8 @@ def cost_of(run: ContinuousRun, setting: Setting) -> float:
 
 def dense(run: ContinuousRun, setting: Setting) -> tuple[Vector, Vector, Vector]:
     """Times, ‖x‖ and ‖W e_c‖ e^{αt} from just after an event to just before the next."""
-    guards = setting.trigger.guards(len(setting.H))
-    alpha = 0.0 if guards.from_event else guards.rate_per_s
+    rule = setting.trigger.trigger_rule(len(setting.H))
+    alpha = 0.0 if rule.from_event else rule.rate_per_s
     times_s, norms, errors = [], [], []
     for state, begin_s, end_s in pieces(run):
         t_s = np.linspace(begin_s, end_s, 400)

@@ -10,7 +10,7 @@ import pytest
 from cosim.simulation.batch.batch_interface import Population, Setting, run_batch, run_events
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.simulation.continuous.continuous_run import TooManyEventsError
-from noack.config.impairments import LinkSettings, LossOf, WorstCase
+from noack.config.impairments import LinkSettings, LossOf, WorstCaseLoss
 from noack.core.linear_systems import Matrix
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
@@ -222,7 +222,7 @@ def test_runs_that_diverge_do_so_at_the_time_of_the_exact_simulator(name: str) -
 def test_an_oscillation_is_no_hard_case() -> None:
     """x turns and nothing arrives: ‖e_c‖ is 1 for ever, all but the level 1 + 1e-10."""
     turn = np.array([[0.0, 100.0], [-100.0, 0.0]])
-    lost = LinkSettings(impairments=(LossOf(loss=WorstCase()),), mansd=None)
+    lost = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=None)
     setting = Setting(
         H=np.zeros((2, 2)), K=np.zeros((1, 2)), trigger=PeriodicTrigger(1000 * MS), link=lost,
         horizon_s=20.0, known_start=False,

@@ -19,7 +19,7 @@ from cosim.simulation.continuous.continuous_run import (
     TooManyEventsError,
     simulate_continuous,
 )
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
@@ -27,14 +27,14 @@ from noack.trigger.decaying import DecayingTrigger
 
 def loop_with(
     A: Matrix, B: Matrix, K: Matrix, H: Matrix, x0: Vector, weight: Matrix | None = None
-) -> Loop:
+) -> LoopMatrices:
     """A loop of given matrices; what H was made of does not matter to it."""
     names = tuple(f"x_{i}" for i in range(len(A)))
-    return Loop(A, B, K, H, A, B, x0, weight, names, names[: B.shape[1]])
+    return LoopMatrices(A, B, K, H, A, B, x0, weight, names, names[: B.shape[1]])
 
 
 class Case(NamedTuple):
-    loop: Loop
+    loop: LoopMatrices
     trigger: DecayingTrigger
     lost: list[bool]
     known: bool

@@ -15,7 +15,7 @@ from cosim.simulation.continuous.continuous_run import (
     TooManyEventsError,
     simulate_continuous,
 )
-from noack.config.resolution import Loop
+from noack.config.resolution import LoopMatrices
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
 from noack.trigger.decaying import DecayingTrigger
@@ -40,8 +40,8 @@ FORM = np.diag([-0.02, -0.02, 1.0, 1.0])
 MS = 1_000_000
 
 
-def loop_of(*, zoh: bool, mismatch: float = 0.1) -> Loop:
-    return Loop(
+def loop_of(*, zoh: bool, mismatch: float = 0.1) -> LoopMatrices:
+    return LoopMatrices(
         A_MODEL, B, K, np.zeros((2, 2)) if zoh else CLOSED,
         A_MODEL + mismatch * np.array([[0.1, -0.3], [0.5, 0.2]]), B, np.array([10.0, 0.0]), None,
         ("x_1", "x_2"), ("u",),
@@ -107,7 +107,7 @@ def test_events_are_those_of_an_integrator(name: str, zoh: bool, lost: int) -> N
     run = run_of(policy, zoh=zoh, lost=lost)
     loop, decay = run.system.loop, getattr(policy, "decay_per_s", 0.0)
     assert len(run.before) >= 3
-    eta = policy.first_reserve
+    eta = policy.initial_dynamic_variable
     for start in (run.start, *run.after):
         z0 = np.concatenate([start.x, start.x + start.e_s, start.x + start.e_c, [eta]])
 
@@ -163,15 +163,15 @@ def test_no_rule_is_broken_between_events(name: str, zoh: bool) -> None:
     run = run_of(policy, zoh=zoh, lost=1, horizon_s=4.0)
     ends_s = [*run.event_s, run.horizon_s]
     for state, end_s in zip([run.start, *run.after], ends_s, strict=True):
-        guard = run.system.guard(state)
-        if guard.reserve is not None:
+        condition = run.system.condition(state)
+        if condition.dynamic_variable is not None:
             continue
-        t_s = np.linspace(max(state.t_s, guard.earliest_ns * 1e-9), end_s, 50)[1:-1]
+        t_s = np.linspace(max(state.t_s, condition.earliest_ns * 1e-9), end_s, 50)[1:-1]
         if len(t_s) == 0 or t_s[-1] <= t_s[0]:
             continue
         samples = run.system.sample(state, t_s)
         for time_s, x, e_s in zip(t_s, samples.x, samples.e_s, strict=True):
-            left, right = guard.sides(time_s * 1e9, x, e_s)
+            left, right = condition.sides(time_s * 1e9, x, e_s)
             assert left <= right * (1 + 1e-9) + 1e-12
 
 

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
-from noack.config.resolution import Loop, resolve
+from noack.config.resolution import LoopMatrices, resolve
 from noack.config.scenario_file import load
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.dynamic import DynamicTrigger
@@ -49,7 +49,7 @@ def held(system: System, policy: Policy) -> ContinuousLoop:
     A, B, K = system
     n, m = B.shape
     names = tuple(f"x_{i}" for i in range(n)), tuple(f"u_{i}" for i in range(m))
-    loop = Loop(A, B, K, np.zeros((n, n)), A, B, np.ones(n), None, *names)
+    loop = LoopMatrices(A, B, K, np.zeros((n, n)), A, B, np.ones(n), None, *names)
     return ContinuousLoop(loop, policy)
 
 
@@ -243,9 +243,9 @@ def test_the_loop_stays_as_near_to_the_continuous_one_as_lunze_and_lehmann_say()
     A, B, K = TABUADA
     closed, level = A + B @ K, 0.2
     names = ("x_1", "x_2"), ("u",)
-    same = Loop(A, B, K, closed, A, B, np.array([1.0, 0.0]), None, *names)
+    same = LoopMatrices(A, B, K, closed, A, B, np.array([1.0, 0.0]), None, *names)
     other = A + np.array([[0.0, 0.0], [0.3, -0.4]])
-    disturbed = Loop(A, B, K, closed, other, B, np.array([1.0, 0.0]), None, *names)
+    disturbed = LoopMatrices(A, B, K, closed, other, B, np.array([1.0, 0.0]), None, *names)
     gain, _ = quad(
         lambda s: float(np.linalg.norm(expm((other + B @ K) * s) @ B @ K, 2)), 0, 60, limit=200
     )

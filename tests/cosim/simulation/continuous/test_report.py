@@ -43,9 +43,9 @@ def test_the_document_is_the_run(resolved: Scenario) -> None:
     assert summary["events"] == len(events) == len(run.before) > 5
     assert summary["deliveries"] == sum(event["delivered"] for event in events)
     assert summary["drops"] == summary["events"] - summary["deliveries"]
-    assert summary["longest_drop_run"] <= resolved.network.mansd
+    assert summary["longest_loss_burst"] <= resolved.network.mansd
     lost = "".join("." if event["delivered"] else "x" for event in events)
-    assert summary["longest_drop_run"] == max(map(len, lost.split(".")))
+    assert summary["longest_loss_burst"] == max(map(len, lost.split(".")))
     times = [event["t_s"] for event in events]
     assert summary["inter_event_min_s"] == pytest.approx(np.diff(times).min())
     assert len(samples["t_s"]) == len(samples["x"]) == len(samples["x_c"]) == POINTS

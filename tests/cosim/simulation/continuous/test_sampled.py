@@ -14,9 +14,9 @@ from cosim.analysis.step_schedule import live_run
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import simulate_continuous
-from cosim.simulation.continuous.plant_grid_loop import SampledLoop, Schedule
+from cosim.simulation.continuous.plant_grid_loop import SampledLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import Loop, resolve
+from noack.config.resolution import LoopMatrices, resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import PLANT_STEP
@@ -30,7 +30,7 @@ STEPS = 200
 class Case(NamedTuple):
     """A random loop and schedule."""
 
-    loop: Loop
+    loop: LoopMatrices
     trigger: DecayingTrigger
     measured: list[bool]
     lost: list[bool]
@@ -43,10 +43,12 @@ class Case(NamedTuple):
     def delay_ns(self, event: int) -> int:
         return self.delays_ns[event % len(self.delays_ns)]
 
-    def schedule(self) -> Schedule:
+    def schedule(self) -> StepSchedule:
         never = np.full(STEPS + 1, -1)
         measured = np.array(self.measured)
-        return Schedule(PERIOD_NS, measured, self.delivered, self.delay_ns, self.delay_ns, never)
+        return StepSchedule(
+            PERIOD_NS, measured, self.delivered, self.delay_ns, self.delay_ns, never
+        )
 
     def sampled(self, *, delay: bool) -> tuple[Matrix, list[int]]:
         loop = SampledLoop(
@@ -66,7 +68,7 @@ class Case(NamedTuple):
 
         z = np.concatenate([loop.x0, loop.x0 if self.known else 0 * loop.x0])
         x_s, common = loop.x0, self.known
-        under_way: list[tuple[int, int, int, Any]] = []
+        in_flight: list[tuple[int, int, int, Any]] = []
         newest, events, states = -1, [], []
         for step in range(STEPS + 1):
             now_ns = step * PERIOD_NS
@@ -76,10 +78,10 @@ class Case(NamedTuple):
                 x_s, common = z[:n], True
                 if self.delivered(len(events)):
                     wait_ns = self.delay_ns(len(events)) if delay else 0
-                    under_way.append((now_ns + wait_ns, len(events), now_ns, z[:n]))
+                    in_flight.append((now_ns + wait_ns, len(events), now_ns, z[:n]))
                 events.append(step)
             at_ns = now_ns
-            for acts_ns, number, event_ns, x in sorted(under_way, key=lambda entry: entry[:2]):
+            for acts_ns, number, event_ns, x in sorted(in_flight, key=lambda entry: entry[:2]):
                 if acts_ns >= now_ns + PERIOD_NS:
                     continue
                 z = transition(acts_ns - at_ns) @ z
@@ -87,7 +89,7 @@ class Case(NamedTuple):
                 if number > newest:
                     newest = number
                     z = np.concatenate([z[:n], transition(acts_ns - event_ns)[n:, n:] @ x])
-                under_way = [entry for entry in under_way if entry[1] != number]
+                in_flight = [entry for entry in in_flight if entry[1] != number]
             z = transition(now_ns + PERIOD_NS - at_ns) @ z
             x_s = transition(PERIOD_NS)[n:, n:] @ x_s
         return np.array(states), events
@@ -104,7 +106,7 @@ def cases(draw: st.DrawFn) -> Case:
     measured = [step % every == 0 for step in range(STEPS + 1)]
     measured[draw(st.integers(0, 20))] = False
     names = tuple("abcd"[:n])
-    loop = Loop(A, B, K, H, A, B, rng.uniform(-1, 1, n), None, names, names[:m])
+    loop = LoopMatrices(A, B, K, H, A, B, rng.uniform(-1, 1, n), None, names, names[:m])
     overtaking_within_a_step = st.just([27_000_000, 12_000_000])
     anything = st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=5)
     delays = st.one_of(overtaking_within_a_step, anything)
@@ -150,7 +152,7 @@ def test_ever_faster_sampling_is_the_continuous_loop() -> None:
     differences = []
     for period_ns in (4_000_000, 2_000_000, 1_000_000, 500_000):
         steps = 4_000_000_000 // period_ns
-        schedule = Schedule(
+        schedule = StepSchedule(
             period_ns, np.ones(steps + 1, np.bool_), lambda _: True, lambda _: 0, lambda _: 0,
             np.zeros(steps + 1, np.int64),
         )  # fmt: skip
@@ -175,7 +177,13 @@ def policies(n: int) -> list[dict[str, Any]]:
         {"policy": "relative", "sigma": 0.1, "weight": np.diag(np.arange(1.0, n + 1)).tolist()},
         {"policy": "mixed", "sigma": 0.05, "epsilon": 0.02},
         {"policy": "lyapunov", "rate_per_s": 0.1},
-        {"policy": "dynamic", "sigma": 0.3, "theta_s": 0.1, "decay_per_s": 0.5, "reserve": 0.01},
+        {
+            "policy": "dynamic",
+            "sigma": 0.3,
+            "theta_s": 0.1,
+            "decay_per_s": 0.5,
+            "dynamic_variable": 0.01,
+        },
     ]
     timed = [
         {"policy": "quadratic", "Q": form.tolist(), "period_s": 0.06, "heartbeat": 3},

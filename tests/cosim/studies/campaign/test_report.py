@@ -27,7 +27,7 @@ from cosim.studies.campaign.campaign_figures import (
 )
 from cosim.studies.campaign.campaign_file import Campaign, load
 from cosim.studies.campaign.campaign_grid import Point, base_of, grid
-from cosim.studies.campaign.campaign_page import Row, page, written
+from cosim.studies.campaign.campaign_page import SummaryRow, page, written
 from cosim.studies.campaign.campaign_report import tables_of, write_report
 from cosim.studies.campaign.campaign_run import run_campaign
 from cosim.studies.campaign.campaign_summary import summarise
@@ -298,8 +298,10 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
 def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [
-        Row(["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (in 97.5 %)"]),
-        Row(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
+        SummaryRow(
+            ["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (in 97.5 %)"]
+        ),
+        SummaryRow(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
     ]
     console = Console(width=width, file=StringIO(), record=True)
     for table in tables_of("all", ["policy", "β"], headings, rows, width):

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 import noack
 from cosim.cli import app
 from cosim.record.environment import write_environment
-from cosim.studies.comparison.run_comparison import Comparison, KeyNumber, compare_runs
+from cosim.studies.comparison.run_comparison import KeyNumber, RunComparison, compare_runs
 from noack.protocol.record_tables import PLANT_STEP
 
 SETTINGS: list[dict[str, Any]] = [
@@ -29,7 +29,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def found(runs: list[Path]) -> Comparison:
+def found(runs: list[Path]) -> RunComparison:
     return compare_runs(runs)
 
 
@@ -37,12 +37,12 @@ def compare(*words: object) -> Result:
     return CliRunner().invoke(app, ["compare", *map(str, words)], prog_name="noack")
 
 
-def number(found: Comparison, name: str) -> KeyNumber:
+def number(found: RunComparison, name: str) -> KeyNumber:
     return next(one for one in found.numbers if one.name == name)
 
 
 def test_numbers_are_those_of_the_summaries_and_differences_are_to_the_first(
-    found: Comparison,
+    found: RunComparison,
 ) -> None:
     events = tuple(run.summary["events"] for run in found.runs)
     assert number(found, "transmissions").values == events
@@ -52,7 +52,7 @@ def test_numbers_are_those_of_the_summaries_and_differences_are_to_the_first(
         assert share == pytest.approx(100 * run.summary["drops"] / crossed)
 
 
-def test_the_distance_is_over_the_times_that_both_have(found: Comparison) -> None:
+def test_the_distance_is_over_the_times_that_both_have(found: RunComparison) -> None:
     """The third run takes every second step of the first, for two of its three seconds."""
     first, _, third = (run.record[PLANT_STEP] for run in found.runs)
     assert len(third) == 501
@@ -70,7 +70,7 @@ def test_a_run_is_at_no_distance_to_itself(runs: list[Path]) -> None:
     assert all(not apart for one in same.numbers for apart in one.differences)
 
 
-def test_settings_that_differ_are_named_and_no_other(found: Comparison) -> None:
+def test_settings_that_differ_are_named_and_no_other(found: RunComparison) -> None:
     assert found.settings["mode"] == ("model", "zoh", "model")
     assert found.settings["network.mansd"] == ("4", "4", "1")
     assert found.settings["plant.rate_hz"] == ("500.0", "500.0", "250.0")
@@ -78,7 +78,7 @@ def test_settings_that_differ_are_named_and_no_other(found: Comparison) -> None:
     assert not any(key.startswith("ports") for key in found.settings)
 
 
-def test_the_overlay_shows_every_run_in_every_panel(found: Comparison) -> None:
+def test_the_overlay_shows_every_run_in_every_panel(found: RunComparison) -> None:
     *states, sensor, controller, transmissions = found.plot().axes
     assert len(states) == 4
     for axes in (*states, controller):
@@ -158,7 +158,7 @@ def test_a_run_that_diverged_is_overlaid_as_far_as_it_goes(runs: list[Path]) -> 
     assert found.plot().axes
 
 
-def test_the_library_gives_the_same(runs: list[Path], found: Comparison) -> None:
+def test_the_library_gives_the_same(runs: list[Path], found: RunComparison) -> None:
     temporary = noack.simulate(noack.load("lane_following", SETTINGS[1]))
     mine = noack.compare(noack.open_run(runs[0]), temporary, runs[2])
     assert mine.rows == found.rows

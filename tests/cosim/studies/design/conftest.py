@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.studies.design.candidate_measures import Limits
-from cosim.studies.design.design_result import Found
+from cosim.studies.design.candidate_measures import DesignLimits
+from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.design_run import design
 from cosim.studies.design.loop_families import families_of
 from noack.config.scenario import Scenario
@@ -34,7 +34,7 @@ loss = { model = "bernoulli", probability = 0.6 }
 rate_hz = 500.0
 """
 
-LIMITS = Limits(settling_s=9.0, quantile=0.9, settle=0.02, bounds={"error": 0.06})
+LIMITS = DesignLimits(settling_s=9.0, quantile=0.9, settle=0.02, bounds={"error": 0.06})
 
 
 @pytest.fixture(scope="session")
@@ -49,11 +49,13 @@ def scenario(mass: Path) -> Scenario:
     return load(mass)
 
 
-def designed(scenario: Scenario, limits: Limits, draws: int = 200, seed: int = 3) -> Found:
+def designed(
+    scenario: Scenario, limits: DesignLimits, draws: int = 200, seed: int = 3
+) -> DesignResult:
     families = families_of(scenario, ("identity", "given"), None)
     return design(families, limits, draws=draws, seed=seed)
 
 
 @pytest.fixture(scope="session")
-def found(scenario: Scenario) -> Found:
+def found(scenario: Scenario) -> DesignResult:
     return designed(scenario, LIMITS)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.studies.design.design_page import page
-from cosim.studies.design.design_result import Found
+from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.lqr import lqr_gain
 
 
@@ -91,7 +91,7 @@ def test_mistakes_are_one_line(mass: Path, words: list[str], said: str) -> None:
     assert said in stderr
 
 
-def test_the_page_stands_alone(found: Found) -> None:
+def test_the_page_stands_alone(found: DesignResult) -> None:
     html = page(found)
     assert "<svg" in html
     assert found.verdict() in html

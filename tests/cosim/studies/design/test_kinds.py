@@ -13,7 +13,7 @@ from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidate_measures import Limits, certificate_of
+from cosim.studies.design.candidate_measures import DesignLimits, certificate_of
 from cosim.studies.design.design_run import design
 from cosim.studies.design.loop_families import families_of
 from noack.config.resolution import resolve
@@ -63,7 +63,7 @@ def largest_errors(scenario: Scenario, seeds: range) -> list[float]:
 
 
 def test_a_hold_is_designed_for_as_a_model_is(mass: Path) -> None:
-    limits = Limits(9.0, 0.8, 0.02, {"error": 0.3})
+    limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.3})
     scenario = load(mass, ['mode="zoh"'])
     found = design(families_of(scenario, ("identity",), None), limits, draws=60, seed=3)
     assert found.feasible
@@ -79,7 +79,7 @@ def test_a_hold_is_designed_for_as_a_model_is(mass: Path) -> None:
 
 def test_a_bound_under_the_schedule_is_that_of_the_schedule(scenario: Scenario) -> None:
     """A real loop samples, holds and delays: what is certified of it is never less."""
-    limits = Limits(9.0, 0.8, 0.02, {"error": 0.2}, schedule=True)
+    limits = DesignLimits(9.0, 0.8, 0.02, {"error": 0.2}, schedule=True)
     found = designed(scenario, limits, draws=60)
     assert found.feasible
     scheduled, ideal = (
@@ -119,7 +119,10 @@ def test_a_chosen_norm_and_gain_are_certified_as_they_are_written(
 
 def test_without_chance_every_draw_is_the_exact_run(one: Path) -> None:
     found = design(
-        families_of(load(one), ("identity",), None), Limits(4.0, 0.5, 0.02, {}), draws=20, seed=0
+        families_of(load(one), ("identity",), None),
+        DesignLimits(4.0, 0.5, 0.02, {}),
+        draws=20,
+        seed=0,
     )
     assert found.confirmed
     assert found.fresh.halfwidth == 0
@@ -135,7 +138,7 @@ def test_without_chance_every_draw_is_the_exact_run(one: Path) -> None:
 
 
 def test_a_quantile_that_is_small_has_no_lower_end(mass: Path) -> None:
-    found = designed(load(mass), Limits(9.0, 0.02, 0.02, {}), draws=20)
+    found = designed(load(mass), DesignLimits(9.0, 0.02, 0.02, {}), draws=20)
     assert found.fresh.settling_low_s == 0
     assert 0 < found.fresh.settling_s <= found.fresh.settling_high_s < math.inf
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from cosim.studies.design.candidate_measures import Limits, ranks, require_draws
+from cosim.studies.design.candidate_measures import DesignLimits, ranks, require_draws
 from noack.core.errors import CallerError
 
 
@@ -33,7 +33,7 @@ def test_too_few_draws_for_a_quantile_are_refused_and_enough_are_named() -> None
 
 
 def test_the_worst_limit_counts() -> None:
-    limits = Limits(10.0, 0.95, 0.02, {"state": 4.0, "error": 1.0})
+    limits = DesignLimits(10.0, 0.95, 0.02, {"state": 4.0, "error": 1.0})
     assert limits.excess(10.0, {"state": 4.0, "error": 1.0}) == 0
     assert limits.excess(20.0, {"state": 5.0, "error": 1.0}) == pytest.approx(0.5)
     assert limits.excess(9.0, {"state": math.inf, "error": 1.0}) == 1

@@ -8,8 +8,8 @@ import pytest
 
 from cosim.simulation.batch.batch_interface import run_batch, setting_of
 from cosim.studies.campaign.random_draws import box_of
-from cosim.studies.design.candidate_measures import Limits, measure
-from cosim.studies.design.design_result import Found
+from cosim.studies.design.candidate_measures import DesignLimits, measure
+from cosim.studies.design.design_result import DesignResult
 from cosim.studies.design.design_space import LEVELS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -20,7 +20,7 @@ from noack.theory.scenario_certificates import certify_box
 from tests.cosim.studies.design.conftest import LIMITS, designed
 
 
-def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: Found) -> None:
+def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: DesignResult) -> None:
     assert found.feasible
     assert found.confirmed
     setting = replace(setting_of(resolve(found.scenario)), settle=LIMITS.settle)
@@ -32,7 +32,7 @@ def test_the_chosen_one_settles_in_time_on_draws_of_another_seed(found: Found) -
     assert abs(rows["transmissions"].mean() - found.fresh.transmissions) < spread
 
 
-def test_the_chosen_one_is_certified_as_asked(found: Found, tmp_path: Path) -> None:
+def test_the_chosen_one_is_certified_as_asked(found: DesignResult, tmp_path: Path) -> None:
     path = tmp_path / "chosen.toml"
     path.write_text(dumps(found.scenario))
     resolved = resolve(load(path))
@@ -48,7 +48,7 @@ def test_the_chosen_one_is_certified_as_asked(found: Found, tmp_path: Path) -> N
     assert found.bounds["error"] == pytest.approx(bound)
 
 
-def test_a_limit_costs_transmissions(found: Found, scenario: Scenario) -> None:
+def test_a_limit_costs_transmissions(found: DesignResult, scenario: Scenario) -> None:
     free = designed(scenario, replace(LIMITS, bounds={}))
     assert free.feasible
     assert free.bounds is not None
@@ -56,7 +56,9 @@ def test_a_limit_costs_transmissions(found: Found, scenario: Scenario) -> None:
     assert free.best.measured.transmissions < found.best.measured.transmissions
 
 
-def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(found: Found) -> None:
+def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(
+    found: DesignResult,
+) -> None:
     best = found.best.measured
     assert found.best.full
     assert best.settling_high_s <= LIMITS.settling_s
@@ -68,7 +70,7 @@ def test_nothing_that_was_tried_meets_the_limits_with_fewer_transmissions(found:
         assert late or trial.bounds["error"] > LIMITS.bounds["error"], trial
 
 
-def test_screening_loses_nothing_that_all_draws_would_find(found: Found) -> None:
+def test_screening_loses_nothing_that_all_draws_would_find(found: DesignResult) -> None:
     """Every grid candidate that was only screened out is measured on all draws."""
     best = found.best.measured
     population = box_of(found.scenario).population(found.seed, range(best.draws))
@@ -81,7 +83,7 @@ def test_screening_loses_nothing_that_all_draws_would_find(found: Found) -> None
     assert rescued == 0
 
 
-def test_the_trade_off_curve_is_what_nothing_dominates(found: Found) -> None:
+def test_the_trade_off_curve_is_what_nothing_dominates(found: DesignResult) -> None:
     assert len(found.front) > 3
     points = [(t.measured.transmissions, t.measured.settling_s) for t in found.front]
     assert points == sorted(points)
@@ -110,7 +112,7 @@ def test_the_same_seed_gives_the_same_design_and_another_one_other_draws(
     assert other.fresh != one.fresh
 
 
-def test_candidates_lie_below_the_decay_rate(found: Found) -> None:
+def test_candidates_lie_below_the_decay_rate(found: DesignResult) -> None:
     # s² + 1.5 s + 1: the real part of both roots is −0.75
     rates = [trial.candidate.alpha_per_s for trial in found.trials]
     assert max(rates) < 0.75
@@ -119,7 +121,7 @@ def test_candidates_lie_below_the_decay_rate(found: Found) -> None:
 
 
 def test_what_cannot_be_met_is_said_with_the_closest(scenario: Scenario) -> None:
-    limits = Limits(1.0, 0.9, 0.02, {})
+    limits = DesignLimits(1.0, 0.9, 0.02, {})
     found = designed(scenario, limits, draws=80)
     assert not found.feasible
     assert not found.confirmed

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 from cosim.cli import app
 from cosim.studies.paper.ensemble_statistics import number, paired, percent, quartiles, spread
-from cosim.studies.paper.paper_claims import Verdict, claims, judge
+from cosim.studies.paper.paper_claims import PaperVerdict, claims, judge
 from cosim.studies.paper.paper_conditions import BASE, CONDITIONS
-from cosim.studies.paper.paper_ensemble import COLUMNS, Part, parts, rows_of
+from cosim.studies.paper.paper_ensemble import COLUMNS, EnsemblePart, parts, rows_of
 from cosim.studies.paper.paper_evidence import evidence
 from cosim.studies.paper.paper_figures import ensemble_figure
 from cosim.studies.paper.paper_page import render
@@ -45,7 +45,9 @@ def test_the_ensemble_is_complete(results: Results) -> None:
 
 
 @pytest.mark.parametrize("part", parts(1000), ids=lambda p: f"{p.table}-{p.condition.name}")
-def test_the_committed_draws_are_what_the_code_computes(results: Results, part: Part) -> None:
+def test_the_committed_draws_are_what_the_code_computes(
+    results: Results, part: EnsemblePart
+) -> None:
     last = results.count(part.condition.name, part.table) - 1
     draws = [0, last] if part.table == "draws" else [last]
     rows = results.tables[part.table, part.condition.name]
@@ -87,37 +89,37 @@ def test_verdicts_follow_the_draws(results: Results) -> None:
     """A claim that the draws contradict is not confirmed; one that most bear out is so partly."""
     gist = "With ZOH the number of updates increases."
 
-    def verdict(changed: Results) -> Verdict:
+    def verdict(changed: Results) -> PaperVerdict:
         return next(claim.verdict for claim in claims(changed) if claim.gist == gist)
 
     events, some = results.column("zoh.events"), np.arange(results.count()) % 10
-    assert verdict(results) == Verdict.CONFIRMED
-    assert verdict(with_column(results, "zoh.events", 1)) == Verdict.NOT_CONFIRMED
+    assert verdict(results) == PaperVerdict.CONFIRMED
+    assert verdict(with_column(results, "zoh.events", 1)) == PaperVerdict.NOT_CONFIRMED
     most = np.where(some < 6, events, 1)
-    assert verdict(with_column(results, "zoh.events", most)) == Verdict.PARTLY
+    assert verdict(with_column(results, "zoh.events", most)) == PaperVerdict.PARTLY
     # A variation of what the paper leaves open counts, one that leaves its example does not.
-    assert verdict(with_column(results, "zoh.events", 1, "far")) == Verdict.PARTLY
-    assert verdict(with_column(results, "zoh.events", 1, "wide_box")) == Verdict.CONFIRMED
+    assert verdict(with_column(results, "zoh.events", 1, "far")) == PaperVerdict.PARTLY
+    assert verdict(with_column(results, "zoh.events", 1, "wide_box")) == PaperVerdict.CONFIRMED
 
 
 def test_a_loop_that_never_settles_is_no_confirmation(results: Results) -> None:
     never = with_column(results, "model.settled_1_s", math.inf)
     (claim,) = [c for c in claims(never) if c.gist == "MB-ET stabilises the uncertain system."]
-    assert claim.verdict == Verdict.NOT_CONFIRMED
+    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
     assert "> 40" in render(never)
 
 
 def test_an_inter_event_time_below_the_certified_one_is_noticed(results: Results) -> None:
     short = with_column(results, "model.gap_min_s", 1e-3)
     (claim,) = [c for c in claims(short) if "minimum inter-event" in c.gist]
-    assert claim.verdict == Verdict.NOT_CONFIRMED
+    assert claim.verdict == PaperVerdict.NOT_CONFIRMED
 
 
 def test_the_least_favourable_variation_is_named(results: Results) -> None:
     found = judge(results, lambda c: c("model.deliveries") < 0.5 * c("model.events"))
     (half,) = [c.title for c in CONDITIONS if c.name == "loss_0.5"]
     assert found.least_in == half
-    assert found.verdict == Verdict.PARTLY
+    assert found.verdict == PaperVerdict.PARTLY
 
 
 def test_the_representative_draw_is_nearest_to_the_medians(results: Results) -> None:
@@ -170,7 +172,7 @@ def test_the_command_writes_the_page_that_the_code_computes(tmp_path: Path) -> N
     written = load_results(tmp_path / "figures" / "paper.json")
     assert (tmp_path / "paper.md").read_text(encoding="utf-8") == render(written)
     # Other processes, the same numbers.
-    part = Part("draws", BASE, 4)
+    part = EnsemblePart("draws", BASE, 4)
     here = results_of([(part, rows_of(PATH, part, range(4)))], {})
     key = ("draws", BASE.name)
     np.testing.assert_array_equal(written.tables[key], here.tables[key])
