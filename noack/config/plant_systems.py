@@ -9,10 +9,10 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
-from noack.config.matrices import Row, Rows, require_length
-from noack.config.section import NonNegative, Positive, ScenarioSection
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.matrices import Row, Rows, require_length
+from noack.settings.section import NonNegative, Positive, ScenarioSection
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]

@@ -6,8 +6,8 @@ without which nothing is run.
 
 from pathlib import Path
 
-from noack.config.named_file import NamedFile
 from noack.config.plant_systems import AnySystem, FmuSettings, PythonSettings
+from noack.settings.named_file import NamedFile
 
 
 def read_system(system: AnySystem, folder: Path, place: str) -> AnySystem:
