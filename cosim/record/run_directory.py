@@ -14,9 +14,9 @@ from typing import Any, TextIO
 
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
-from noack.config.user_files import file_tables, unchanged, with_tables
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.regular_file import read_regular
+from noack.settings.user_files import file_tables, unchanged, with_tables
 
 DEFAULT_RUNS = Path("runs")
 """Where run directories are made, in the folder where a person stands."""

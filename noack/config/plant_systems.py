@@ -9,12 +9,12 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
-from noack.config.matrices import Row, require_length
-from noack.config.section import NonNegative, Positive, ScenarioSection
-from noack.config.user_class import ClassSettings
-from noack.config.user_files import FileSettings
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.matrices import Row, require_length
+from noack.settings.section import NonNegative, Positive, ScenarioSection
+from noack.settings.user_class import ClassSettings
+from noack.settings.user_files import FileSettings
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 

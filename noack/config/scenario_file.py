@@ -13,8 +13,8 @@ from noack.config.impairment_files import read_impairment, read_loss
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
-from noack.config.user_files import file_tables, located, with_tables
 from noack.core.errors import CallerError, printable
+from noack.settings.user_files import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")

@@ -18,9 +18,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from noack.config.plant_systems import FmuSettings
-from noack.config.user_files import unchanged
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.settings.user_files import unchanged
 from plant_server.native_code import quiet, temporary_folder
 from plant_server.system import SystemFailedError
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from noack.config.plant_systems import PythonSettings
-from noack.config.user_class import failure_text, new_instance, read_only, real_vector
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.settings.user_class import failure_text, new_instance, read_only, real_vector
 from plant_server.ode_integrator import OdeSystem
 from plant_server.system import PlantSystem, SystemFailedError
 

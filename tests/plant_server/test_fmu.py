@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from noack.config.plant_systems import FmuSettings
-from noack.config.user_files import located
 from noack.core.errors import CallerError
+from noack.settings.user_files import located
 from plant_server.ode_integrator import OdeSystem
 from plant_server.plant_linearisation import linearise
 from plant_server.system import SystemFailedError

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from noack.config.plant_systems import PythonSettings
-from noack.config.user_files import located
 from noack.core.errors import CallerError
+from noack.settings.user_files import located
 from plant_server.system import SystemFailedError
 from plant_server.systems.python_plant import PythonSystem
 

@@ -10,8 +10,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from noack.config.named_file import NamedFile
-from noack.config.section import ScenarioSection
+from noack.settings.named_file import NamedFile
+from noack.settings.section import ScenarioSection
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Settings = TypeVar("Settings", bound="FileSettings")
