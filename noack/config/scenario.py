@@ -15,11 +15,9 @@ from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_val
 
 from noack.config.disturbances import require_disturbances, variance_at
 from noack.config.impairments import Loss, Mansd, TraceLoss, require_scores
-from noack.config.matrices import require_length, require_shape
 from noack.config.observers import AnyObserver, KalmanSettings
 from noack.config.plant_systems import LinearSettings
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
-from noack.config.section import ScenarioSection
 from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.model_section import ModelSection
 from noack.config.sections.network_section import NetworkSection
@@ -38,6 +36,8 @@ from noack.config.triggers import AnyTrigger, DecayingSettings, require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
+from noack.settings.matrices import require_length, require_shape
+from noack.settings.section import ScenarioSection
 
 _TIMEOUT_PERIODS = 5
 _WATCHDOG_PERIODS = 50
