@@ -15,7 +15,7 @@ from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_val
 
 from noack.config.disturbances import require_disturbances, variance_at
 from noack.config.impairments import Loss, Mansd, TraceLoss, require_scores
-from noack.config.observers import AnyObserver, KalmanSettings
+from noack.config.observers import AnyObserver
 from noack.config.plant_systems import LinearSettings
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.sections.controller_section import ControllerSection
@@ -35,6 +35,7 @@ from noack.config.setpoint import input_at
 from noack.config.triggers import AnyTrigger, DecayingSettings, require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.observers.estimation_model import NoiseVariances
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.matrices import require_length, require_shape
 from noack.settings.section import ScenarioSection
@@ -278,6 +279,16 @@ class Scenario(ScenarioSection):
             )
 
     @property
+    def noise_variances(self) -> NoiseVariances:
+        """Variances of the random disturbances and of the measurement noise."""
+        (n, m), plant = self.model.dimensions, self.plant
+        return NoiseVariances(
+            at_state=variance_at("state", plant.disturbances, n),
+            at_input=variance_at("input", plant.disturbances, m),
+            output=plant.measurement.variance(n),
+        )
+
+    @property
     def outputs(self) -> int:
         """How many outputs p are measured."""
         return self.plant.measurement.outputs(self.model.dimensions[0])
@@ -426,28 +437,12 @@ class Scenario(ScenarioSection):
                     "state; give one, or no C"
                 )
             return
-        observer.check(n, m, self.outputs)
+        observer.check(n, m, self.outputs, self.noise_variances)
         if self.measurement_entries > MAX_DIMENSION:
             raise ValueError(
                 "plant.measure_every: with an observer a measurement carries y and the inputs of "
                 f"{plant.measure_every} steps, {self.outputs} + {self.inputs_reported} numbers; "
                 f"at most {MAX_DIMENSION} fit"
-            )
-        if not isinstance(observer, KalmanSettings):
-            return
-        noise = plant.measurement.variance(n) if observer.noise_std is None else observer.noise_std
-        if observer.R is None and not all(np.array(noise) > 0):
-            raise ValueError(
-                "observer.noise_std: every output needs some noise, for the filter to weigh it; "
-                "give noise_std or R, or the measurement's own"
-            )
-        process, push = observer.process_std, observer.input_std
-        at_state = variance_at("state", plant.disturbances, n) if process is None else process
-        at_input = variance_at("input", plant.disturbances, m) if push is None else push
-        if not any(at_state) and not any(at_input) and not np.any(observer.Q or 0):
-            raise ValueError(
-                "observer.process_std: without any process noise the filter stops listening; "
-                "give process_std, input_std or Q, or random disturbances of the plant"
             )
 
     def _check_watchdog(self) -> None:

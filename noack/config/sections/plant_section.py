@@ -5,9 +5,9 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.disturbances import AnyDisturbance
-from noack.config.observers import Measurement
 from noack.config.plant_systems import AnySystem, LinearSettings
 from noack.config.sections.matrix_file_section import require_read
+from noack.config.sections.measurement_section import MeasurementSection
 from noack.config.sections.rates import RateHz, require_whole_period
 from noack.settings.matrices import Row, Rows, require_non_negative
 from noack.settings.section import ScenarioSection
@@ -52,7 +52,7 @@ class PlantSection(ScenarioSection):
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """A measurement is sent every so many steps."""
-    measurement: Measurement = Measurement()
+    measurement: MeasurementSection = MeasurementSection()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """What disturbs it, one added to the other."""
     watchdog: WatchdogSection = WatchdogSection()

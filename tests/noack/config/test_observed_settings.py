@@ -90,7 +90,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "observer.poles_per_s = [-5.0]: expected 2 poles (one per state, a pair counts twice), "
          "found 1"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, 1.0]},
-         "observer.poles_per_s = [-5.0, 1.0]: must have negative real parts, for the error to die"),
+         "observer.poles_per_s = [-5.0, 1.0]: need negative real parts, else the error grows"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [[-5.0, -1.0]]},
          "observer.poles_per_s = [[-5.0, -1.0]]: a pair [re, im] needs im > 0; write a real pole "
          "as a number"),
@@ -99,7 +99,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, -5.0]},
          "observer.poles_per_s: cannot be placed: "),
         ({"C": [[0.0, 1.0]]}, LUENBERGER,
-         "plant.measurement.C: no observer can follow: the mode e^(0"),
+         "plant.measurement.C: the model's mode e^(0"),
         (POSITION, {"kind": "kalman", "input_std": [0.1]},
          "observer.initial_std: missing (standard deviation of x − x̂ before the first measurement"),
         (POSITION, KALMAN | {"initial_std": [1.0]},
@@ -112,13 +112,13 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0], "Q": [[1.0, 2.0], [0.0, 1.0]]},
          "observer.Q = [[1.0, 2.0], [0.0, 1.0]]: must be symmetric"),
         ({"C": [[1.0, 0.0]]}, KALMAN,
-         "observer.noise_std: every output needs some noise, for the filter to weigh it; give "
+         "observer.noise_std: the filter needs noise in every output to weigh it; give "
          "noise_std or R, or the measurement's own"),
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0]},
-         "observer.process_std: without any process noise the filter stops listening; give "
+         "observer.process_std: without process noise the Kalman gain tends to 0; give "
          "process_std, input_std or Q, or random disturbances of the plant"),
         (POSITION, {"kind": "luenburger", "gain": [[1.0], [1.0]]},
-         'observer.kind = "luenburger": must be one of luenberger, kalman; '
+         'observer.kind = "luenburger": must be one of kalman, luenberger; '
          "did you mean luenberger?"),
     ],
 )  # fmt: skip
