@@ -60,7 +60,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
     }  # fmt: skip
     assert said_of(content) == (
-        'file: plant.disturbances.0.at = "state": "state" is for linear plants; '
+        'file: plant.disturbances.0.at = "state": "state" needs a linear plant; '
         'this one can be disturbed at "input"'
     )
 
