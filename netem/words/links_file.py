@@ -18,9 +18,9 @@ from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
 from noack.config.impairment_files import read_files
 from noack.config.impairments import LinkSettings
-from noack.config.section import ScenarioSection, Seed
 from noack.core.errors import CallerError
 from noack.runtime.address import parse_address
+from noack.settings.section import ScenarioSection, Seed
 
 
 def _settings(value: Any) -> Any:

@@ -13,7 +13,6 @@ from noack.config.message_sizes import MessageSizes
 from noack.config.observers import AnyObserver
 from noack.config.scenario_changes import check_changes
 from noack.config.scenario_checks import check_sections
-from noack.config.section import ScenarioSection
 from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.model_section import ModelSection
 from noack.config.sections.network_section import NetworkSection
@@ -30,6 +29,7 @@ from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
 from noack.config.triggers import AnyTrigger, DecayingSettings
 from noack.core.errors import CallerError
+from noack.settings.section import ScenarioSection
 
 MOST_CHANGES = 256
 """In a run."""

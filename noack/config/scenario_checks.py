@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from noack.config.disturbances import require_disturbances, variance_at
-from noack.config.matrices import require_length, require_shape
 from noack.config.observers import KalmanSettings
 from noack.config.setpoint import input_at
 from noack.config.triggers import require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.matrices import require_length, require_shape
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario
