@@ -47,7 +47,7 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     signals: dict[Place, list[Signal]] = {"input": [], "state": []}
     for number, one in enumerate(resolved.plant.disturbances):
         name = ("plant", "disturbance", str(number))
-        source = SignalSource(resolved.plant_period_ns, resolved.seeds.disturbance, name)
+        source = SignalSource(resolved.timing.plant_period_ns, resolved.seeds.disturbance, name)
         signals[one.at].append(partial(one.signal, source=source))
     return Disturbance(signals["input"], signals["state"])
 

@@ -139,5 +139,5 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> AppliedInputTracker |
     observer = settings.estimator(assumed_model(resolved), x)
     since_ns = 0 if knows_start else None
     return AppliedInputTracker(
-        observer, loop.m, resolved.outputs, resolved.plant_period_ns, since_ns
+        observer, loop.m, resolved.message_sizes.outputs, resolved.timing.plant_period_ns, since_ns
     )

@@ -28,9 +28,10 @@ class SteadyState(NamedTuple):
 
 def true_model(resolved: Scenario) -> EstimationModel:
     """The model with the covariances of the scenario's disturbances and noise."""
-    loop, plant, noise = loop_of(resolved), resolved.plant, resolved.noise_variances
-    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.plant_period_ns)
-    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.plant_period_ns)
+    loop, plant = loop_of(resolved), resolved.plant
+    noise = plant.noise_variances(loop.n, loop.m)
+    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
+    _, Gd = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
     C = np.eye(loop.n) if plant.measurement.C is None else np.array(plant.measurement.C)
     model = EstimationModel(
         Ad, Bd, Gd, C, np.zeros_like(Ad), np.diag(noise.output), plant.measure_every
@@ -41,7 +42,10 @@ def true_model(resolved: Scenario) -> EstimationModel:
 def assumed_model(resolved: Scenario) -> EstimationModel:
     """The model with the covariances that the observer assumes."""
     model, observer = true_model(resolved), resolved.observer
-    return model if observer is None else observer.assumed_model(model, resolved.noise_variances)
+    if observer is None:
+        return model
+    noise = resolved.plant.noise_variances(*resolved.model.dimensions)
+    return observer.assumed_model(model, noise)
 
 
 def steady_state(resolved: Scenario) -> SteadyState:

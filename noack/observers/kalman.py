@@ -65,8 +65,8 @@ class KalmanSettings(ObserverSettings):
         output = noise.output if self.noise_std is None else self.noise_std
         if self.R is None and not all(np.array(output) > 0):
             raise ValueError(
-                "observer.noise_std: the filter needs noise in every output to weigh it; "
-                "give noise_std or R, or the measurement's own"
+                "observer.noise_std: the filter needs a noise above 0 on every output; "
+                "give noise_std or R, or plant.measurement's noise"
             )
         at_state = noise.at_state if self.process_std is None else self.process_std
         at_input = noise.at_input if self.input_std is None else self.input_std
