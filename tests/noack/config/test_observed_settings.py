@@ -40,7 +40,7 @@ def said_of(content: dict[str, Any], **changes: Any) -> str:
          "plant.disturbances.0.until_s = 1.0: must be later than from_s"),
         ({"kind": "sine", "amplitude": [1.0]}, "plant.disturbances.0.hz: missing"),
         ({"kind": "sin", "amplitude": [1.0]}, "plant.disturbances.0.kind = \"sin\": must be one of "
-         "uniform, gaussian, sine, step; did you mean sine?"),
+         "gaussian, sine, step, uniform; did you mean sine?"),
         ({"kind": "sine", "amplitude": [1.0], "hz": 1.0, "at": "output"},
          "plant.disturbances.0.at = \"output\": should be 'input' or 'state'"),
         ({"kind": "uniform", "std": [1.0]}, "plant.disturbances.0.std = [1.0]: unknown key"),
