@@ -181,7 +181,11 @@ class RunEvidence:
     def theorem_2(self) -> Theorem2 | None:
         """Theorem 2 with the uniform Δ of (I1) for the paper's conditions; None if it has none."""
         scenario, loop = self.record.scenario, self.record.loop
-        if not scenario.is_certifiable or loop.weight is not None or scenario.decaying.floor > 0:
+        if (
+            not scenario.coverage.is_certifiable
+            or loop.weight is not None
+            or scenario.decaying.floor > 0
+        ):
             return None
         ideal, trigger = certify(scenario, ideal_conditions(scenario)).constants, scenario.decaying
         if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
@@ -206,7 +210,7 @@ def scheduled_certificates(
         start_error: for a run that begins with an input of an earlier run; see
             :class:`noack.theory.scenario_certificates.CertificateScope`.
     """
-    if not scenario.is_certifiable:
+    if not scenario.coverage.is_certifiable:
         return []
     conditions, error = allowed_conditions(scenario), 0.0
     if start_error is not None:

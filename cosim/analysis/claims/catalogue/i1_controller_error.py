@@ -10,7 +10,7 @@ from cosim.analysis.claims.shared_bounds import controller_error_bound
 
 
 def _bound(run: RunEvidence) -> Bound:
-    error = "e_c" if run.record.scenario.knows_state else "x_c − x̂"
+    error = "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂"
     formula = f"‖{error}‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖"
     return controller_error_bound(run, formula, run.error_bounds[0])
 

@@ -31,7 +31,7 @@ def _margin(run: RunEvidence) -> float:
 
     n ε sup‖e^{Hτ}‖ over the time τ between deliveries, at most 1e-6.
     """
-    loop, period_ns = run.record.loop, run.record.scenario.measurement_period_ns
+    loop, period_ns = run.record.loop, run.record.scenario.timing.measurement_period_ns
     fresh_ns = run.joined.t_ns[np.flatnonzero(np.diff(run.joined.received, prepend=-1))]
     ends_ns = np.append(fresh_ns, run.joined.t_ns[-1])
     longest_ns = int(np.diff(ends_ns).max(initial=0))

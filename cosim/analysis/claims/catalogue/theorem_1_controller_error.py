@@ -108,7 +108,11 @@ def _intervals(
 
 def _bound(run: RunEvidence) -> Bound | None:
     scenario = run.record.scenario
-    if not scenario.is_certifiable or not scenario.knows_state or scenario.decaying.floor > 0:
+    if (
+        not scenario.coverage.is_certifiable
+        or not scenario.coverage.knows_state
+        or scenario.decaying.floor > 0
+    ):
         return None
     void = run.paper_violation
     until_s = run.until_s if void is None else min(run.until_s, void.t_s)

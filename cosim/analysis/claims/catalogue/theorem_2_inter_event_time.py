@@ -7,7 +7,7 @@ from cosim.analysis.claims.shared_bounds import inter_event_bound, inter_event_e
 
 
 def _bound(run: RunEvidence) -> Bound | None:
-    if not run.record.scenario.knows_state or run.theorem_2 is None:
+    if not run.record.scenario.coverage.knows_state or run.theorem_2 is None:
         return None
     return inter_event_bound(run, run.theorem_2.inter_event_s, run.paper_violation)
 

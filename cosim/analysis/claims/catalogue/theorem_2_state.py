@@ -14,7 +14,7 @@ def _envelope(run: RunEvidence) -> Envelope | None:
 
 
 def _bound(run: RunEvidence) -> Bound | None:
-    if not run.record.scenario.knows_state or (envelope := _envelope(run)) is None:
+    if not run.record.scenario.coverage.knows_state or (envelope := _envelope(run)) is None:
         return None
     shares = upper_shares(row_norms(run.joined.x), envelope.values)
     formula = "‖x‖ ≤ c x₀ e^(−ᾱt) + g (e^(−αt) − e^(−ᾱt))"
