@@ -272,7 +272,7 @@ class Recorder:
             self._see_run(rows["dropouts"])
         elif table == NETEM_PACKET:
             rows = updates_in(rows)[0]
-            self._see_run(rows["drop_run"][~effective(rows["fate"])])
+            self._see_run(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _judge(self, guard: Callable[[], list[AssumptionViolation]]) -> None:
         """Say that claims are void, in the record, the view and the account."""
