@@ -113,7 +113,7 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print what a plant is near its operating point, and what holds of keys without a value."""
     from cosim.analysis.model_comparison import linearisation, said
-    from plant_server.systems.system_from_settings import system_of
+    from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
