@@ -53,7 +53,7 @@ def disturbance_of(resolved: Scenario) -> Disturbance | None:
     disturbances = resolved.plant.disturbances
     if not disturbances:
         return None
-    seed, period_ns = resolved.seeds.disturbance, resolved.plant_period_ns
+    seed, period_ns = resolved.seeds.disturbance, resolved.timing.plant_period_ns
     found: dict[Place, list[Rows]] = {"input": [], "state": []}
     for number, one in enumerate(disturbances):
         found[one.at].append(_rows_of(one, seed, number, period_ns))

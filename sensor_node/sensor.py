@@ -138,9 +138,9 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
     loop, policy = loop_of(resolved), policy_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.again
     x0 = loop.x0 if known else None
-    period_ns, first = resolved.measurement_period_ns, start.first_number
+    period_ns, first = resolved.timing.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:
-        timeout_ns = resolved.acknowledgement_timeout_ns
+        timeout_ns = resolved.timing.acknowledgement_timeout_ns
         return AcknowledgedSensor(
             loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first
         )

@@ -220,5 +220,7 @@ def observer_of(resolved: Scenario, *, known: bool) -> AppliedInputTracker | Non
             observer = LuenbergerObserver(model, np.array(settings.gain), x)
         case KalmanSettings():
             observer = KalmanObserver(model, x, np.diag(np.square(settings.initial_std)))
-    period_ns, since_ns = resolved.plant_period_ns, 0 if told else None
-    return AppliedInputTracker(observer, loop.m, resolved.outputs, period_ns, since_ns)
+    period_ns, since_ns = resolved.timing.plant_period_ns, 0 if told else None
+    return AppliedInputTracker(
+        observer, loop.m, resolved.message_sizes.outputs, period_ns, since_ns
+    )

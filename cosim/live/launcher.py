@@ -288,7 +288,7 @@ class _Run:
                 return lost.status, f"{lost.why}; no other came within {lost.within_s:g} s"
         for role, (status, why) in self._casualties(coordinator).items():
             within_s = self._rejoin_within_s(role)
-            over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+            over = coordinator.now_ns() >= self._ticket.scenario.timing.horizon_ns
             if coordinator.epoch_ns is None or over or role == PLANT or not within_s:
                 return status, why
             if self._gave_up(role):  # so would another
@@ -327,7 +327,7 @@ class _Run:
 
     def _over_its_record(self, coordinator: Coordinator) -> bool:
         """Whether the recorder may be busy with a long record's end, and not hear its peers."""
-        over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+        over = coordinator.now_ns() >= self._ticket.scenario.timing.horizon_ns
         return over and self._is_running(RECORDER)
 
     def _is_running(self, role: str) -> bool:

@@ -10,9 +10,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Discriminator, Field, FiniteFloat, model_validator
 
-from noack.config.matrices import Row, require_length, require_squares
-from noack.config.section import NonNegative, Positive, ScenarioSection
 from noack.core.linear_systems import Vector
+from noack.settings.matrices import Row, require_length, require_squares
+from noack.settings.section import NonNegative, Positive, ScenarioSection
 
 Place = Literal["input", "state"]
 

@@ -5,9 +5,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Discriminator, FiniteFloat, model_validator
 
-from noack.config.matrices import Row, Rows, require_length, require_shape, require_squares
-from noack.config.section import ScenarioSection
 from noack.core.linear_systems import Vector
+from noack.settings.matrices import Row, Rows, require_length, require_shape, require_squares
+from noack.settings.section import ScenarioSection
 
 Pole = FiniteFloat | tuple[FiniteFloat, ...]
 

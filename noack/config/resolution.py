@@ -85,15 +85,15 @@ def resolve(scenario: Scenario) -> Scenario:
         A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
         B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
     K = np.array(model.gain)
-    _require_finite("plant", A, B, scenario.plant_period_ns)
+    _require_finite("plant", A, B, scenario.timing.plant_period_ns)
     if scenario.mode == "model":
         H = np.array(model.A) + np.array(model.B) @ K
-        _require_finite("model", H, K.T, scenario.controller_period_ns)
+        _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
     drawn: dict[str, object] = {
         "initial_state": tuple(x0.tolist()),
         "initial_state_halfwidth": None,
     }
-    if scenario.is_linear:
+    if scenario.coverage.is_linear:
         drawn |= {"draw": "given", "A": _rows(A), "B": _rows(B)}
     update = {"model": model, "plant": plant.model_copy(update=drawn)}
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
@@ -134,14 +134,14 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """The row types of the tables that runs of a resolved scenario have."""
     n, m = resolved.model.dimensions
-    acknowledged, predictive = resolved.is_acknowledged, resolved.is_predictive
+    acknowledged, predictive = resolved.is_acknowledged, resolved.message_sizes.is_predictive
     internal = len(resolved.plant.system.internal_names)
     disturbed = {one.at for one in resolved.plant.disturbances}
     return tables(
         n, m, acknowledged=acknowledged, predictive=predictive, internal=internal,
         disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
-        outputs=0 if resolved.observer is None else resolved.outputs,
-        inputs_reported=resolved.inputs_reported,
+        outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
+        inputs_reported=resolved.message_sizes.inputs_reported,
     )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
     A, n = np.array(model.A), len(model.A or ())
     given = scenario.plant.measurement.C
     C = np.eye(n) if given is None else np.array(given)
-    period_ns = scenario.measurement_period_ns
+    period_ns = scenario.timing.measurement_period_ns
     with np.errstate(all="ignore"):
         step = transition(A, period_ns)
     if not np.isfinite(step).all():

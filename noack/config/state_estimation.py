@@ -55,8 +55,8 @@ class SteadyState(NamedTuple):
 def true_model(resolved: Scenario) -> EstimationModel:
     """The model, with the disturbances and noise that the scenario really has."""
     loop, plant = loop_of(resolved), resolved.plant
-    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.plant_period_ns)
-    _, G = discretise(loop.A_model, np.eye(loop.n), resolved.plant_period_ns)
+    Ad, Bd = discretise(loop.A_model, loop.B_model, resolved.timing.plant_period_ns)
+    _, G = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
     at_state = variance_at("state", plant.disturbances, loop.n)
     at_input = variance_at("input", plant.disturbances, loop.m)
     Q = _spread(G, at_state) + _spread(Bd, at_input)
@@ -75,7 +75,7 @@ def believed_model(resolved: Scenario) -> EstimationModel:
     if kalman.Q is not None:
         Q = np.array(kalman.Q)
     elif kalman.process_std is not None or kalman.input_std is not None:
-        _, G = discretise(loop.A_model, np.eye(loop.n), resolved.plant_period_ns)
+        _, G = discretise(loop.A_model, np.eye(loop.n), resolved.timing.plant_period_ns)
         at_state = variance_at("state", disturbances, loop.n)
         at_input = variance_at("input", disturbances, loop.m)
         if kalman.process_std is not None:

@@ -45,7 +45,7 @@ def steps_of(plant: Plant, scenario: Scenario, count: int) -> tuple[Any, list[Me
     rows, sent = [], []
     for k in range(count):
         plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)
-        for out in plant.on_timer(k * scenario.plant_period_ns):
+        for out in plant.on_timer(k * scenario.timing.plant_period_ns):
             if isinstance(out, Record):
                 rows.append(out.row)
             elif isinstance(out, Message):

@@ -107,4 +107,4 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     """
     if scenario.is_acknowledged:
         return ()
-    return tuple(CAUSES) if scenario.is_certifiable else ("sampling",)
+    return tuple(CAUSES) if scenario.coverage.is_certifiable else ("sampling",)

@@ -267,7 +267,7 @@ class ClaimEvaluation:
     def _theorem_2(self) -> Theorem2 | None:
         """With the uniform Δ of (I1) under the paper's conditions, which Theorem 1 lacks."""
         scenario = self.record.scenario
-        if not scenario.is_certifiable:
+        if not scenario.coverage.is_certifiable:
             return None
         ideal = certify(scenario, ideal_conditions(scenario)).constants
         if ideal is None or ideal.rate_per_s != scenario.decaying.alpha_per_s:
@@ -297,7 +297,7 @@ class ClaimEvaluation:
             "x_c − x_s = Σ e^(H(t−t_k)) e_s(t_k), to {:.0e} of the larger", margin,
             self._t_s[here], residual / (margin * scale), self._unknown, "",
         )  # fmt: skip
-        known = self.record.scenario.knows_state
+        known = self.record.scenario.coverage.knows_state
         yield self._controller_error(
             "the controller's error is at most what was missed"
             + ("" if known else ", against what the sensor takes for x"), "(I1)",
@@ -311,7 +311,7 @@ class ClaimEvaluation:
         Where e^{Hτ} grows before it decays, it makes rounding grow with it, n ε sup‖e^{Hτ}‖ in the
         time between two deliveries; but of a millionth is said that it is none.
         """
-        loop, period_ns = self.record.loop, self.record.scenario.measurement_period_ns
+        loop, period_ns = self.record.loop, self.record.scenario.timing.measurement_period_ns
         fresh_ns = self.joined.t_ns[np.flatnonzero(np.diff(self.joined.received, prepend=-1))]
         ends_ns = np.append(fresh_ns, self.joined.t_ns[-1])
         longest_ns = int(np.diff(ends_ns).max(initial=0))
@@ -324,7 +324,10 @@ class ClaimEvaluation:
 
     def _printed(self) -> Iterator[Claim]:
         # An estimate, or noise, jumps at every measurement: no trigger keeps e_s below a threshold.
-        if not self.record.scenario.is_decaying or not self.record.scenario.knows_state:
+        if (
+            not self.record.scenario.coverage.is_decaying
+            or not self.record.scenario.coverage.knows_state
+        ):
             return
         ideal = (
             "assumes a continuous trigger, and a network and input without delay, which no sampled "
@@ -336,7 +339,7 @@ class ClaimEvaluation:
             "‖e_c‖ ≤ βe^(−αt) + Σ βe^(−αt_k) ‖e^(H(t−t_k))‖", None, self._bounds[1],
             self._unknown, ideal,
         )  # fmt: skip
-        if not self.record.scenario.is_certifiable:
+        if not self.record.scenario.coverage.is_certifiable:
             return
         trigger = self.record.scenario.decaying
         delta = theorem_one(self.record, self.joined, min(until_s, left[0]) if left else until_s)
@@ -472,7 +475,7 @@ def scheduled_certificates(
         scenario: the scenario.
         start_error: of a run that begins with the input of an earlier one; see ``Scope``.
     """
-    if not scenario.is_certifiable:
+    if not scenario.coverage.is_certifiable:
         return []
     conditions, error = allowed_conditions(scenario), 0.0
     if start_error is not None:

@@ -257,7 +257,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
     steps = steps[: int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1]
     if len(steps) < 2:
         return 0.0
-    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.plant_period_ns * 1e-9
+    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.timing.plant_period_ns * 1e-9
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
@@ -270,7 +270,7 @@ def _start_error(own: RunRecord, started_s: float) -> float:
 def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
     """Why nothing is certified at a scenario's set-point, by scope: a plant may not rest there."""
     setpoint = setpoint_of(scenario)
-    if setpoint is None or not scenario.is_linear:
+    if setpoint is None or not scenario.coverage.is_linear:
         return {}
     x_r, u_r = setpoint
     loop, plant = record.loop, scenario.plant

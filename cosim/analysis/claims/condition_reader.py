@@ -59,7 +59,7 @@ class ConditionReader:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._timeout_s = scenario.actuation_timeout_ns / NS_PER_S
+        self._timeout_s = scenario.timing.actuation_timeout_ns / NS_PER_S
         self._gaps = _Gaps()
         self._sensors = _Sensors()
         self._ticks = _Ticks()
@@ -205,8 +205,8 @@ class _Inputs:
     """What the plant's inputs rest on, step by step."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._period_ns = scenario.plant_period_ns
-        self._timeout_ns = scenario.actuation_timeout_ns
+        self._period_ns = scenario.timing.plant_period_ns
+        self._timeout_ns = scenario.timing.actuation_timeout_ns
         self._replaces = scenario.plant.watchdog.policy != "hold"
         known = scenario.network.initial_sync == "known_state"
         self._knowing: dict[int, int] = {0: 0} if known else {}

@@ -5,12 +5,12 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.disturbances import AnyDisturbance
-from noack.config.matrices import Row, Rows, require_non_negative
 from noack.config.observers import Measurement
 from noack.config.plant_systems import AnySystem, LinearSettings
-from noack.config.section import ScenarioSection
 from noack.config.sections.matrix_file_section import require_read
 from noack.config.sections.rates import RateHz, require_whole_period
+from noack.settings.matrices import Row, Rows, require_non_negative
+from noack.settings.section import ScenarioSection
 
 
 class WatchdogSection(ScenarioSection):

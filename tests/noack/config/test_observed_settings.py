@@ -70,7 +70,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
     [
         ({"C": [[1.0, 0.0]]}, None,
          "plant.measurement.C = [[1.0, 0.0]]: without an [observer] the sensor has to measure "
-         "every state; give one, or no C"),
+         "every state; give an [observer], or no C"),
         ({"C": [[1.0]]}, KALMAN,
          "plant.measurement.C = [[1.0]]: expected 1 x 2 (the model has 2 states and 1 inputs; "
          "one row per output), found 1 x 1"),
@@ -112,10 +112,10 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0], "Q": [[1.0, 2.0], [0.0, 1.0]]},
          "observer.Q = [[1.0, 2.0], [0.0, 1.0]]: must be symmetric"),
         ({"C": [[1.0, 0.0]]}, KALMAN,
-         "observer.noise_std: every output needs some noise, for the filter to weigh it; give "
-         "noise_std or R, or the measurement's own"),
+         "observer.noise_std: the filter needs a noise above 0 on every output; give noise_std "
+         "or R, or plant.measurement's noise"),
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0]},
-         "observer.process_std: without any process noise the filter stops listening; give "
+         "observer.process_std: without process noise the Kalman gain tends to 0; give "
          "process_std, input_std or Q, or random disturbances of the plant"),
         (POSITION, {"kind": "luenburger", "gain": [[1.0], [1.0]]},
          'observer.kind = "luenburger": must be one of luenberger, kalman; '
@@ -142,7 +142,7 @@ def test_what_a_datagram_cannot_carry(content: dict[str, Any]) -> None:
 def test_every_flow_has_its_length(content: dict[str, Any]) -> None:
     content["plant"] |= {"measurement": POSITION, "measure_every": 3}
     scenario = validate(content | {"observer": KALMAN}, "file")
-    lengths = [scenario.entries(flow) for flow in Flow]
+    lengths = [scenario.message_sizes.entries(flow) for flow in Flow]
     assert lengths == [1 + 3, 2, 1, 0]  # y and three inputs; x̂; u; nothing
 
 

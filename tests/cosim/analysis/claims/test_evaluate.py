@@ -324,7 +324,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
 def hostile(resolved: Scenario, seed: int) -> Any:
     """Loses all it may, or some, and is as late as is allowed, or less."""
     rng = np.random.default_rng(seed)
-    late_ns = resolved.certificate.late_periods * resolved.plant_period_ns
+    late_ns = resolved.certificate.late_periods * resolved.timing.plant_period_ns
     known = resolved.network.initial_sync == "known_state"
     share, events, run = float(rng.choice([0.5, 1.0])), 0, 0
 

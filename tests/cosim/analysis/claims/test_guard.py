@@ -239,7 +239,9 @@ def sensor_anew(make: Make) -> tuple[RunRecord, float]:
     resolved, at_ns = make(), 50_000_000
     successor = sensor_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "sensor", lambda one: Reborn(one, successor, at_ns))
-    assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == resolved.measurement_period_ns).all()
+    assert (
+        np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == resolved.timing.measurement_period_ns
+    ).all()
     return record, 0.05
 
 
