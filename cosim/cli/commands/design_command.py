@@ -21,8 +21,9 @@ from cosim.cli.command import (
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load, value_of
-from noack.core.errors import CallerError, ExitStatus, MachineError
+from noack.core.errors import CallerError, ExitStatus
 from noack.core.linear_systems import Matrix
+from noack.core.whole_file import write_whole
 
 if TYPE_CHECKING:
     from cosim.studies.design.candidate_measures import DesignLimits
@@ -113,9 +114,11 @@ def design(
         families = families_of(loaded, norms, _regulator(loaded, gain, Q, R), progress)
     with work_bar("trying candidates") as progress:
         found = designed(families, limits, draws=draws, seed=seed, progress=progress)
-    written = [_write(page or DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))]
+    written = [
+        write_whole(page or DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))
+    ]
     if out is not None and found.feasible:
-        written.append(_write(out, dumps(found.scenario)))
+        written.append(write_whole(out, dumps(found.scenario)))
     if json:
         print_json(found.document() | {"files": [str(path) for path in written]})
     else:
@@ -188,14 +191,3 @@ def _matrix(option: str, text: str | None, size: int) -> Matrix:
             f"diagonal, e.g. '{example}'"
         )
     return value
-
-
-def _write(path: Path, text: str) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        scratch = path.with_name(f".{path.name}.partial")
-        scratch.write_text(text, encoding="utf-8")
-        scratch.replace(path)
-    except OSError as error:
-        raise MachineError(f"{path}: cannot be written: {error.strerror or error}") from None
-    return path

@@ -30,11 +30,15 @@ def fidelity(
     from cosim.analysis.fidelity import compute_fidelity
     from cosim.live.progress import PatientConsole
     from cosim.output.fidelity_table import print_fidelity
+    from cosim.output.report.figure_files import save_figure
+    from cosim.output.report.signal_figures import fidelity_figure
     from cosim.record.run_record import load_record
 
     path = chosen_run(run_dir, runs)
     with PatientConsole(stderr=True).status("comparing"):
         found = compute_fidelity(load_record(path))
+        if out is not None:
+            save_figure(fidelity_figure(found), out)
     if json:
         print_json(found.as_json())
     else:

@@ -37,7 +37,9 @@ def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
     assert result.stdout == ""
 
 
-def test_check_prints_the_defaults_that_depend_on_other_keys(tmp_path: Path, content: dict[str, Any]) -> None:
+def test_check_prints_the_defaults_that_depend_on_other_keys(
+    tmp_path: Path, content: dict[str, Any]
+) -> None:
     path = tmp_path / "small.toml"
 
     def said() -> str:

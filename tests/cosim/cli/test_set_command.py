@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cosim.cli.commands.set_command import parsed
 from typer.testing import CliRunner
 
-
 from cosim.cli import app
+from cosim.cli.commands.set_command import parsed
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
