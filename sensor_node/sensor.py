@@ -18,7 +18,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy, Trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
-from sensor_node.state_observer import ObservingSensor, observer_of
+from sensor_node.observing_sensor import ObservingSensor, observer_of
 
 
 class Sensor:
@@ -126,11 +126,11 @@ def sensor_of(
 
     One that is started anew transmits its first measurement.
     """
-    observer = observer_of(resolved, known=not start.again)
+    observer = observer_of(resolved, restarted=start.again)
     sensor = _triggering(resolved, start)
     if observer is None:
         return sensor
-    return ObservingSensor(observer, sensor, again=start.again)
+    return ObservingSensor(observer, sensor, restarted=start.again)
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:

@@ -10,14 +10,14 @@ from typing import Literal
 import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
-from noack.config.observability import observer_gain, unseen_mode
-from noack.config.observers import AnyObserver, LuenbergerSettings
+from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
 from noack.config.setpoint import input_at
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
+from noack.observers.observability import unobservable_mode
 from noack.protocol.record_tables import entry_names, tables
 
 _SURELY_FINITE = 600.0
@@ -146,7 +146,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
 
 
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
-    """The observer, with a gain where it has poles."""
+    """The observer with its gain; refused if the measurement does not show an unstable mode."""
     observer = scenario.observer
     if observer is None:
         return None
@@ -158,23 +158,16 @@ def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
         step = transition(A, period_ns)
     if not np.isfinite(step).all():
         raise CallerError(
-            "model.A: it takes one time between measurements to infinity; check its size"
+            "model.A: e^(AT) is not finite, T being the time between measurements; check its size"
         )
-    if (mode := unseen_mode(step, C)) is not None:
+    if (mode := unobservable_mode(step, C)) is not None:
         rate_per_s = np.log(mode) / (period_ns * 1e-9)
         rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
         raise CallerError(
-            f"plant.measurement.C: no observer can follow: the mode e^({rate} t) of "
-            "the model does not show in what is measured, and does not decay"
+            f"plant.measurement.C: the model's mode e^({rate} t) does not decay and does not "
+            "appear in what is measured; no observer can estimate it"
         )
-    if isinstance(observer, LuenbergerSettings) and observer.poles_per_s is not None:
-        try:
-            z = tuple(complex(np.exp(pole * period_ns * 1e-9)) for pole in observer.poles)
-            gain = observer_gain(step, C, z)
-        except ValueError as error:
-            raise CallerError(f"observer.poles_per_s: cannot be placed: {error}") from None
-        return observer.model_copy(update={"gain": _rows(gain), "poles_per_s": None})
-    return observer
+    return observer.resolved(step, C, period_ns)
 
 
 def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:

@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from noack.config.disturbances import require_disturbances, variance_at
-from noack.config.observers import KalmanSettings
+from noack.config.disturbances import require_disturbances
 from noack.config.setpoint import input_at
 from noack.config.triggers import require_on_grid
 from noack.core.clock import NS_PER_S
@@ -93,33 +92,12 @@ def _check_observer(scenario: "Scenario") -> None:
                 "state; give an [observer], or no C"
             )
         return
-    observer.check(n, m, sizes.outputs)
+    observer.check(n, m, sizes.outputs, plant.noise_variances(n, m))
     if sizes.measurement_entries > MAX_DIMENSION:
         raise ValueError(
             "plant.measure_every: with an observer a measurement carries y and the inputs of "
             f"{plant.measure_every} steps, {sizes.outputs} + {sizes.inputs_reported} numbers; "
             f"at most {MAX_DIMENSION} fit"
-        )
-    if isinstance(observer, KalmanSettings):
-        _check_noise(scenario, observer)
-
-
-def _check_noise(scenario: "Scenario", observer: KalmanSettings) -> None:
-    """Check that the Kalman filter has measurement noise and process noise to weigh."""
-    (n, m), plant = scenario.model.dimensions, scenario.plant
-    noise = plant.measurement.variance(n) if observer.noise_std is None else observer.noise_std
-    if observer.R is None and not all(np.array(noise) > 0):
-        raise ValueError(
-            "observer.noise_std: the filter needs a noise above 0 on every output; "
-            "give noise_std or R, or plant.measurement's noise"
-        )
-    process, push = observer.process_std, observer.input_std
-    at_state = variance_at("state", plant.disturbances, n) if process is None else process
-    at_input = variance_at("input", plant.disturbances, m) if push is None else push
-    if not any(at_state) and not any(at_input) and not np.any(observer.Q or 0):
-        raise ValueError(
-            "observer.process_std: without process noise the Kalman gain tends to 0; "
-            "give process_std, input_std or Q, or random disturbances of the plant"
         )
 
 

@@ -7,11 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-from noack.config.disturbances import GaussianDisturbance, StepDisturbance, UniformDisturbance
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.random_streams import normals
+from noack.disturbances.gaussian import GaussianDisturbance
+from noack.disturbances.step import StepDisturbance
+from noack.disturbances.uniform import UniformDisturbance
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import disturbance_of

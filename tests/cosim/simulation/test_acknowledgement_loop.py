@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.live.simulated_run import simulate_run

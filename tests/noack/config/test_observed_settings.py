@@ -40,7 +40,7 @@ def said_of(content: dict[str, Any], **changes: Any) -> str:
          "plant.disturbances.0.until_s = 1.0: must be later than from_s"),
         ({"kind": "sine", "amplitude": [1.0]}, "plant.disturbances.0.hz: missing"),
         ({"kind": "sin", "amplitude": [1.0]}, "plant.disturbances.0.kind = \"sin\": must be one of "
-         "uniform, gaussian, sine, step; did you mean sine?"),
+         "gaussian, sine, step, uniform; did you mean sine?"),
         ({"kind": "sine", "amplitude": [1.0], "hz": 1.0, "at": "output"},
          "plant.disturbances.0.at = \"output\": should be 'input' or 'state'"),
         ({"kind": "uniform", "std": [1.0]}, "plant.disturbances.0.std = [1.0]: unknown key"),
@@ -60,7 +60,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
     }  # fmt: skip
     assert said_of(content) == (
-        'file: plant.disturbances.0.at = "state": "state" is for linear plants; '
+        'file: plant.disturbances.0.at = "state": "state" needs a linear plant; '
         'this one can be disturbed at "input"'
     )
 
@@ -90,7 +90,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "observer.poles_per_s = [-5.0]: expected 2 poles (one per state, a pair counts twice), "
          "found 1"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, 1.0]},
-         "observer.poles_per_s = [-5.0, 1.0]: must have negative real parts, for the error to die"),
+         "observer.poles_per_s = [-5.0, 1.0]: need negative real parts, else the error grows"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [[-5.0, -1.0]]},
          "observer.poles_per_s = [[-5.0, -1.0]]: a pair [re, im] needs im > 0; write a real pole "
          "as a number"),
@@ -99,7 +99,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, -5.0]},
          "observer.poles_per_s: cannot be placed: "),
         ({"C": [[0.0, 1.0]]}, LUENBERGER,
-         "plant.measurement.C: no observer can follow: the mode e^(0"),
+         "plant.measurement.C: the model's mode e^(0"),
         (POSITION, {"kind": "kalman", "input_std": [0.1]},
          "observer.initial_std: missing (standard deviation of x − x̂ before the first measurement"),
         (POSITION, KALMAN | {"initial_std": [1.0]},
@@ -118,7 +118,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "observer.process_std: without process noise the Kalman gain tends to 0; give "
          "process_std, input_std or Q, or random disturbances of the plant"),
         (POSITION, {"kind": "luenburger", "gain": [[1.0], [1.0]]},
-         'observer.kind = "luenburger": must be one of luenberger, kalman; '
+         'observer.kind = "luenburger": must be one of kalman, luenberger; '
          "did you mean luenberger?"),
     ],
 )  # fmt: skip
