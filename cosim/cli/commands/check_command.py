@@ -61,7 +61,7 @@ def check(
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
     from cosim.analysis.model_comparison import linearisation, said
-    from plant_server.systems.system_from_settings import system_of
+    from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)

@@ -6,14 +6,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.cli.command import THEORY, JsonOption, command, cores, find_scenario, print_json
+from cosim.cli.command import THEORY, JsonOption, command, cores, print_json
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import ExitStatus
 
 
 @command(THEORY, 30, [
     ("noack paper", "1,000 draws into runs/paper; takes some minutes"),
-    ("noack paper --draws 50 --out paper --json", "fewer draws"),
+    ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
     *,
@@ -30,11 +30,10 @@ def paper(
     from cosim.studies.paper.paper_run import document, make_folder, reproduce, write_page
     from cosim.studies.paper.paper_table import print_claims
 
-    path = find_scenario("lane_following")
     make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = reproduce(path, draws, cores(), progress)
-    found = document(results, write_page(path, results, out))
+        results = reproduce(draws, cores(), progress)
+    found = document(results, write_page(results, out))
     if json:
         print_json(found)
     else:

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numba
 import pytest
 
-from noack.runtime.code_cache import _one_at_a_time, cache_folder, compiler
+from noack.core.code_cache import _one_at_a_time, cache_folder, compiler
 
 SOURCES = [Path(__file__)]
 
@@ -52,8 +52,8 @@ def test_what_is_compiled_is_kept_there(home: Path) -> None:
 COMPILED_LATER = """
 import sys
 from pathlib import Path
-from noack.runtime.code_cache import compiler
-from tests.noack.runtime.test_code_cache import doubled
+from noack.core.code_cache import compiler
+from tests.noack.core.test_code_cache import doubled
 function = compiler(Path(sys.argv[1]))(doubled)
 print("began", flush=True)
 assert function(21) == 42

@@ -17,12 +17,12 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from noack.config.plant_systems import FmuSettings
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.plants.fmu import FmuSettings
+from noack.plants.systems.native_code import quiet, temporary_folder
+from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.user_files import unchanged
-from plant_server.native_code import quiet, temporary_folder
-from plant_server.system import SystemFailedError
 
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
 """Statuses of FMI."""

@@ -39,7 +39,7 @@ def test_a_period_must_make_sense(period: str) -> None:
 
 
 def test_lines_and_view_do_not_share_a_terminal() -> None:
-    with pytest.raises(CallerError, match="both want the terminal"):
+    with pytest.raises(CallerError, match="both use standard output"):
         options("--stats", "1", "--view")
 
 
@@ -61,9 +61,9 @@ def test_what_is_at_its_side_ends_with_the_relay(relay: FakeRelay, tmp_path: Pat
         assert running() == ["lab"]
         assert sys.getswitchinterval() < interval
         for _ in range(3):
-            side.housekeeping()
+            side.commands.run_pending()
         relay.counters["up", "forward"].arrived = 5
-        assert side.look().links[0].forward.counters.arrived == 5
+        assert side.commands.look().links[0].forward.counters.arrived == 5
     assert running() == []
     assert threading.active_count() == threads
     assert sys.getswitchinterval() == interval
@@ -78,10 +78,10 @@ def test_a_full_disk_is_told_and_the_relay_goes_on(
     monkeypatch.setattr(sys, "stderr", error)
     with attached(relay, Options(stats_s=0.01, stats_file=Path("/dev/full"))) as side:
         while not error.getvalue().endswith("\n"):
-            side.housekeeping()
+            side.commands.run_pending()
     assert error.getvalue() == (
-        "noack netem: statistics can no longer be written to /dev/full "
-        "(No space left on device); the relay goes on\n"
+        "noack netem: statistics cannot be written to /dev/full "
+        "(No space left on device); the relay continues\n"
     )
 
 

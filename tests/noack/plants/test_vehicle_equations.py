@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plant_systems import FourTankSettings, VehicleSettings
-from plant_server.systems import equations as compiled
-from plant_server.systems.equations import equations, library
-from plant_server.systems.system_from_settings import prepare
+from noack.plants.four_tank import FourTankSettings
+from noack.plants.systems import vehicle_equations as compiled
+from noack.plants.systems.vehicle_equations import equations, library
+from noack.plants.vehicle import VehicleSettings
 
 CARS = (1, 2, 3)
 WIDTHS = {"ks": 5, "st": 7, "std": 9, "mb": 29}
@@ -54,8 +54,8 @@ def test_they_say_what_the_library_says(model: str, car: int) -> None:
 
 @pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
 def test_those_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
-    assert (compiled.prepare(model) is not None) == is_compiled
-    assert compiled.kept(model)
+    assert (compiled.compiled_dynamics(model) is not None) == is_compiled
+    assert compiled.is_compiled(model)
 
 
 def test_they_take_the_parameters_that_they_are_given() -> None:
@@ -78,8 +78,8 @@ def test_what_cannot_be_compiled_is_run_as_it_is(
 
     monkeypatch.setattr(compiled, "_dynamics", lambda model: dynamics)
     monkeypatch.setattr(compiled, "_COMPILED", ("other",))
-    prepare_anew = compiled.prepare.__wrapped__
-    monkeypatch.setattr(compiled, "prepare", prepare_anew)
+    uncached = compiled.compiled_dynamics.__wrapped__
+    monkeypatch.setattr(compiled, "compiled_dynamics", uncached)
     rates = equations("other", parameters(2))
     assert rates(np.array([1.0, 3.0]), 0.0, 0.0).tolist() == [2.0, 6.0]
     told = capsys.readouterr().err.splitlines()
@@ -88,11 +88,10 @@ def test_what_cannot_be_compiled_is_run_as_it_is(
 
 def test_they_are_compiled_before_a_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
-    monkeypatch.setattr(compiled, "prepare", made.append)
-    monkeypatch.setattr(compiled, "kept", lambda model: model == "st")
-    prepare(VehicleSettings(kind="vehicle"))
-    prepare(VehicleSettings(kind="vehicle", model="multi_body"))
-    prepare(VehicleSettings(kind="vehicle", model="kinematic", parameters="truck"))
-    prepare(FourTankSettings(kind="four_tank"))
-    prepare(None)
+    monkeypatch.setattr(compiled, "compiled_dynamics", made.append)
+    monkeypatch.setattr(compiled, "is_compiled", lambda model: model == "st")
+    VehicleSettings(kind="vehicle").prepare()
+    VehicleSettings(kind="vehicle", model="multi_body").prepare()
+    VehicleSettings(kind="vehicle", model="kinematic", parameters="truck").prepare()
+    FourTankSettings(kind="four_tank").prepare()
     assert made == ["mb", "kst"]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from noack.config.plant_systems import CartPoleSettings
-from plant_server.ode_integrator import OdeSystem
-from plant_server.plant_linearisation import linearise
-from plant_server.systems.cart_pole import cart_pole
+from noack.plants.cart_pole import CartPoleSettings
+from noack.plants.plant_settings import PlantEquations
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
 
 H_NS = 2_000_000
 
@@ -32,7 +32,7 @@ def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
 
 def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
     settings = CartPoleSettings(kind="cart_pole", friction_n_s_per_m=0.0)
-    states = run(cart_pole(settings, np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 1000)
+    states = run(OdeSystem(settings.equations(), np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 1000)
     assert np.ptp(states[:, 2]) > 1.0  # it has fallen
     energies = [energy(settings, x) for x in states]
     np.testing.assert_allclose(energies, energies[0], rtol=1e-7)
@@ -44,7 +44,9 @@ def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
 def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
     settings = CartPoleSettings(kind="cart_pole")
     force, h_ns = 0.7, 500_000
-    states = run(cart_pole(settings, np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns)
+    states = run(
+        OdeSystem(settings.equations(), np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns
+    )
     power = force * states[:, 1] - settings.friction_n_s_per_m * states[:, 1] ** 2
     work = np.trapezoid(power, dx=h_ns * 1e-9)
     gained = energy(settings, states[-1]) - energy(settings, states[0])
@@ -53,7 +55,7 @@ def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
 
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
     """Open loop, by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041, 5.5651."""
-    A, B = linearise(lambda x0: cart_pole(CartPoleSettings(kind="cart_pole"), x0), 4, 1)
+    A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
     poles = np.sort(np.linalg.eigvals(A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
     np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
@@ -63,7 +65,7 @@ def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
     def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
 
-    system = OdeSystem(pendulum, np.array([2.0, 0.0]))
+    system = OdeSystem(PlantEquations(pendulum), np.array([2.0, 0.0]))
     states = run(system, [0.5] * 500, 20_000_000)
     exact = solve_ivp(
         lambda t, z: pendulum(t, z, np.array([0.5])), (0, 10), [2.0, 0.0],
@@ -73,11 +75,17 @@ def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
 
 
 def test_the_same_steps_give_the_same_bits_whatever_was_integrated_before() -> None:
-    first = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
+    first = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.1, 0.0, 0.2, 0.0])
+    )
     expected = run(first, [0.3, -0.1, 2.0] * 20)
-    other = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.5, 0.0, -1.0, 3.0]))
+    other = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.5, 0.0, -1.0, 3.0])
+    )
     run(other, [9.0] * 50)
-    second = cart_pole(CartPoleSettings(kind="cart_pole"), np.array([0.1, 0.0, 0.2, 0.0]))
+    second = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.1, 0.0, 0.2, 0.0])
+    )
     assert run(second, [0.3, -0.1, 2.0] * 20).tobytes() == expected.tobytes()
 
 
@@ -85,7 +93,7 @@ def test_what_cannot_be_integrated_is_nan_from_then_on() -> None:
     def blows_up(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
         return (float(z[0]) ** 2,)
 
-    system = OdeSystem(blows_up, np.array([1.0]))
+    system = OdeSystem(PlantEquations(blows_up), np.array([1.0]))
     states = run(system, [0.0] * 20, 100_000_000)
     assert np.isfinite(states[9]).all()
     assert np.isnan(states[12:]).all()
@@ -97,7 +105,10 @@ def test_what_a_derivative_raises_is_divergence_if_it_is_of_arithmetic_and_else_
             raise [OverflowError, KeyError][int(v[0])]("far")
         return (1.0,)
 
-    inputs = {0.0: OdeSystem(broken, np.zeros(1)), 1.0: OdeSystem(broken, np.zeros(1))}
+    inputs = {
+        0.0: OdeSystem(PlantEquations(broken), np.zeros(1)),
+        1.0: OdeSystem(PlantEquations(broken), np.zeros(1)),
+    }
     for u, system in inputs.items():
         system.advance(np.array([u]), 0, H_NS)
         assert system.x == pytest.approx([0.002])

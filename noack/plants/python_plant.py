@@ -1,23 +1,51 @@
-"""A class of the user's own, given by its differential equation or stepping by itself.
+"""A class of the user's own: equations, or an object that advances itself.
 
-Its code runs in this process. Whatever it raises ends the plant's motion, not the run.
+Its code runs in the plant's process. An exception of the user's code stops the motion, not the run.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from noack.config.plant_systems import PythonSettings
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
-from noack.settings.user_class import failure_text, new_instance, read_only, real_vector
-from plant_server.ode_integrator import OdeSystem
-from plant_server.system import PlantSystem, SystemFailedError
+from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, PlantStart
+from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
+from noack.settings.user_class import (
+    ClassSettings,
+    failure_text,
+    new_instance,
+    read_only,
+    real_vector,
+)
 
 _PLACE = "plant.system"
-_ALIKE = 1e-6
-"""How far x(0) of the scenario and of the class may be apart, relative to its size."""
+_START_TOLERANCE = 1e-6
+"""Relative difference that x(0) of the scenario and of the class may have."""
+
+
+class PythonPlantSettings(ClassSettings, PlantSettings):
+    """A class of the user's own, from an installed package or from a file.
+
+    Its code runs in the plant's process; docs/plants.md says what the class must offer.
+    """
+
+    group: ClassVar = "noack.plants"
+
+    kind: Literal["python"]
+    """What the plant is."""
+    on_record: Names = ()
+    """Names of the entries of its own state z; z is recorded if they are given."""
+
+    @property
+    def internal_names(self) -> tuple[str, ...]:
+        """Names of the entries of z."""
+        return self.on_record
+
+    def system(self, start: PlantStart) -> PlantSystem:
+        """Return an object of the class, at x(0)."""
+        return PythonSystem(self, start.x0, start.B.shape[1])
 
 
 class PythonSystem:
@@ -25,7 +53,7 @@ class PythonSystem:
 
     It has either ``derivative(t_s, z, u)``, dz/dt under the held input, and if z is not x also
     ``state(x0)`` and ``output(z)``; or ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, and
-    ``z`` if that is to be on record. ``docs/plants.md`` has examples.
+    ``z`` if z is to be recorded. ``docs/plants.md`` has examples.
 
     Args:
         settings: of a loaded scenario.
@@ -33,43 +61,43 @@ class PythonSystem:
         m: number of inputs.
 
     Raises:
-        CallerError: there is no such class, it cannot be made, or it is not as it must be.
+        CallerError: the class does not exist, raises, or lacks what it must offer.
     """
 
-    def __init__(self, settings: PythonSettings, x0: Vector, m: int) -> None:
+    def __init__(self, settings: PythonPlantSettings, x0: Vector, m: int) -> None:
         self._settings = settings
         self._recorded = len(settings.on_record)
         try:
             plant, self.about = new_instance(settings, _PLACE)
             self._system = self._system_of(plant, x0, m)
             self.x, self.z = x0, np.zeros(self._recorded)
-            self._look(self._system)
+            self._copy_state()
         except CallerError:
             raise
         except SystemFailedError as error:
             raise CallerError(str(error)) from None
         except (Exception, SystemExit) as error:
-            raise CallerError(self._said(error)) from None
-        if not np.all(np.abs(self.x - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
+            raise CallerError(self._failure(error)) from None
+        if not np.all(np.abs(self.x - x0) <= _START_TOLERANCE * (np.abs(x0) + 1.0)):
             raise CallerError(
                 f'{_PLACE}.name = "{settings.name}": x is {self.x.tolist()} at the start; '
                 f"plant.initial_state is {x0.tolist()}"
             )
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
-        """Go on for one step."""
+        """Advance by one step."""
         try:
             self._system.advance(u, t_ns, dt_ns)
-            self._look(self._system)
+            self._copy_state()
         except (Exception, SystemExit) as error:
             if isinstance(error, SystemFailedError):
                 raise
-            raise SystemFailedError(self._said(error)) from None
+            raise SystemFailedError(self._failure(error)) from None
 
-    def _look(self, system: PlantSystem) -> None:
-        self.x = real_vector("x", system.x, len(self.x))
+    def _copy_state(self) -> None:
+        self.x = real_vector("x", self._system.x, len(self.x))
         if self._recorded:
-            self.z = real_vector("z", system.z, self._recorded)
+            self.z = real_vector("z", self._system.z, self._recorded)
 
     def _system_of(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
@@ -85,9 +113,14 @@ class PythonSystem:
                 f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}"
             )
         derivative = self._derivative(plant, len(z0))
-        derivative(0.0, z0, np.zeros(m))  # what is wrong with it is better known now
+        derivative(0.0, z0, np.zeros(m))  # report its errors before the run
         output = plant.output if hasattr(plant, "output") else np.copy
-        return OdeSystem(derivative, z0, output=output)
+        from noack.plants.systems.ode_integrator import OdeSystem
+
+        equations = PlantEquations(
+            derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
+        )
+        return OdeSystem(equations, x0)
 
     def _derivative(self, plant: Any, size: int) -> Callable[[float, Vector, Vector], Vector]:
         def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
@@ -95,16 +128,16 @@ class PythonSystem:
                 found = plant.derivative(t_s, read_only(z), read_only(u))
                 return real_vector("derivative(t_s, z, u)", found, size)
             except (Exception, SystemExit) as error:
-                raise SystemFailedError(self._said(error)) from None
+                raise SystemFailedError(self._failure(error)) from None
 
         return derivative
 
-    def _said(self, error: BaseException) -> str:
+    def _failure(self, error: BaseException) -> str:
         return failure_text(self._settings, _PLACE, error)
 
 
 class _Stepping:
-    """An object that steps by itself."""
+    """An object that advances itself."""
 
     def __init__(self, plant: Any, x0: Vector) -> None:
         self._plant = plant

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.plant_systems import FmuSettings
 from noack.core.errors import CallerError
+from noack.plants.fmu import FmuSettings
+from noack.plants.linear import LinearSystem
+from noack.plants.plant_settings import PlantEquations
+from noack.plants.systems.fmu_system import FmuSystem
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.user_files import located
-from plant_server.ode_integrator import OdeSystem
-from plant_server.plant_linearisation import linearise
-from plant_server.system import SystemFailedError
-from plant_server.systems.fmu import FmuSystem
-from plant_server.systems.linear_plant import LinearSystem
 from tests.plant_server.fmus.build import build
 
 pytest.importorskip("fmpy")
@@ -73,7 +74,7 @@ def test_van_der_pol_is_what_another_integrator_makes_of_it(version: int, tmp_pa
         settings(build(tmp_path, version), parameters={"mu": 2}, on_record=("energy",)), X0
     )
     np.testing.assert_allclose(
-        run(system, INPUTS), run(OdeSystem(van_der_pol, X0), INPUTS), atol=1e-9
+        run(system, INPUTS), run(OdeSystem(PlantEquations(van_der_pol), X0), INPUTS), atol=1e-9
     )
     assert system.z == pytest.approx([(system.x[1] ** 2 + system.x[0] ** 2) / 2])
 
@@ -237,7 +238,7 @@ def test_without_fmpy_one_line_says_what_to_install(
     loaded = settings(build(tmp_path, 2))
     monkeypatch.setitem(sys.modules, "fmpy", None)
     with pytest.raises(
-        CallerError, match=r"needs what is not installed; pip install 'noack\[fmi\]'"
+        CallerError, match=r"needs a package that is not installed; pip install 'noack\[fmi\]'"
     ):
         FmuSystem(loaded, X0)
 
@@ -251,8 +252,8 @@ def test_what_is_unpacked_goes_with_the_system_or_its_process(
     del system
     assert not folder.exists()
     program = (
-        "import sys, tempfile, numpy as np; from plant_server.systems.fmu import FmuSystem; "
-        "from noack.config.plant_systems import FmuSettings; tempfile.tempdir = sys.argv[1]; "
+        "import sys, tempfile, numpy as np; from noack.plants.systems.fmu_system import FmuSystem; "
+        "from noack.plants.fmu import FmuSettings; tempfile.tempdir = sys.argv[1]; "
         "kept = FmuSystem(FmuSettings.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
     )
     loaded = settings(build(tmp_path, 2)).model_dump_json()

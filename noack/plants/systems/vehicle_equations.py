@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.code_cache import cache_folder, compiler, is_kept, while_compiling
 from noack.core.linear_systems import Vector
-from noack.runtime.code_cache import cache_folder, compiler, is_kept, while_compiling
 
 _LIBRARY = "vehiclemodels"
 _COMPILED = ("std", "mb")
@@ -41,7 +41,7 @@ def equations(model: str, parameters: Any) -> Rates:
         model: as the library calls it, e.g. ``st``.
         parameters: the library's, of a vehicle.
     """
-    if (compiled := prepare(model)) is None:
+    if (compiled := compiled_dynamics(model)) is None:
         dynamics = _dynamics(model)
         return lambda z, *inputs: np.array(dynamics(z.tolist(), list(inputs), parameters))
     values = _record(parameters)
@@ -55,14 +55,17 @@ def equations(model: str, parameters: Any) -> Rates:
 
 
 @cache
-def prepare(model: str) -> Any:
-    """Compile the equations of a model, which takes long the first time; None if they are not."""
+def compiled_dynamics(model: str) -> Any:
+    """Return a model's compiled equations; None if they run as Python code.
+
+    The first time on a machine, they are compiled, which takes long.
+    """
     if model not in _COMPILED:
         return None
     import numba
     from numba.core.errors import NumbaError
 
-    if not kept(model):
+    if not is_compiled(model):
         _say(while_compiling("the vehicle's equations", kept=_folder(model) is not None))
     compiled = _compiled(model)
     vector = numba.types.Array(numba.float64, 1, "C")
@@ -77,8 +80,8 @@ def prepare(model: str) -> Any:
     return compiled
 
 
-def kept(model: str) -> bool:
-    """Whether the equations of a model need not be compiled on this machine any more."""
+def is_compiled(model: str) -> bool:
+    """Whether the equations of a model need no compilation on this machine."""
     return model not in _COMPILED or is_kept(_folder(model), _of(_dynamics(model)))
 
 

@@ -19,7 +19,7 @@ from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
     """In the k-th second, from 0, 1000 k datagrams of 100 bytes come on each link."""
-    errands, found, before = CommandQueue(relay), [], None
+    commands, found, before = CommandQueue(relay), [], None
     for second in range(seconds):
         for name, way in relay.counters:
             if way == "forward":
@@ -34,7 +34,7 @@ def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
                 counters.forwarded_bytes += 100 * (came - came // 5)
                 counters.longest_loss_burst = 2
         relay.delays = times(*[10_000_000] * 98, 20_000_000, 20_000_000)
-        snapshot = errands.look()._replace(elapsed_ns=(second + 1) * NS_PER_S)
+        snapshot = commands.look()._replace(elapsed_ns=(second + 1) * NS_PER_S)
         found.append(statistics(snapshot, before))
         before = snapshot
     return found
@@ -64,16 +64,16 @@ def test_a_link_is_shown_with_both_directions() -> None:
     assert lines[0].split() == ["lab", "0:03,", "plain"]
     assert "up  127.0.0.1:5000 → [::1]:6000  1 client" in lines[1]
     assert "loss 10% delay 10ms mansd 2" in lines[3]
-    assert "nothing is done" in lines[3]
-    assert line_of(lines, "in") == "in 2,000/s 1.60 Mbit/s 0/s 0 bit/s"
-    assert line_of(lines, "out") == "out 1,600/s 1.28 Mbit/s 0/s 0 bit/s"
+    assert "no impairment" in lines[3]
+    assert line_of(lines, "received") == "received 2,000/s 1.60 Mbit/s 0/s 0 bit/s"
+    assert line_of(lines, "forwarded") == "forwarded 1,600/s 1.28 Mbit/s 0/s 0 bit/s"
     assert line_of(lines, "loss") == "loss 20.0 % –"
-    assert line_of(lines, "drawn") == "drawn 20.0 % 9.91 % predicted – 0 % predicted"
+    assert line_of(lines, "drawn") == "drawn 20.0 %, predicted 9.91 % –, predicted 0 %"
     assert line_of(lines, "lost") == "lost 600 dropped 0"
-    assert "2 of 2" in line_of(lines, "run")
-    assert "300 forced" in line_of(lines, "run")
-    assert "0 in a row, no cap" in line_of(lines, "run")
-    assert line_of(lines, "under way") == "under way 5 (most 0) 5 (most 0)"
+    burst = line_of(lines, "burst")
+    assert burst.startswith("burst 2, cap 2 ━")
+    assert burst.endswith("━ 300 forced 0, no cap")
+    assert line_of(lines, "in flight") == "in flight 5, max 0 5, max 0"
     p50, p99 = line_of(lines, "delay").removeprefix("delay p50 ").split(" ms p99 ")[:2]
     assert float(p50) == pytest.approx(10, rel=0.03)
     assert float(p99.split(" ms")[0]) == pytest.approx(20, rel=0.03)
@@ -81,7 +81,7 @@ def test_a_link_is_shown_with_both_directions() -> None:
 
 def test_the_last_minute_is_drawn() -> None:
     lines = text_of(FakeRelay("up"), seconds=61)
-    chart = lines[[line.startswith("│ in ") for line in lines].index(True) + 1]
+    chart = lines[[line.startswith("│ received ") for line in lines].index(True) + 1]
     forward = chart[12:44]
     assert forward == "".join(sorted(forward))  # it rises all the time
     assert forward.startswith("▁")
@@ -146,10 +146,10 @@ def test_what_is_no_terminal_gets_a_line_for_each_direction_in_use() -> None:
     assert plain_lines(first) == []
     up, down = plain_lines(last)
     assert up.startswith(
-        "3.0 s  up forward  in 2,000/s 1.60 Mbit/s  out 1,600/s 1.28 Mbit/s  loss 20.0 %  "
-        "drawn 20.0 %  9.91 % predicted  run 2 of 2  300 forced  "
+        "3.0 s  up forward  received 2,000/s  1.60 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
+        "loss 20.0 %  drawn 20.0 %, predicted 9.91 %  longest loss burst 2, cap 2  forced 300  "
     )
-    assert up.endswith("under way 5  UNINTENDED 3 send_errors")
+    assert up.endswith("in flight 5  UNINTENDED 3 send_errors")
     assert "down forward" in down
 
 
@@ -163,4 +163,4 @@ def test_with_many_links_figures_are_whole_in_any_width(width: int) -> None:
         assert "2,000/s" in line
         assert "20.0 %" in line
         assert "2/2" in line
-    assert ("last minute" in lines[1]) == (width >= 80)
+    assert ("last minute" in lines[1]) == (width >= 120)
