@@ -32,7 +32,6 @@ from noack.runtime.process_entry import TICKET_ON_STDIN
 from noack.runtime.process_life import HORIZON
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
-from plant_server.systems.system_from_settings import prepare
 
 _MODULES = {
     "recorder": "cosim.live.recorder",
@@ -93,7 +92,7 @@ def launch(
     if control:
         require_free_tcp_port(control, "ports.control")
     if PLANT in spawn:
-        prepare(resolved.plant.system)  # nobody waits long for a process at the start
+        resolved.plant.system.prepare()  # nobody waits long for a process at the start
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
     resolved = write_scenario(resolved, run_dir)

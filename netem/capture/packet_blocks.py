@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.runtime.code_cache import cache_folder, compiler
+from noack.core.code_cache import cache_folder, compiler
 
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
