@@ -52,7 +52,8 @@ def test_a_row_says_what_an_event_says(path: Path) -> None:
     (row,) = pq.read_table(path).to_pylist()
     arrival_ns, losses = told.pop("t_ns"), told.pop("run")
     assert row == told | {
-        "consecutive_losses": losses, "link": "up", "direction": "reverse", "flow": 0, "packet": 0, "arrival_ns": arrival_ns,
+        "consecutive_losses": losses, "link": "up", "direction": "reverse", "flow": 0, "packet": 0,
+        "arrival_ns": arrival_ns,
     }  # fmt: skip
 
 
