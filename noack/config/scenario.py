@@ -32,12 +32,13 @@ from noack.config.sections.run_sections import (
     SeedsSection,
 )
 from noack.config.setpoint import input_at
-from noack.config.triggers import AnyTrigger, DecayingSettings, require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.matrices import require_length, require_shape
 from noack.settings.section import ScenarioSection
+from noack.trigger.decaying import DecayingSettings
+from noack.trigger.policy_registry import AnyTrigger
 
 _TIMEOUT_PERIODS = 5
 _WATCHDOG_PERIODS = 50
@@ -175,7 +176,7 @@ class Scenario(ScenarioSection):
         n, m = self.model.dimensions
         if "trigger" in touched:
             found.trigger.check(n, f"the model has {n} states and {m} inputs")
-            require_on_grid(found.trigger, self.measurement_period_ns)
+            found.trigger.check_period(self.measurement_period_ns)
         if "controller" in touched:
             found._check_setpoint(n)
         return found
@@ -382,7 +383,7 @@ class Scenario(ScenarioSection):
         self._check_observer()
         self._check_watchdog()
         self.trigger.check(n, why)
-        require_on_grid(self.trigger, self.measurement_period_ns)
+        self.trigger.check_period(self.measurement_period_ns)
         self._check_changes()
         return self
 

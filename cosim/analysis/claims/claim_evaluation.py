@@ -16,6 +16,7 @@ from cosim.analysis.claims.observed_conditions import Left, ObservedConditions, 
 from cosim.analysis.claims.theorem_one import theorem_one
 from cosim.record.align import AlignedRun, identity_residual, in_common, join_all
 from cosim.record.run_record import RunRecord
+from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import row_norms, transition
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
@@ -31,7 +32,6 @@ from noack.theory.scenario_certificates import (
     certify_box,
     outside_box,
 )
-from noack.trigger.policy_from_settings import policy_of
 
 Reals = NDArray[np.float64]
 
