@@ -40,8 +40,8 @@ from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.config.sections.run_sections import SeedsSection
+from noack.config.triggers import POLICIES
 from noack.core.linear_systems import Vector
-from noack.trigger.policy_registry import POLICIES
 
 Mode = Literal["model", "zoh"]
 Method = Literal["RK45", "DOP853"]

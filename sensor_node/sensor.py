@@ -17,7 +17,7 @@ from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR
 from noack.protocol.wire_format import Flow, Message
 from noack.trigger.trigger_policy import Policy, Trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
-from sensor_node.state_observer import ObservingSensor, observer_of
+from sensor_node.observing_sensor import ObservingSensor, observer_of
 
 
 class Sensor:
@@ -125,11 +125,11 @@ def sensor_of(
 
     One that is started anew transmits its first measurement.
     """
-    observer = observer_of(resolved, known=not start.again)
+    observer = observer_of(resolved, restarted=start.again)
     sensor = _triggering(resolved, start)
     if observer is None:
         return sensor
-    return ObservingSensor(observer, sensor, again=start.again)
+    return ObservingSensor(observer, sensor, restarted=start.again)
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
@@ -137,9 +137,9 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
     loop, policy = loop_of(resolved), policy_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.again
     x0 = loop.x0 if known else None
-    period_ns, first = resolved.measurement_period_ns, start.first_number
+    period_ns, first = resolved.timing.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:
-        timeout_ns = resolved.acknowledgement_timeout_ns
+        timeout_ns = resolved.timing.acknowledgement_timeout_ns
         return AcknowledgedSensor(
             loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first
         )

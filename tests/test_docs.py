@@ -26,8 +26,8 @@ from noack.config.impairments import Impairment, Loss
 from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import json_schema, load
+from noack.config.triggers import POLICIES
 from noack.protocol.record_tables import tables
-from noack.trigger.policy_registry import POLICIES
 
 ROOT = Path(__file__).parents[1]
 PAGES = (

@@ -112,9 +112,9 @@ def check(scenario: ScenarioArgument, settings: SetOption = None, json: JsonOpti
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print what a plant is near its operating point, and what holds of keys without a value."""
     from cosim.analysis.model_comparison import linearisation, said
-    from plant_server.systems.system_from_settings import system_of
+    from plant_server.plant import system_of
 
-    if not resolved.is_linear:
+    if not resolved.coverage.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
         console.print(f"the plant: {about}", highlight=False, markup=False)
     if (near := linearisation(resolved)) is not None:
@@ -129,7 +129,7 @@ def _in_force(resolved: Scenario) -> Iterator[str]:
     from cosim.live.launcher import REJOIN_BY_HAND_S
     from cosim.live.start_limit import DEFAULT_S
 
-    watchdog, timeout_s = resolved.plant.watchdog, resolved.actuation_timeout_ns / NS_PER_S
+    watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield f"plant.watchdog: {watchdog.policy} when no actuation has come for {timeout_s:g} s"
     if resolved.controller.safe_input is None:

@@ -123,7 +123,7 @@ def adversary(
 
 @command(THEORY, [
     ("noack paper", "1,000 draws, some minutes; into runs/paper"),
-    ("noack paper --draws 50 --out paper --json", "a glance"),
+    ("noack paper --draws 50 --out paper --json", "fewer draws, as JSON"),
 ])  # fmt: skip
 def paper(
     draws: Annotated[int, typer.Option(help="Draws of plant, losses and initial state.")] = 1000,
@@ -137,11 +137,10 @@ def paper(
     from cosim.studies.paper.paper_run import document, make_folder, reproduce, write_page
     from cosim.studies.paper.paper_table import print_claims
 
-    path = find_scenario("lane_following")
     make_folder(out)
     with draws_bar(PatientConsole(stderr=True)) as progress:
-        results = reproduce(path, draws, cores(), progress)
-    found = document(results, write_page(path, results, out))
+        results = reproduce(draws, cores(), progress)
+    found = document(results, write_page(results, out))
     if json:
         print_json(found)
     else:

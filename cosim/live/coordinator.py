@@ -244,7 +244,7 @@ class Coordinator:
                 raise CallerError(f"a run can be changed {MOST_CHANGES} times, and this one was")
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
-            if t_ns >= self._scenario.horizon_ns:
+            if t_ns >= self._scenario.timing.horizon_ns:
                 raise CallerError(f"the run ends at {self._scenario.horizon_s:g} s, before that")
             change = ParameterChange(len(self._changes), t_ns, settings)
             said_at = datetime.now(UTC).isoformat(timespec="milliseconds")

@@ -32,7 +32,6 @@ from noack.runtime.process_entry import TICKET_ON_STDIN
 from noack.runtime.process_life import HORIZON
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
-from plant_server.systems.system_from_settings import prepare
 
 _MODULES = {
     "recorder": "cosim.live.recorder",
@@ -93,7 +92,7 @@ def launch(
     if control:
         require_free_tcp_port(control, "ports.control")
     if PLANT in spawn:
-        prepare(resolved.plant.system)  # nobody waits long for a process at the start
+        resolved.plant.system.prepare()  # nobody waits long for a process at the start
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
     resolved = write_scenario(resolved, run_dir)
@@ -288,7 +287,7 @@ class _Run:
                 return lost.status, f"{lost.why}; no other came within {lost.within_s:g} s"
         for role, (status, why) in self._casualties(coordinator).items():
             within_s = self._rejoin_within_s(role)
-            over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+            over = coordinator.now_ns() >= self._ticket.scenario.timing.horizon_ns
             if coordinator.epoch_ns is None or over or role == PLANT or not within_s:
                 return status, why
             if self._gave_up(role):  # so would another
@@ -327,7 +326,7 @@ class _Run:
 
     def _over_its_record(self, coordinator: Coordinator) -> bool:
         """Whether the recorder may be busy with a long record's end, and not hear its peers."""
-        over = coordinator.now_ns() >= self._ticket.scenario.horizon_ns
+        over = coordinator.now_ns() >= self._ticket.scenario.timing.horizon_ns
         return over and self._is_running(RECORDER)
 
     def _is_running(self, role: str) -> bool:

@@ -107,7 +107,7 @@ class Recorder:
             "live": live, "void": [], "changes": [],
         }  # fmt: skip
         if start.again:
-            self._monitor.give_up("the recorder was started anew")
+            self._monitor.stop("the recorder was started anew")
             self._take_over()
 
     @property
@@ -252,7 +252,7 @@ class Recorder:
         got.add(first, first + len(rows))
         if not follows:
             self._out_of_order = True
-            self._monitor.give_up("telemetry is missing, or came out of turn")
+            self._monitor.stop("telemetry is missing, or came out of turn")
         else:
             self._count(table, rows)
             self._monitor.take(table, rows)
@@ -272,7 +272,7 @@ class Recorder:
             self._see_run(rows["dropouts"])
         elif table == NETEM_PACKET:
             rows = updates_in(rows)[0]
-            self._see_run(rows["drop_run"][~effective(rows["fate"])])
+            self._see_run(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _judge(self, guard: Callable[[], list[AssumptionViolation]]) -> None:
         """Say that claims are void, in the record, the view and the account."""
@@ -282,17 +282,17 @@ class Recorder:
             departures = guard()
         except Exception as error:  # whatever it is, what is recorded is recorded
             departures = []
-            self._monitor.give_up(repr(error))
+            self._monitor.stop(repr(error))
         for one in departures:
-            text = f"claims that this touches are void from {one.t_s:.3f} s on: {one.text}"
+            text = f"void (assumption violated) from {one.t_s:.3f} s on: {one.text}"
             notice = Notice(round(one.t_s * NS_PER_S), "void", text)
             self.note(notice)
             self._account["void"].append(text)
             if self._feed is not None:
                 self._feed.log(notice._asdict())
-        if self._monitor.blind is not None and not self._told_blind:
+        if self._monitor.stopped is not None and not self._told_blind:
             self._told_blind = True
-            text = f"whether claims are void is told after the run only: {self._monitor.blind}"
+            text = f"whether claims are void is told after the run only: {self._monitor.stopped}"
             self._account["void"].append(text)
 
     def _see_run(self, lost: np.ndarray[Any, np.dtype[np.int64]]) -> None:

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.runtime.code_cache import cache_folder, compiler
+from noack.core.code_cache import cache_folder, compiler
 
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
@@ -75,7 +75,7 @@ _HELD_BACK = _text(", held back ")
 _FOR_THE_CAP = _text(" so that the cap holds")
 _MS = _text(" ms")
 _FORWARD = _text("; forward, flow ")
-_BACK = _text("; back, flow ")
+_BACK = _text("; reverse, flow ")
 _DATAGRAM = _text(", datagram ")
 
 

@@ -36,7 +36,7 @@ from netem.capture.packet_blocks import (
 )
 from netem.compile_notice import announced
 from netem.relay_events import EVENT
-from noack.runtime.code_cache import is_kept
+from noack.core.code_cache import is_kept
 
 SNAP_BYTES = 262_144
 """Payload bytes captured of a datagram unless told otherwise: all."""

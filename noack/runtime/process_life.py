@@ -193,7 +193,7 @@ class RunProcess:
         leg = ROUTES[self.role]
         decoder = Decoder(
             leg.receives,
-            self.scenario.entries(leg.receives),
+            self.scenario.message_sizes.entries(leg.receives),
             self.ticket.run_id,
             self.ticket.key,
             not_before_ns=self._admitted_ns,
@@ -256,7 +256,7 @@ class RunProcess:
                     channel,
                     self.clock,
                     telemetry,
-                    end_ns=self.scenario.horizon_ns + grace_ns,
+                    end_ns=self.scenario.timing.horizon_ns + grace_ns,
                     stop=lambda: self.stopping,
                     spin_us=settings.spin_us,
                     news=lambda now_ns: self._announce(changeable, now_ns),

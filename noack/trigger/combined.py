@@ -9,7 +9,7 @@ from noack.trigger.policy_settings import Interval, PolicySettings
 from noack.trigger.trigger_policy import Policy
 
 if TYPE_CHECKING:
-    AnyTrigger = PolicySettings  # policy_registry inserts the union of all policies
+    AnyTrigger = PolicySettings  # noack.config.triggers inserts the union of all policies
 
 
 class CombinedSettings(PolicySettings):

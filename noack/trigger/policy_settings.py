@@ -2,7 +2,7 @@
 
 A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
 field ``policy``, and the behaviour that the settings describe;
-:mod:`noack.trigger.policy_registry` finds it there.
+:mod:`noack.config.triggers` finds it there.
 """
 
 from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self
@@ -41,12 +41,9 @@ class PolicySettings(ScenarioSection):
     at_start_only: ClassVar[tuple[str, ...]] = ()
     """Keys that describe the start of a run and cannot change later."""
 
-    if TYPE_CHECKING:
+    policy: str
 
-        @property
-        def policy(self) -> str:
-            """The policy's name; a field of each policy."""
-            return ""
+    if TYPE_CHECKING:
 
         @property
         def weight(self) -> Rows | None:

@@ -91,7 +91,7 @@ def certified_error(resolved: Scenario) -> float | None:
     the cap.
     """
     network = resolved.network
-    if not resolved.is_decaying or not network.enforce_mansd:
+    if not resolved.coverage.is_decaying or not network.enforce_mansd:
         return None
     trigger = resolved.decaying
     if trigger.floor > 0:
