@@ -4,7 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from cosim.output.report.figure_files import save
+from cosim.output.report.figure_files import save_figure
 from cosim.studies.campaign.campaign_workers import local
 from cosim.studies.campaign.draw_statistics import quartiles
 from cosim.studies.paper.draw_measures import MODES, resolved_draw, simulate_draw
@@ -74,9 +74,9 @@ def write_page(results: Results, folder: Path) -> list[Path]:
             resolved = resolved_draw(scenario, results.representative, mode)
             figure = draw_figure(simulate_draw(resolved), resolved, results.representative)
             written.append(figures / f"paper-{name.lower()}.svg")
-            save(figure, written[-1])
+            save_figure(figure, written[-1])
         written.append(figures / "paper-ensemble.png")
-        save(ensemble_figure(results), written[-1])
+        save_figure(ensemble_figure(results), written[-1])
     except OSError as error:
         raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
     return written
