@@ -36,9 +36,8 @@ def check(
     A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
     """
     from cosim.output.assumptions_table import print_assumptions
-    from noack.config.resolution import resolve
+    from noack.config.resolution import policy_of, resolve
     from noack.theory.assumptions import assumptions
-    from noack.trigger.policy_from_settings import policy_of
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
     policy_of(resolved)  # some policies require a stable loop
