@@ -127,7 +127,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
 
 def _in_force(resolved: Scenario) -> Iterator[str]:
     """Say what holds of keys that have no value, and whose default depends on others."""
-    from cosim.live.launcher import REJOIN_BY_HAND_S
+    from cosim.live.restart_policy import RESTART_BY_HAND_S
     from cosim.live.start_limit import DEFAULT_S
 
     watchdog, timeout_s = resolved.plant.watchdog, resolved.actuation_timeout_ns / NS_PER_S
@@ -138,7 +138,7 @@ def _in_force(resolved: Scenario) -> Iterator[str]:
     if resolved.recovery.rejoin_within_s is None:
         yield (
             "recovery.rejoin_within_s: 0, who dies ends the run; "
-            f"{REJOIN_BY_HAND_S:g} for processes that people start"
+            f"{RESTART_BY_HAND_S:g} for processes that people start"
         )
     if resolved.start_within_s is None:
         yield f"start_within_s: {DEFAULT_S:g}, longer under load; unlimited if people start some"

@@ -45,10 +45,10 @@ def set_(
     json: JsonOption = False,
 ) -> int:
     """Change a run while it goes on: losses, M, the trigger, the set-point; the newest run's."""
-    from noack.runtime.run_registry import ask, find
+    from noack.runtime.run_registry import find, request_change
 
     wanted = parsed(settings or ())
-    answer = ask(find(session, run), wanted)
+    answer = request_change(find(session, run), wanted)
     if json:
         print_json(answer)
     elif wanted:

@@ -33,14 +33,14 @@ def test_a_run_is_changed_twice_from_another_process(
         assert done.returncode == answer.get("exit", {"status": 0})["status"], done.stderr
         return answer
 
-    wait_for(lambda: run_registry.ask(run, {})["t_s"] > 0)
+    wait_for(lambda: run_registry.request_change(run, {})["t_s"] > 0)
     first = said("loss.p", "0.5", "mansd=2")
     second = said("setpoint", "[0.0, 0.0, 0.0, 1.0]")
     assert second["runtime_parameters"]["network.mansd"] == 2
     refused = said("loss.p", "1.5")
     assert refused["exit"]["status"] == 2
     assert "should be less than or equal to 1" in refused["error"]
-    wait_for(lambda: run_registry.ask(run, {})["t_s"] > second["from_s"] + 1)
+    wait_for(lambda: run_registry.request_change(run, {})["t_s"] > second["from_s"] + 1)
     running.process.send_signal(signal.SIGINT)
     finished = running.finish()
     assert finished.status == 130, finished.stderr

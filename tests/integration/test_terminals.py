@@ -76,7 +76,7 @@ def test_who_ends_a_process_may_start_another_in_its_place(
     assert "sensor ended early: SIGINT at " in finished.stderr
     assert "the run goes on, start it again: noack sensor" in finished.stderr
     (restart,) = finished.summary["restarts"]
-    assert restart["what"] == "started anew: sensor ended early: SIGINT"
+    assert restart["what"] == "restarted: sensor ended early: SIGINT"
     assert finished.summary["replay"]["bit_exact"]
     assert finished.summary["replay"]["complete"]  # who is asked to end hands everything over
     assert finished.summary["missing_samples"] == 0
