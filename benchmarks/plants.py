@@ -63,10 +63,12 @@ class Steps:
 
     def __init__(self, scenario: str, settings: tuple[str, ...], count: int) -> None:
         self.resolved: Scenario = resolve(load(find_scenario(scenario), settings))
-        horizon_s = min(self.resolved.horizon_s, count * self.resolved.plant_period_ns / NS_PER_S)
+        horizon_s = min(
+            self.resolved.horizon_s, count * self.resolved.timing.plant_period_ns / NS_PER_S
+        )
         record = simulate(self.resolved.model_copy(update={"horizon_s": horizon_s}))
         self._plant: Plant = plant_of(self.resolved)
-        self._period_ns = self.resolved.plant_period_ns
+        self._period_ns = self.resolved.timing.plant_period_ns
         self._inputs = iter(record[PLANT_STEP]["u"])
         self._step = 0
         self.cpu_ns: list[int] = []
@@ -107,7 +109,7 @@ def timed(
 
 def rows_of(case: Case, ours: Steps, linear: Steps) -> list[Row]:
     """The rows of a case: median, 99 % quantile, and what that is of the period in wall time."""
-    period_us = ours.resolved.plant_period_ns / ours.resolved.speed / 1e3
+    period_us = ours.resolved.timing.plant_period_ns / ours.resolved.speed / 1e3
     found = {q: (float(np.quantile(ours.us, q)), float(np.quantile(linear.us, q)))
              for q in (0.5, 0.99)}  # fmt: skip
     share = 100 * found[0.99][0] / period_us

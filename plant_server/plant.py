@@ -143,8 +143,8 @@ def plant_of(resolved: Scenario) -> Plant:
     return Plant(
         system_of(resolved),
         _watchdog_of(resolved),
-        period_ns=resolved.plant_period_ns,
-        horizon_ns=resolved.horizon_ns,
+        period_ns=resolved.timing.plant_period_ns,
+        horizon_ns=resolved.timing.horizon_ns,
         measure_every=resolved.plant.measure_every,
         disturbance=disturbance_of(resolved),
         measuring=measurement_model_of(resolved),
@@ -157,7 +157,7 @@ def _watchdog_of(resolved: Scenario) -> Watchdog:
     fallbacks: dict[str, tuple[Fallback, str]] = {
         "hold": (hold, "held"),
         "zero": (zero, "0"),
-        "model": (PredictedInput(loop.H, loop.K, resolved.plant_period_ns), "the model's"),
+        "model": (PredictedInput(loop.H, loop.K, resolved.timing.plant_period_ns), "the model's"),
     }
     fallback, said = fallbacks[resolved.plant.watchdog.policy]
-    return Watchdog(loop.m, resolved.actuation_timeout_ns, fallback, said)
+    return Watchdog(loop.m, resolved.timing.actuation_timeout_ns, fallback, said)

@@ -18,7 +18,7 @@ from noack.protocol.wire_format import Flow, Message
 from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy, Trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
-from sensor_node.state_observer import ObservingSensor, observer_of
+from sensor_node.observing_sensor import ObservingSensor, observer_of
 
 
 class Sensor:
@@ -126,11 +126,11 @@ def sensor_of(
 
     One that is started anew transmits its first measurement.
     """
-    observer = observer_of(resolved, known=not start.is_restart)
+    observer = observer_of(resolved, restarted=start.is_restart)
     sensor = _triggering(resolved, start)
     if observer is None:
         return sensor
-    return ObservingSensor(observer, sensor, again=start.is_restart)
+    return ObservingSensor(observer, sensor, restarted=start.is_restart)
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
@@ -138,9 +138,9 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
     loop, policy = loop_of(resolved), policy_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     x0 = loop.x0 if known else None
-    period_ns, first = resolved.measurement_period_ns, start.first_number
+    period_ns, first = resolved.timing.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:
-        timeout_ns = resolved.acknowledgement_timeout_ns
+        timeout_ns = resolved.timing.acknowledgement_timeout_ns
         return AcknowledgedSensor(
             loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first
         )

@@ -188,7 +188,7 @@ class Invariants:
         """Hold (I1) against the measurements up to which the controller's state is known."""
         reach_ns = int(self._track.model_ns[-1])
         if final:
-            reach_ns += self._scenario.controller_period_ns
+            reach_ns += self._scenario.timing.controller_period_ns
         ready = int(
             np.searchsorted(self._unjoined["t_ns"], reach_ns, side="right" if final else "left")
         )

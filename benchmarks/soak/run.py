@@ -148,7 +148,7 @@ class _Soak:
         pause_s = min(self._length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
         look_s = told_s = moved_s = time.monotonic()
         began_s, told, newest_ns, disk_bytes = math.inf, 0, 0, 0
-        while self._run.poll() is None and newest_ns < self._scenario.horizon_ns:
+        while self._run.poll() is None and newest_ns < self._scenario.timing.horizon_ns:
             self._read()
             now_s = time.monotonic()
             if self._invariants.t_ns > newest_ns:
@@ -162,7 +162,7 @@ class _Soak:
                 self._faults.append(f"nothing was recorded for {_STUCK_S:g} s; the run was ended")
                 self._run.terminate()
                 break
-            share = newest_ns / self._scenario.horizon_ns
+            share = newest_ns / self._scenario.timing.horizon_ns
             if int(10 * share) > told or now_s - told_s > _SAY_S:
                 told, told_s = int(10 * share), now_s
                 self._say(self._progress(share))

@@ -23,7 +23,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     and ``off_B`` = A − Â and B − B̂, and ``in_box``, whether these are within the half-widths of the
     scenario's uncertainty box; None without one. All are None of a plant whose x is no state.
     """
-    if resolved.is_linear:
+    if resolved.coverage.is_linear:
         return None
     loop, plant = loop_of(resolved), resolved.plant
 

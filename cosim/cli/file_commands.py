@@ -115,7 +115,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
     from cosim.analysis.model_comparison import linearisation, said
     from plant_server.systems.system_from_settings import system_of
 
-    if not resolved.is_linear:
+    if not resolved.coverage.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
         console.print(f"the plant: {about}", highlight=False, markup=False)
     if (near := linearisation(resolved)) is not None:
@@ -130,7 +130,7 @@ def _in_force(resolved: Scenario) -> Iterator[str]:
     from cosim.live.restart_policy import RESTART_BY_HAND_S
     from cosim.live.start_limit import DEFAULT_S
 
-    watchdog, timeout_s = resolved.plant.watchdog, resolved.actuation_timeout_ns / NS_PER_S
+    watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
     if watchdog.timeout_s is None:
         yield f"plant.watchdog: {watchdog.policy} when no actuation has come for {timeout_s:g} s"
     if resolved.controller.safe_input is None:

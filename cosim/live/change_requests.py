@@ -59,7 +59,7 @@ class ChangeRequests:
                 raise CallerError(f"this run has had {MOST_CHANGES} changes, the maximum")
             delay_ns = int(_CHANGE_DELAY_S * NS_PER_S * self._scenario.speed)
             t_ns = -(-max(now_ns + delay_ns, 0) // _MILLISECOND_NS) * _MILLISECOND_NS
-            if t_ns >= self._scenario.horizon_ns:
+            if t_ns >= self._scenario.timing.horizon_ns:
                 raise CallerError(
                     f"the run ends at {self._scenario.horizon_s:g} s, before a change could apply"
                 )

@@ -92,7 +92,7 @@ class Recorder:
         self._invalid = 0
         self._progress = ProgressReport(live)
         if start.is_restart:
-            self._monitor.give_up("the recorder was restarted")
+            self._monitor.stop("the recorder was restarted")
             self._store.load(self._progress.count)
 
     @property
@@ -211,7 +211,7 @@ class Recorder:
         """Count, check and show rows that are stored."""
         if not follows:
             self._out_of_order = True
-            self._monitor.give_up("telemetry is missing or arrived out of order")
+            self._monitor.stop("telemetry is missing or arrived out of order")
             return
         self._progress.count(table, rows)
         self._monitor.take(table, rows)
@@ -226,17 +226,19 @@ class Recorder:
             violations = check()
         except Exception as error:  # whatever it is: recording goes on
             violations = []
-            self._monitor.give_up(repr(error))
+            self._monitor.stop(repr(error))
         for one in violations:
-            text = f"affected claims are void from {one.t_s:.3f} s: {one.text}"
+            text = f"void (assumption violated) from {one.t_s:.3f} s on: {one.text}"
             notice = Notice(round(one.t_s * NS_PER_S), "void", text)
             self.note(notice)
             self._progress.add_void(text)
             if self._feed is not None:
                 self._feed.log(notice._asdict())
-        if self._monitor.blind is not None and not self._blind_reported:
+        if self._monitor.stopped is not None and not self._blind_reported:
             self._blind_reported = True
-            self._progress.add_void(f"claims are checked after the run only: {self._monitor.blind}")
+            self._progress.add_void(
+                f"claims are checked after the run only: {self._monitor.stopped}"
+            )
 
     def _publish_progress(self) -> None:
         self._plane.session.put(self._plane.key("progress"), self._progress.dumps())

@@ -106,7 +106,7 @@ class RestartPolicy:
         return {role: one for role, one in (seen | exited).items() if role not in self._failed}
 
     def _is_past_horizon(self) -> bool:
-        return self._coordinator.now_ns() >= self._scenario.horizon_ns
+        return self._coordinator.now_ns() >= self._scenario.timing.horizon_ns
 
     def _t_s(self) -> float:
         return self._coordinator.now_ns() * 1e-9

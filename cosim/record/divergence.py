@@ -18,11 +18,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from noack.config.disturbances import StepDisturbance
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.config.triggers import AnyTrigger, DeadlineSettings, DwellSettings
 from noack.core.linear_systems import Matrix, Vector, row_norms
+from noack.disturbances.step import StepDisturbance
 
 GROWTH = 1000.0
 _STILL_GROWING = 2.0

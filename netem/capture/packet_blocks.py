@@ -75,7 +75,7 @@ _HELD_BACK = _text(", held back ")
 _FOR_THE_CAP = _text(" so that the cap holds")
 _MS = _text(" ms")
 _FORWARD = _text("; forward, flow ")
-_BACK = _text("; back, flow ")
+_BACK = _text("; reverse, flow ")
 _DATAGRAM = _text(", datagram ")
 
 

@@ -60,7 +60,7 @@ exit status: 0 it ended as asked; 1 something failed; 2 the command line or a fi
 
 examples:
   noack netem --listen :9000 --to :9001 loss 5% mansd 4
-  noack netem --listen :9000 --to :9001 delay 10ms 2ms distribution normal --back delay 10ms
+  noack netem --listen :9000 --to :9001 delay 10ms 2ms distribution normal --reverse delay 10ms
   noack netem --listen :5300 --to 192.0.2.1:53 --both "loss gemodel 1% 10%"
   noack netem --links links.toml
   noack netem --explain loss burst 5% 3 mansd 2
@@ -111,7 +111,10 @@ def parser() -> Parser:
     alone.add_argument("--to", metavar="HOST:PORT", help="the server")
     alone.add_argument("words", nargs="*", metavar="WORDS", help="from clients to the server")
     alone.add_argument(
-        "--back", metavar="WORDS", nargs="+", help="from the server to clients; nothing by default"
+        "--reverse",
+        metavar="WORDS",
+        nargs="+",
+        help="from the server to clients (no impairment)",
     )
     alone.add_argument("--both", action="store_true", help="the words apply in both directions")
     alone.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
@@ -152,7 +155,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
         CallerError: it says something wrong.
     """
     if options.links is not None:
-        for name in ("listen", "to", "words", "back", "both", "one_way", "idle", "seed"):
+        for name in ("listen", "to", "words", "reverse", "both", "one_way", "idle", "seed"):
             if getattr(options, name):
                 shown = name if name == "words" else f"--{name.replace('_', '-')}"
                 raise CallerError(f"{shown}: stands in the file that --links names")
@@ -166,7 +169,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
         raise CallerError("--listen and --to go together")
     listen = parse_address(options.listen, "--listen")
     to = parse_address(options.to, "--to", listen)
-    forward, back, seed = directions(options)
+    forward, reverse, seed = directions(options)
     idle_s = LinkSpec.idle_s
     if options.idle is not None:
         try:
@@ -181,7 +184,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
             listen=listen,
             to=to,
             forward=read_files(forward, Path()),
-            back=read_files(back, Path()),
+            reverse=read_files(reverse, Path()),
             seed=seed,
             return_path=not options.one_way,
             idle_s=idle_s,
@@ -190,20 +193,20 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
 
 
 def directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
-    """Return what happens forward and back, and the seed; files are not read yet.
+    """Return the settings forward and reverse, and the seed; files are not read yet.
 
     Raises:
         CallerError: the words say something wrong.
     """
     forward, seed = parse(options.words or ())
-    if options.both and options.back is not None:
-        raise CallerError("--back: goes without --both")
-    if options.one_way and (options.both or options.back is not None):
-        raise CallerError("--one-way: nothing goes back; leave out --back and --both")
-    back = settings_of(options.back) if options.back is not None else LinkSettings()
+    if options.both and options.reverse is not None:
+        raise CallerError("--reverse: goes without --both")
+    if options.one_way and (options.both or options.reverse is not None):
+        raise CallerError("--one-way: no reverse direction; leave out --reverse and --both")
+    reverse = settings_of(options.reverse) if options.reverse is not None else LinkSettings()
     if seed is not None and options.seed is not None:
         raise CallerError(f"--seed {options.seed}: the words say seed {seed} already")
     seed = options.seed if seed is None else seed
     if seed is not None and not 0 <= seed < 2**64:
         raise CallerError(f"--seed {seed}: must be 0 or more, below 2^64")
-    return forward, forward if options.both else back, seed or 0
+    return forward, forward if options.both else reverse, seed or 0

@@ -20,7 +20,7 @@ from noack.config.impairments import LinkSettings
 from noack.runtime.address import text_of as address_text
 
 _NOTHING = LinkSettings()
-_FROM_TO = {"forward": "from clients to the server", "back": "from the server to clients"}
+_FROM_TO = {"forward": "from clients to the server", "reverse": "from the server to clients"}
 _MOST_TOML = 4000
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
 """Least and most columns for words."""
@@ -50,7 +50,7 @@ class LinkExplanation(TypedDict):
     to: str
     seed: int
     forward: DirectionExplanation
-    back: DirectionExplanation | None
+    reverse: DirectionExplanation | None
     """None: one way only."""
 
 
@@ -92,7 +92,7 @@ def _link_document(spec: LinkSpec) -> LinkExplanation:
         "to": address_text(spec.to),
         "seed": spec.seed,
         "forward": _document(spec.forward),
-        "back": _document(spec.back) if spec.return_path else None,
+        "reverse": _document(spec.reverse) if spec.return_path else None,
     }
 
 
@@ -118,15 +118,15 @@ def _heading(spec: LinkSpec) -> str:
 
 
 def _print_link(console: Console, spec: LinkSpec) -> None:
-    if spec.return_path and spec.forward == spec.back:
+    if spec.return_path and spec.forward == spec.reverse:
         _print_direction(console, "in both directions, in each by itself", spec.forward)
         return
     _print_direction(console, f"forward, {_FROM_TO['forward']}", spec.forward)
     console.print()
     if spec.return_path:
-        _print_direction(console, f"back, {_FROM_TO['back']}", spec.back)
+        _print_direction(console, f"reverse, {_FROM_TO['reverse']}", spec.reverse)
     else:
-        console.print(Text("back: one way only, what the server answers is not relayed", "bold"))
+        console.print(Text("reverse: not relayed; the server's answers are discarded", "bold"))
 
 
 def _print_direction(console: Console, title: str, settings: LinkSettings) -> None:
@@ -205,7 +205,7 @@ def _toml(spec: LinkSpec) -> Iterator[str]:
         value = getattr(spec, key)
         if value != getattr(LinkSpec, key):
             link[key] = value
-    sides = {"forward": _given(spec.forward), "back": _given(spec.back)}
+    sides = {"forward": _given(spec.forward), "reverse": _given(spec.reverse)}
     yield from _toml_table("[[link]]", "link", link | {k: v for k, v in sides.items() if v})
 
 

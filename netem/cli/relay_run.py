@@ -126,7 +126,7 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
         replace(
             spec,
             forward=settings(spec, "forward"),
-            back=settings(spec, "back"),
+            reverse=settings(spec, "reverse"),
             decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
         )
         for spec in specs

@@ -34,7 +34,7 @@ _COUNTS = {
 class _Row(NamedTuple):
     label: str
     forward: str
-    back: str
+    reverse: str
     style: str = ""
 
 
@@ -68,40 +68,44 @@ def _table(link: LinkStatistics, predicted: bool) -> Table:
     )  # fmt: skip
     table.add_column("")
     table.add_column("forward", justify="right")
-    both = bool(link["back"]["arrived"] or link["back"]["words"] or link["discarded"])
+    both = bool(link["reverse"]["arrived"] or link["reverse"]["words"] or link["discarded"])
     if both:
-        table.add_column("back", justify="right")
+        table.add_column("reverse", justify="right")
     for row in _rows(link, predicted):
-        cells = (row.forward, row.back) if both else (row.forward,)
+        cells = (row.forward, row.reverse) if both else (row.forward,)
         table.add_row(row.label, *cells, style=row.style)
     return table
 
 
 def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
-    forward, back = link["forward"], link["back"]
-    yield _Row("came", _number(forward["arrived"]), _number(back["arrived"]))
-    yield _Row("left", _number(forward["forwarded"]), _number(back["forwarded"]))
+    sides = forward, reverse = link["forward"], link["reverse"]
+    yield _Row("came", _number(forward["arrived"]), _number(reverse["arrived"]))
+    yield _Row("left", _number(forward["forwarded"]), _number(reverse["forwarded"]))
     for fate, label in _CAUSES.items():
-        yield from _some(label, forward["fates"][fate], back["fates"][fate])
-    yield from _some("forced through", forward["fates"]["forced"], back["fates"]["forced"])
+        yield from _some(label, forward["fates"][fate], reverse["fates"][fate])
+    yield from _some("forced through", forward["fates"]["forced"], reverse["fates"]["forced"])
     for key, label in _COUNTS.items():
-        yield from _some(label, forward[key], back[key])  # type: ignore[literal-required]
-    if forward["arrived_before"] or back["arrived_before"]:
+        yield from _some(label, forward[key], reverse[key])  # type: ignore[literal-required]
+    if forward["arrived_before"] or reverse["arrived_before"]:
         yield _Row("since the last change:", "", "", "dim")
-    yield _Row("most in a row not delivered", _run(forward), _run(back))
-    yield _Row("lost", _share(forward, "lost"), _share(back, "lost"))
-    if predicted and any(side["loss"]["predicted"] is not None for side in (forward, back)):
-        full = forward["fates"]["overflowed"] or back["fates"]["overflowed"]
+    yield _Row("most in a row not delivered", _run(forward), _run(reverse))
+    yield _Row("lost", _share(forward, "lost"), _share(reverse, "lost"))
+    if predicted and any(side["loss"]["predicted"] is not None for side in sides):
+        full = forward["fates"]["overflowed"] or reverse["fates"]["overflowed"]
         what = "but for full queues" if full else "in the long run"
-        yield _Row(f"  predicted {what}", _share(forward, "predicted"), _share(back, "predicted"))
-    if forward["delivered_out_of_order"] or back["delivered_out_of_order"]:
-        yield _Row("lost or stale", _share(forward, "realised"), _share(back, "realised"))
-    yield _Row("delay: median, 99 % within", _times(forward["delay_ns"]), _times(back["delay_ns"]))
-    late = (forward["lateness_ns"], back["lateness_ns"])
+        yield _Row(
+            f"  predicted {what}", _share(forward, "predicted"), _share(reverse, "predicted")
+        )
+    if forward["delivered_out_of_order"] or reverse["delivered_out_of_order"]:
+        yield _Row("lost or stale", _share(forward, "realised"), _share(reverse, "realised"))
+    yield _Row(
+        "delay: median, 99 % within", _times(forward["delay_ns"]), _times(reverse["delay_ns"])
+    )
+    late = (forward["lateness_ns"], reverse["lateness_ns"])
     if any(times["p50"] is not None for times in late):
         yield _Row("lateness: median, 99 % within", *map(_times, late))
-    for cause in {**forward["unintended"], **back["unintended"]}:
-        there, here = (side["unintended"].get(cause, 0) for side in (forward, back))
+    for cause in {**forward["unintended"], **reverse["unintended"]}:
+        there, here = (side["unintended"].get(cause, 0) for side in sides)
         yield from _some(f"unintended: {cause.replace('_', ' ')}", there, here, "bold red")
     if link["refused"]:
         yield _Row("refused: too many clients", _number(link["refused"]), "", "bold red")
@@ -111,9 +115,9 @@ def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
         yield _Row("answers discarded, one way", "", _number(link["discarded"]))
 
 
-def _some(label: str, forward: int, back: int, style: str = "") -> Iterator[_Row]:
-    if forward or back:
-        yield _Row(label, _number(forward), _number(back), style)
+def _some(label: str, forward: int, reverse: int, style: str = "") -> Iterator[_Row]:
+    if forward or reverse:
+        yield _Row(label, _number(forward), _number(reverse), style)
 
 
 def _number(number: int) -> str:

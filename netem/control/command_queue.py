@@ -69,7 +69,7 @@ class CommandQueue:
         self._in_force: dict[tuple[str, Direction], AppliedSettings] = {}
         for spec in relay.specs:
             self._in_force[spec.name, "forward"] = AppliedSettings(spec.forward, Counters())
-            self._in_force[spec.name, "back"] = AppliedSettings(spec.back, Counters())
+            self._in_force[spec.name, "reverse"] = AppliedSettings(spec.reverse, Counters())
         self._closed = False
         self._lock = Lock()
 
@@ -148,7 +148,7 @@ class CommandQueue:
                 self._relay.change(link, direction, settings)
             (report,) = (one for one in self._relay.report() if one.name == link)
             for direction in directions:
-                changed = report.forward if direction == "forward" else report.back
+                changed = report.forward if direction == "forward" else report.reverse
                 self._in_force[link, direction] = AppliedSettings(
                     settings, replace(changed.counters)
                 )

@@ -9,7 +9,7 @@ session file (:mod:`netem.control.emulator_session`). Below ``netem/NAME`` it
 * publishes ``statistics`` once a second.
 
 A query is a JSON object. It must hold ``token``, the secret of the session file; ``change`` takes
-``link`` (may be left out if there is one), ``direction`` (``forward``, the default, ``back`` or
+``link`` (may be left out if there is one), ``direction`` (``forward``, the default, ``reverse`` or
 ``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
 :class:`~noack.config.impairments.LinkSettings`). As with ``tc qdisc change``, the new settings
 replace the old; files that words name are read before they are sent. What is wrong with a query is
@@ -68,7 +68,7 @@ class SettingsChange(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
     link: str | None = None
-    direction: Literal["forward", "back", "both"] = "forward"
+    direction: Literal["forward", "reverse", "both"] = "forward"
     words: str | list[str] | None = None
     settings: LinkSettings | None = None
 
@@ -189,7 +189,7 @@ class ControlServer:
                 {
                     "name": link.name,
                     "forward": _settings(link.forward.settings),
-                    "back": _settings(link.back.settings),
+                    "reverse": _settings(link.reverse.settings),
                 }
                 for link in links
             ]

@@ -81,7 +81,7 @@ def _set(arguments: Sequence[str]) -> ExitStatus:
         "Change what a link of a running emulator does. As with `tc qdisc change`, the words\n"
         "replace all that the direction did, its cap too.",
         ("noack netem set loss 10% mansd 4", "noack netem set dns --direction both delay 20ms 5ms"),
-        usage="%(prog)s [NAME] [--link LINK] [--direction forward|back|both] WORDS ...",
+        usage="%(prog)s [NAME] [--link LINK] [--direction forward|reverse|both] WORDS ...",
     )
     parser.add_argument("words", nargs="*", metavar="[NAME] WORDS", help="e.g. loss 5%% mansd 4")
     parser.add_argument("--link", help="may be left out if there is only one")

@@ -128,7 +128,7 @@ class LinkStatistics(TypedDict):
     """How often ICMP said that nobody listens where the server should be; at least so often did a
     datagram come to nobody."""
     forward: DirectionStatistics
-    back: DirectionStatistics
+    reverse: DirectionStatistics
 
 
 class Statistics(TypedDict):
@@ -180,7 +180,7 @@ def _link(
         "discarded": after.discarded,
         "port_unreachable": after.port_unreachable,
         "forward": direction("forward", after.forward, before.forward if before else None),
-        "back": direction("back", after.back, before.back if before else None),
+        "reverse": direction("reverse", after.reverse, before.reverse if before else None),
     }
 
 
@@ -238,7 +238,7 @@ def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> 
 
 def unintended(totals: Statistics) -> int:
     """Return how many datagrams were lost unintentionally in all links."""
-    directions = [link[side] for link in totals["links"] for side in ("forward", "back")]
+    directions = [link[side] for link in totals["links"] for side in ("forward", "reverse")]
     return sum(sum(direction["unintended"].values()) for direction in directions)
 
 

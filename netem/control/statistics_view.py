@@ -32,7 +32,7 @@ from netem.control.number_texts import (
 from netem.control.statistics_history import History
 from netem.engine.relay_interface import DIRECTIONS, Direction
 
-_ARROWS = {"forward": "forward →", "back": "← back"}
+_ARROWS = {"forward": "forward →", "reverse": "← reverse"}
 _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4
 _WORDS_LINES = 3
@@ -76,9 +76,9 @@ def _panel(history: History, link: LinkStatistics, column: int) -> tuple[Rendera
         grid.add_column(width=column)
     columns = [_cells(history, link["name"], name, link[name], column) for name in DIRECTIONS]
     lines = 2
-    for (label, forward), (_, back) in zip(*columns, strict=True):
-        grid.add_row(label, forward, back)
-        lines += max(_lines(forward), _lines(back))
+    for (label, forward), (_, reverse) in zip(*columns, strict=True):
+        grid.add_row(label, forward, reverse)
+        lines += max(_lines(forward), _lines(reverse))
     unintended = _unintended(link)
     content: RenderableType = grid
     if unintended is not None:

@@ -97,7 +97,7 @@ class _Direction(BaseModel):
 class _Link(BaseModel):
     name: str
     forward: _Direction
-    back: _Direction
+    reverse: _Direction
 
 
 class _Header(BaseModel):

@@ -18,9 +18,9 @@ from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
 from noack.config.impairment_files import read_files
 from noack.config.impairments import LinkSettings
-from noack.config.section import ScenarioSection, Seed
 from noack.core.errors import CallerError
 from noack.runtime.address import parse_address
+from noack.settings.section import ScenarioSection, Seed
 
 
 def _settings(value: Any) -> Any:
@@ -51,7 +51,7 @@ class LinkTable(ScenarioSection):
     """The server: HOST:PORT."""
     forward: Side = LinkSettings()
     """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
-    back: Side = LinkSettings()
+    reverse: Side = LinkSettings()
     """From the server back to the clients, likewise."""
     words: Side | None = None
     """Short for forward."""
@@ -86,7 +86,7 @@ class LinkTable(ScenarioSection):
             listen=listen,
             to=parse_address(self.to, f"{place}.to", listen),
             forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
-            back=read_files(self.back, folder, f"{place}.back"),
+            reverse=read_files(self.reverse, folder, f"{place}.reverse"),
             seed=self.seed,
             return_path=self.return_path,
             idle_s=self.idle_s,

@@ -27,8 +27,8 @@ from netem.words.quantities import (
 )
 from netem.words.word_reader import WordReader
 from noack.config.impairments import Delay, Distribution, Impairment, LinkSettings, Rate, Reorder
-from noack.config.section import Seed
 from noack.core.errors import CallerError
+from noack.settings.section import Seed
 
 SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")
 """Names of distributions; any other word after ``distribution`` is a file's name."""

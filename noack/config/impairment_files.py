@@ -17,7 +17,7 @@ from noack.config.impairments import (
     ScriptedLoss,
     TraceLoss,
 )
-from noack.config.named_file import NamedFile
+from noack.settings.named_file import NamedFile
 
 MAX_SAMPLES = 1_000_000
 TABLE_SUFFIX = ".dist"

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.section import Correlation, Probability, ScenarioSection
+from noack.settings.section import Correlation, Probability, ScenarioSection
 
 MAX_SCRIPT = 10_000_000
 MOST_DELAY_S = 3600.0

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from noack.config.mat_file import matrices_as_npz
-from noack.config.named_file import NamedFile
 from noack.core.linear_systems import Matrix
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.named_file import NamedFile
 
 NPZ, MAT = ".npz", ".mat"
 GAIN = "gain"

@@ -9,13 +9,14 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
-from noack.config.matrices import Row, Rows, require_length
-from noack.config.section import NonNegative, Positive, ScenarioSection
 from noack.core.errors import CallerError
 from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.matrices import Row, require_length
+from noack.settings.section import NonNegative, Positive, ScenarioSection
+from noack.settings.user_class import ClassSettings
+from noack.settings.user_files import FileSettings
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
-Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
@@ -235,7 +236,7 @@ class QuadrotorSettings(PlantSettings):
     """Gravity."""
 
 
-class FmuSettings(PlantSettings):
+class FmuSettings(FileSettings, PlantSettings):
     """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: any tool's model, exported.
 
     It is native code that is run in the plant's process; see docs/plants.md.
@@ -247,8 +248,6 @@ class FmuSettings(PlantSettings):
     """What the plant is."""
     file: str
     """The FMU; relative names begin at the scenario file."""
-    sha256: Sha256 | None = None
-    """What the file must have; filled in when the scenario is loaded."""
     state_variables: Annotated[Names, Field(min_length=1)]
     """Its variables that make up x: outputs or locals, real."""
     input_variables: Annotated[Names, Field(min_length=1)]
@@ -284,31 +283,18 @@ class FmuSettings(PlantSettings):
         require_length(self.operating_input, "plant.system.operating_input", m, why)
 
 
-class PythonSettings(PlantSettings):
+class PythonSettings(ClassSettings, PlantSettings):
     """A class of the user's own, from an installed package or from a file.
 
     Its code is run in the plant's process; see docs/plants.md for what the class must offer.
     """
 
+    group: ClassVar = "noack.plants"
+
     kind: Literal["python"]
     """What the plant is."""
-    name: Annotated[str, Field(pattern=r"^[A-Za-z_][\w.:-]*$")]
-    """An entry point of the group noack.plants, or package.module:Class; or, with file, the class
-    in it."""
-    file: str | None = None
-    """A Python source file that has the class; relative names begin at the scenario file."""
-    sha256: Sha256 | None = None
-    """What the file must have; filled in when the scenario is loaded."""
-    parameters: dict[str, bool | int | FiniteFloat | str | Row | Rows] = Field({})
-    """Passed to the class as keywords, arrays as lists."""
     on_record: Names = ()
     """Names of the entries of its own state z, which is then on record."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.file is None and self.sha256 is not None:
-            raise ValueError("sha256: it is of a file; give file, too")
-        return self
 
     @property
     def internal_names(self) -> tuple[str, ...]:

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from noack.config.matrices import require_shape
 from noack.config.matrix_files import GAIN, unfit, write_matrices
 from noack.config.sections.model_section import ModelSection, instability
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.settings.matrices import require_shape
 
 
 def model_of(

@@ -5,9 +5,9 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Discriminator, Field, FiniteFloat, Tag, model_validator
 
-from noack.config.matrices import Rows, require_shape
-from noack.config.section import Positive, ScenarioSection
 from noack.core.clock import NS_PER_S
+from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import Positive, ScenarioSection
 
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]

@@ -17,12 +17,12 @@ from typing import Annotated, Any, NamedTuple
 from pydantic import Field, ValidationError
 
 from noack.config.scenario import Scenario
-from noack.config.section import ScenarioSection, Seed
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, PeerError
 from noack.protocol.wire_format import KEY_BYTES
 from noack.runtime.lock_file import lock_file
 from noack.runtime.private_folder import open_private, private_folder, require_name
+from noack.settings.section import ScenarioSection, Seed
 
 DEFAULT_SESSION = "default"
 

@@ -155,7 +155,7 @@ class RunProcess:
         route, ticket = ROUTES[self.role], self.ticket
         decoder = Decoder(
             route.receives,
-            self.scenario.entries(route.receives),
+            self.scenario.message_sizes.entries(route.receives),
             ticket.run_id,
             ticket.key,
             not_before_ns=self._admitted_ns,
@@ -246,7 +246,7 @@ class RunProcess:
             channel,
             self.clock,
             telemetry,
-            end_ns=self.scenario.horizon_ns + int(_GRACE_S * NS_PER_S * self.scenario.speed),
+            end_ns=self.scenario.timing.horizon_ns + int(_GRACE_S * NS_PER_S * self.scenario.speed),
             stop=lambda: self.stopping,
             spin_us=self.scenario.realtime.spin_us,
             news=lambda now_ns: self._announce(changeable, now_ns, next(limits)),

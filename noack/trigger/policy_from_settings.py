@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from noack.config.matrices import Rows
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.triggers import (
@@ -22,6 +21,7 @@ from noack.config.triggers import (
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.settings.matrices import Rows
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
 from noack.trigger.decaying import DecayingTrigger

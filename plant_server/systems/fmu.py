@@ -18,9 +18,9 @@ from typing import Any, NoReturn
 import numpy as np
 
 from noack.config.plant_systems import FmuSettings
-from noack.config.system_files import unchanged
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.settings.user_files import unchanged
 from plant_server.native_code import quiet, temporary_folder
 from plant_server.system import SystemFailedError
 
@@ -49,7 +49,7 @@ class FmuSystem:
 
     def __init__(self, settings: FmuSettings, x0: Vector) -> None:
         settings.require_installed()
-        path = unchanged(settings)
+        path = unchanged(settings, "plant.system")
         self._place = f'plant.system.file = "{path.name}"'
         self._operating_state = np.array(settings.operating_state or np.zeros_like(x0))
         self._operating_input = np.array(

@@ -3,25 +3,19 @@
 Its code runs in this process. Whatever it raises ends the plant's motion, not the run.
 """
 
-import sys
-import traceback
 from collections.abc import Callable
-from importlib import import_module, metadata
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from noack.config.plant_systems import PythonSettings
-from noack.config.system_files import unchanged
-from noack.core.errors import CallerError, one_line
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Vector
+from noack.settings.user_class import failure_text, new_instance, read_only, real_vector
 from plant_server.ode_integrator import OdeSystem
 from plant_server.system import PlantSystem, SystemFailedError
 
-GROUP = "noack.plants"
-"""The group of entry points in which packages name their plants."""
+_PLACE = "plant.system"
 _ALIKE = 1e-6
 """How far x(0) of the scenario and of the class may be apart, relative to its size."""
 
@@ -43,15 +37,10 @@ class PythonSystem:
     """
 
     def __init__(self, settings: PythonSettings, x0: Vector, m: int) -> None:
-        self._place = f'plant.system.name = "{settings.name}"'
+        self._settings = settings
         self._recorded = len(settings.on_record)
-        parameters = {
-            key: _listed(value) if isinstance(value, tuple) else value
-            for key, value in settings.parameters.items()
-        }
         try:
-            made, self.about = _found(settings)
-            plant = made(**parameters)
+            plant, self.about = new_instance(settings, _PLACE)
             self._system = self._system_of(plant, x0, m)
             self.x, self.z = x0, np.zeros(self._recorded)
             self._look(self._system)
@@ -63,7 +52,7 @@ class PythonSystem:
             raise CallerError(self._said(error)) from None
         if not np.all(np.abs(self.x - x0) <= _ALIKE * (np.abs(x0) + 1.0)):
             raise CallerError(
-                f"{self._place}: x is {self.x.tolist()} at the start; "
+                f'{_PLACE}.name = "{settings.name}": x is {self.x.tolist()} at the start; '
                 f"plant.initial_state is {x0.tolist()}"
             )
 
@@ -78,9 +67,9 @@ class PythonSystem:
             raise SystemFailedError(self._said(error)) from None
 
     def _look(self, system: PlantSystem) -> None:
-        self.x = _vector("x", system.x, len(self.x))
+        self.x = real_vector("x", system.x, len(self.x))
         if self._recorded:
-            self.z = _vector("z", system.z, self._recorded)
+            self.z = real_vector("z", system.z, self._recorded)
 
     def _system_of(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
         if hasattr(plant, "derivative") == hasattr(plant, "advance"):
@@ -103,18 +92,15 @@ class PythonSystem:
     def _derivative(self, plant: Any, size: int) -> Callable[[float, Vector, Vector], Vector]:
         def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
             try:
-                found = plant.derivative(t_s, _frozen(z), _frozen(u))
-                return _vector("derivative(t_s, z, u)", found, size)
+                found = plant.derivative(t_s, read_only(z), read_only(u))
+                return real_vector("derivative(t_s, z, u)", found, size)
             except (Exception, SystemExit) as error:
                 raise SystemFailedError(self._said(error)) from None
 
         return derivative
 
     def _said(self, error: BaseException) -> str:
-        """What went wrong, and where in code that is not ours."""
-        frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
-        where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-        return f"{self._place}: {type(error).__name__}: {one_line(error)}{where}"
+        return failure_text(self._settings, _PLACE, error)
 
 
 class _Stepping:
@@ -134,64 +120,3 @@ class _Stepping:
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
         self._plant.advance(u.copy(), t_ns * 1e-9, dt_ns * 1e-9)
-
-
-def _frozen(values: Vector) -> Vector:
-    """A copy that cannot be written to: the integrator counts on its own."""
-    copy = values.copy()
-    copy.flags.writeable = False
-    return copy
-
-
-def _vector(what: str, value: Any, size: int) -> Vector:
-    """A copy of what a class returned, if it has the right shape."""
-    given = np.array(value)
-    if given.dtype.kind not in "biuf":
-        raise TypeError(f"{what} is not of real numbers")
-    found = given.astype(np.float64)
-    if found.shape != (size,):
-        raise ValueError(f"{what} has shape {found.shape}, expected ({size},)")
-    return found
-
-
-def _found(settings: PythonSettings) -> tuple[Any, str]:
-    """The class that the settings name, and what it is, in words."""
-    if settings.file is not None:
-        path = unchanged(settings)
-        return _within(_executed(path), settings.name), f"class {settings.name} of {path.name}"
-    module, colon, name = settings.name.partition(":")
-    if colon:
-        return _within(import_module(module), name), f"class {settings.name}"
-    known = metadata.entry_points(group=GROUP)
-    if settings.name not in known.names:
-        there = ", ".join(sorted(known.names)) or "none"
-        raise LookupError(
-            f"no installed package has an entry point of this name in the group {GROUP} (there "
-            f"are: {there}); write package.module:Class, or name a file, too"
-        )
-    entry = known[settings.name]
-    version = f", {entry.dist.name} {entry.dist.version}" if entry.dist else ""
-    return entry.load(), f"class {entry.value}{version}"
-
-
-def _within(module: ModuleType, name: str) -> Any:
-    if not hasattr(module, name):
-        raise LookupError(f"{Path(module.__file__ or module.__name__).name} has no {name}")
-    return getattr(module, name)
-
-
-def _executed(path: Path) -> ModuleType:
-    """A module of its own of a source file; what stands beside it cannot be imported by it."""
-    module = ModuleType(f"noack_plant_{path.stem}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses look there
-    exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
-    return module
-
-
-def _is_ours(frame: traceback.FrameSummary) -> bool:
-    return frame.filename == __file__ or "importlib" in frame.filename
-
-
-def _listed(value: Any) -> Any:
-    return [_listed(one) for one in value] if isinstance(value, tuple) else value

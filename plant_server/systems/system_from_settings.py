@@ -71,4 +71,4 @@ def system_of(resolved: Scenario) -> PlantSystem:
             B: Matrix = loop.B
             if any(one.at == "state" for one in resolved.plant.disturbances):
                 B = np.hstack([B, np.eye(loop.n)])
-            return LinearSystem(loop.A, B, x0, step_ns=resolved.plant_period_ns)
+            return LinearSystem(loop.A, B, x0, step_ns=resolved.timing.plant_period_ns)

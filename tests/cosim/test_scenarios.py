@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.linalg import eigvals, solve_continuous_are
 
-from cosim.analysis.claims.claim_evaluation import scheduled_certificates
+from cosim.analysis.claims.run_evidence import scheduled_certificates
 from cosim.analysis.model_comparison import linearisation, said
 from cosim.analysis.run_summary import summarise
 from cosim.output.certificate_report import with_weight

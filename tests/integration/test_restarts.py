@@ -155,7 +155,7 @@ def test_a_restarted_controller_puts_out_nothing_until_it_knows_a_state(
     assert (ticks["u"][~waiting] != 0).any()
     assert (
         ticks["sequence"][0] % GENERATION
-        == ticks["t_ns"][0] // record.scenario.controller_period_ns
+        == ticks["t_ns"][0] // record.scenario.timing.controller_period_ns
     )
 
 

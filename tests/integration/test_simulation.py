@@ -57,7 +57,7 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
     The plant and the controller have two kinds of input each, and only their order is a race; it
     shows in the ``input`` numbers. The plant's held actuation shows what got through in time.
     """
-    first_ns = simulated.scenario.horizon_ns + 1
+    first_ns = simulated.scenario.timing.horizon_ns + 1
     for table, columns in (
         (PLANT_STEP, ("input", "actuation")),
         (CONTROLLER_STEP, ("input",)),
@@ -111,6 +111,6 @@ def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
             )
         compared += len(rows)
     assert until_ns < ENOUGH_S * 1e9 or compared > 60
-    if until_ns > simulated.scenario.horizon_ns:
+    if until_ns > simulated.scenario.timing.horizon_ns:
         for table in SAME:
             assert len(live[table]) == len(simulated[table]), table

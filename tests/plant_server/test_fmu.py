@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from noack.config.plant_systems import FmuSettings
-from noack.config.system_files import read_system
 from noack.core.errors import CallerError
+from noack.settings.user_files import located
 from plant_server.ode_integrator import OdeSystem
 from plant_server.plant_linearisation import linearise
 from plant_server.system import SystemFailedError
@@ -37,7 +37,7 @@ def own_folder_for_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def settings(path: Path, **more: Any) -> FmuSettings:
     given = {"state_variables": ("x0", "x1"), "input_variables": ("u",)} | more
-    loaded = read_system(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
+    loaded = located(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
     assert isinstance(loaded, FmuSettings)
     return loaded
 
@@ -224,7 +224,7 @@ def test_a_changed_fmu_is_not_run(version: int, tmp_path: Path) -> None:
     path = build(tmp_path, version)
     loaded = settings(path)
     path.write_bytes(path.read_bytes() + b"\0")
-    with pytest.raises(CallerError, match="is not what it was: its SHA-256 is"):
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
         FmuSystem(loaded, X0)
     path.unlink()
     with pytest.raises(CallerError, match="cannot be read: No such file"):
@@ -252,8 +252,8 @@ def test_what_is_unpacked_goes_with_the_system_or_its_process(
     assert not folder.exists()
     program = (
         "import sys, tempfile, numpy as np; from plant_server.systems.fmu import FmuSystem; "
-        "from noack.config.plant_systems import Fmu; tempfile.tempdir = sys.argv[1]; "
-        "kept = FmuSystem(Fmu.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
+        "from noack.config.plant_systems import FmuSettings; tempfile.tempdir = sys.argv[1]; "
+        "kept = FmuSystem(FmuSettings.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
     )
     loaded = settings(build(tmp_path, 2)).model_dump_json()
     done = subprocess.run(

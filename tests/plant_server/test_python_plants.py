@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from noack.config.plant_systems import PythonSettings
-from noack.config.system_files import read_system
 from noack.core.errors import CallerError
+from noack.settings.user_files import located
 from plant_server.system import SystemFailedError
 from plant_server.systems.python_plant import PythonSystem
 
@@ -46,7 +46,7 @@ STEPPING = """
 def settings(folder: Path, code: str, name: str, **more: Any) -> PythonSettings:
     path = folder / "mine.py"
     path.write_text(dedent(code))
-    loaded = read_system(
+    loaded = located(
         PythonSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml"
     )
     assert isinstance(loaded, PythonSettings)
@@ -213,7 +213,7 @@ def test_a_shape_that_changes_later_is_a_failure(tmp_path: Path) -> None:
 def test_a_changed_file_is_not_executed(tmp_path: Path) -> None:
     loaded = settings(tmp_path, PENDULUM, "Pendulum")
     (tmp_path / "mine.py").write_text("raise SystemExit('executed')")
-    with pytest.raises(CallerError, match="is not what it was: its SHA-256 is"):
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
         PythonSystem(loaded, X0, 1)
 
 

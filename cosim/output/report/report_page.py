@@ -121,7 +121,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model
     if scenario.is_acknowledged:
-        timeout_ms = 1e-6 * scenario.acknowledgement_timeout_ns
+        timeout_ms = 1e-6 * scenario.timing.acknowledgement_timeout_ns
         back = network.reverse.loss.model_dump()
         lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in back.items())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"

@@ -111,9 +111,9 @@ def setting_of(resolved: Scenario) -> Setting:
     Raises:
         CallerError: the scenario is one that exact simulation cannot take.
     """
-    resolved.require_unacknowledged()
-    resolved.require_unchanging()
-    resolved.require_exact()
+    resolved.coverage.require_unacknowledged()
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
     loop = loop_of(resolved)
     return Setting(
         H=loop.H,

@@ -123,7 +123,7 @@ class ContinuousLoop:
             CallerError: it is another.
         """
         if not isinstance(self.trigger, DecayingTrigger):
-            raise CallerError('trigger.policy: this is for the paper\'s trigger, "decaying", only')
+            raise CallerError('trigger.policy: needs the paper\'s trigger, "decaying"')
         return self.trigger
 
     def threshold(self, t_s: float) -> float:
@@ -383,7 +383,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     Raises:
         CallerError: it is a scenario that exact simulation cannot take.
     """
-    resolved.require_unacknowledged()
-    resolved.require_unchanging()
-    resolved.require_exact()
+    resolved.coverage.require_unacknowledged()
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
     return ContinuousLoop(loop_of(resolved), policy_of(resolved))

@@ -16,8 +16,8 @@ from pydantic import Field, FiniteFloat, JsonValue, model_validator
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
 from noack.config import toml_file
-from noack.config.matrices import Rows
-from noack.config.section import ScenarioSection, Seed
+from noack.settings.matrices import Rows
+from noack.settings.section import ScenarioSection, Seed
 
 MOST_POINTS = 10_000
 MOST_SERIES = 12

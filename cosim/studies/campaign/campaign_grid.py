@@ -19,12 +19,12 @@ from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
 from noack.config import toml_file
-from noack.config.matrices import Rows, require_shape
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import completed, put
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.settings.matrices import Rows, require_shape
 
 SCENARIOS = "scenarios"
 

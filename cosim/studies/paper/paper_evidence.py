@@ -312,7 +312,7 @@ def _sampled(path: Path, representative: int) -> Numbers:
     exact = continuous.at(joined.t_ns / NS_PER_S)
     return {
         "horizon_s": _SAMPLED_S,
-        "period_s": resolved.measurement_period_ns / NS_PER_S,
+        "period_s": resolved.timing.measurement_period_ns / NS_PER_S,
         "events": int(tested.sum()) + 1,
         "events_continuous": len(continuous.event_s),
         "beyond": float(beyond.max()),

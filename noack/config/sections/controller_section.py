@@ -4,9 +4,9 @@ from typing import Annotated, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.matrices import Row
-from noack.config.section import ScenarioSection
 from noack.config.sections.rates import RateHz, require_whole_period
+from noack.settings.matrices import Row
+from noack.settings.section import ScenarioSection
 
 
 class ControllerSection(ScenarioSection):

@@ -5,11 +5,11 @@ from typing import Literal, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.matrices import Rows, require_length, require_shape, shape
 from noack.config.named_models import MODEL_PARAMETERS, NAMED_MODELS
-from noack.config.section import ScenarioSection
 from noack.config.sections.matrix_file_section import require_read
 from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.settings.matrices import Rows, require_length, require_shape, shape
+from noack.settings.section import ScenarioSection
 
 
 class ModelSection(ScenarioSection):

@@ -13,7 +13,7 @@ from noack.config.impairments import (
     NoLoss,
     require_scores,
 )
-from noack.config.section import ScenarioSection
+from noack.settings.section import ScenarioSection
 
 
 class AcknowledgementSection(ScenarioSection):

@@ -4,13 +4,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.disturbances import AnyDisturbance
-from noack.config.matrices import Row, Rows, require_non_negative
-from noack.config.observers import Measurement
+from noack.config.disturbances import AnyDisturbance, variance_at
 from noack.config.plant_systems import AnySystem, LinearSettings
-from noack.config.section import ScenarioSection
 from noack.config.sections.matrix_file_section import require_read
+from noack.config.sections.measurement_section import MeasurementSection
 from noack.config.sections.rates import RateHz, require_whole_period
+from noack.observers.estimation_model import NoiseVariances
+from noack.settings.matrices import Row, Rows, require_non_negative
+from noack.settings.section import ScenarioSection
 
 
 class WatchdogSection(ScenarioSection):
@@ -52,7 +53,7 @@ class PlantSection(ScenarioSection):
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """A measurement is sent every so many steps."""
-    measurement: Measurement = Measurement()
+    measurement: MeasurementSection = MeasurementSection()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """What disturbs it, one added to the other."""
     watchdog: WatchdogSection = WatchdogSection()
@@ -81,3 +82,11 @@ class PlantSection(ScenarioSection):
                 require_non_negative(row, key)
         require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
         return self
+
+    def noise_variances(self, n: int, m: int) -> NoiseVariances:
+        """Variances of the random disturbances and of the measurement noise."""
+        return NoiseVariances(
+            at_state=variance_at("state", self.disturbances, n),
+            at_input=variance_at("input", self.disturbances, m),
+            output=self.measurement.variance(n),
+        )

@@ -4,8 +4,8 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.section import ScenarioSection, Seed
 from noack.core.clock import NS_PER_S
+from noack.settings.section import ScenarioSection, Seed
 
 Port = Annotated[int, Field(ge=0, le=65535)]
 

@@ -66,7 +66,7 @@ def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_pa
         recorder.poll()
         recorder.show()
     cause = "an input was 0.101 s old, 0.007 s allowed"
-    line = f"claims that this touches are void from 0.506 s on: {cause}"
+    line = f"void (assumption violated) from 0.506 s on: {cause}"
     void = [account["void"] for account in plane.accounts]
     assert void == [[]] * 5 + [[line]] * 6
     notices = recorder.finish().notices

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.claim_evaluation import ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
@@ -205,7 +205,7 @@ def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> N
         "plant": plant_of(resolved), "sensor": sensor_of(resolved),
         "netem": network_of(resolved), "controller": controller_of(resolved),
     }  # fmt: skip
-    shuttle = Shuttle(machines, resolved.entries, gathered.take)
+    shuttle = Shuttle(machines, resolved.message_sizes.entries, gathered.take)
     for now_ns in shuttle.run():
         for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
             shuttle._emit(role, machines[role].announce(change, now_ns))

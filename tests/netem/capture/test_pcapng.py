@@ -39,7 +39,7 @@ def test_an_independent_reader_finds_what_was_written(described: list[dict[str, 
             event["destination_port"],
             event["payload"],
         )
-        way = "back" if event["direction"] else "forward"
+        way = "reverse" if event["direction"] else "forward"
         assert packet.comment.endswith(f"; {way}, flow {event['flow']}, datagram {event['packet']}")
 
 

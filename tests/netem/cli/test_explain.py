@@ -28,7 +28,7 @@ name = "uplink"
 listen = "127.0.0.1:9000"
 to = "[::1]:9001"
 words = "loss 50% mansd 4"
-back = "delay 10ms"
+reverse = "delay 10ms"
 seed = 7
 
 [[link]]
@@ -102,21 +102,21 @@ def test_where_tc_can_do_nothing_that_is_said(explain: Explain) -> None:
     [
         ("", ["in both directions, in each by itself: nothing happens"]),
         ("loss 5%", ["forward, from clients to the server, in this order",
-                     "back, from the server to clients: nothing happens"]),
-        ("--back loss 5%", ["forward, from clients to the server: nothing happens",
-                            "back, from the server to clients, in this order"]),
-        ("loss 5% --back loss 6%", ["forward, from clients to the server, in this order",
-                                    "back, from the server to clients, in this order"]),
-        ("loss 5% --back loss none", ["forward, from clients to the server, in this order",
-                                      "back, from the server to clients, in this order"]),
+                     "reverse, from the server to clients: nothing happens"]),
+        ("--reverse loss 5%", ["forward, from clients to the server: nothing happens",
+                            "reverse, from the server to clients, in this order"]),
+        ("loss 5% --reverse loss 6%", ["forward, from clients to the server, in this order",
+                                    "reverse, from the server to clients, in this order"]),
+        ("loss 5% --reverse loss none", ["forward, from clients to the server, in this order",
+                                      "reverse, from the server to clients, in this order"]),
         ("--both loss 5%", ["in both directions, in each by itself, in this order"]),
         ("--one-way loss 5%", ["forward, from clients to the server, in this order",
-                               "back: one way only, what the server answers is not relayed"]),
+                               "reverse: not relayed; the server's answers are discarded"]),
     ],
 )  # fmt: skip
 def test_each_direction_is_explained(explain: Explain, arguments: str, titles: list[str]) -> None:
     lines = explain(*shlex.split(arguments)).splitlines()
-    assert [line for line in lines if line.startswith(("forward", "back", "in both"))] == titles
+    assert [line for line in lines if line.startswith(("forward", "reverse", "in both"))] == titles
 
 
 def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) -> None:
@@ -126,7 +126,7 @@ def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) ->
     assert "loses 50%" in uplink
     assert "holds each datagram back by 10ms" in uplink
     assert "loses 20%" in video
-    assert video.endswith("back: one way only, what the server answers is not relayed\n")
+    assert video.endswith("reverse: not relayed; the server's answers are discarded\n")
 
 
 @pytest.mark.parametrize("columns", [120, 80, 60])
@@ -158,8 +158,8 @@ def test_what_is_to_be_copied_is_whole_at_any_width(
     "arguments",
     [
         MUCH,
-        f"{MUCH} --seed 9 --back delay 10ms",
-        f"--back {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
+        f"{MUCH} --seed 9 --reverse delay 10ms",
+        f"--reverse {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
         "loss 5% --both --idle 5s",
         "delay 0 samples 1ms,2ms --one-way",
         "",
@@ -185,15 +185,15 @@ def test_links_are_explained_as_json(explain: Explain, links_file: Path) -> None
     assert uplink["forward"]["predicted_loss_without_cap"] == pytest.approx(0.5)
     assert uplink["forward"]["tc"] == "limit 16384 loss random 50%"
     assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on successive losses)"]
-    assert uplink["back"] is not None
-    assert uplink["back"]["words"] == "delay 10ms"
-    assert (video["forward"]["words"], video["back"]) == ("loss 20%", None)
+    assert uplink["reverse"] is not None
+    assert uplink["reverse"]["words"] == "delay 10ms"
+    assert (video["forward"]["words"], video["reverse"]) == ("loss 20%", None)
 
 
 def test_each_direction_is_explained_as_json(explain: Explain) -> None:
-    (link,) = explain.links("delay 10ms loss 5%", "--back", "corrupt 1%")
+    (link,) = explain.links("delay 10ms loss 5%", "--reverse", "corrupt 1%")
     assert link["name"] == "relay"
-    for side, words in (("forward", "delay 10ms loss 5%"), ("back", "corrupt 1%")):
+    for side, words in (("forward", "delay 10ms loss 5%"), ("reverse", "corrupt 1%")):
         direction: Any = link[side]  # type: ignore[literal-required]
         assert direction["words"] == words
         settings = LinkSettings.model_validate_json(json.dumps(direction["settings"]))

@@ -31,7 +31,7 @@ def the_link(**changes: Any) -> LinkSpec:
         "listen": ("127.0.0.1", 9000),
         "to": ("127.0.0.1", 9001),
         "forward": NOTHING,
-        "back": NOTHING,
+        "reverse": NOTHING,
     }
     return LinkSpec(**given | changes)
 
@@ -43,16 +43,19 @@ def the_link(**changes: Any) -> LinkSpec:
         (["loss", "5%", "mansd", "4"], {"forward": "loss 5% mansd 4"}),
         (["loss 5%", "mansd 4"], {"forward": "loss 5% mansd 4"}),
         (["rate", "1mbit", "-14"], {"forward": "rate 1mbit -14"}),
-        (["loss", "5%", "--back", "delay", "3ms"], {"forward": "loss 5%", "back": "delay 3ms"}),
-        (["--back", "delay 3ms", "--seed", "3"], {"back": "delay 3ms", "seed": 3}),
-        (["--both", "loss", "5%"], {"forward": "loss 5%", "back": "loss 5%"}),
-        (["loss", "5%", "--both"], {"forward": "loss 5%", "back": "loss 5%"}),
+        (
+            ["loss", "5%", "--reverse", "delay", "3ms"],
+            {"forward": "loss 5%", "reverse": "delay 3ms"},
+        ),
+        (["--reverse", "delay 3ms", "--seed", "3"], {"reverse": "delay 3ms", "seed": 3}),
+        (["--both", "loss", "5%"], {"forward": "loss 5%", "reverse": "loss 5%"}),
+        (["loss", "5%", "--both"], {"forward": "loss 5%", "reverse": "loss 5%"}),
         (["loss", "5%", "seed", "7"], {"forward": "loss 5%", "seed": 7}),
         (["--one-way", "--idle", "500ms"], {"return_path": False, "idle_s": 0.5}),
     ],
 )
 def test_a_command_line_describes_a_link(arguments: list[str], changes: dict[str, Any]) -> None:
-    for side in ("forward", "back"):
+    for side in ("forward", "reverse"):
         if side in changes:
             changes = changes | {side: settings_of(changes[side])}
     assert specs([*ADDRESSES, *arguments]) == (the_link(**changes),)
@@ -83,8 +86,8 @@ def test_files_in_words_lie_in_the_working_directory(
 ) -> None:
     (tmp_path / "lost.txt").write_text("010")
     monkeypatch.chdir(tmp_path)
-    (link,) = specs([*ADDRESSES, "--back", "loss", "trace", "lost.txt"])
-    assert link.back.impairments == (LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)
+    (link,) = specs([*ADDRESSES, "--reverse", "loss", "trace", "lost.txt"])
+    assert link.reverse.impairments == (LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)
 
 
 def test_links_come_from_a_file(tmp_path: Path) -> None:
@@ -103,12 +106,15 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
         (["--listen", "x", "--to", ":9"], "--listen: expected HOST:PORT, e.g. 127.0.0.1:9000"),
         (["--listen", ":0", "--to", "no such:9"], "--to: no such: no such host"),
         ([*ADDRESSES, "lsos", "5%"], "lsos: no such word; did you mean loss?"),
-        ([*ADDRESSES, "--back", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
-        ([*ADDRESSES, "--back", "seed", "5"], "seed 5: belongs to the link"),
+        ([*ADDRESSES, "--reverse", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
+        ([*ADDRESSES, "--reverse", "seed", "5"], "seed 5: belongs to the link"),
         ([*ADDRESSES, "--seed", "-1"], "--seed -1: must be 0 or more"),
         ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words say seed 1 already"),
-        ([*ADDRESSES, "--both", "--back", "loss", "5%"], "--back: goes without --both"),
-        ([*ADDRESSES, "--one-way", "--back", "loss", "5%"], "--one-way: nothing goes back"),
+        ([*ADDRESSES, "--both", "--reverse", "loss", "5%"], "--reverse: goes without --both"),
+        (
+            [*ADDRESSES, "--one-way", "--reverse", "loss", "5%"],
+            "--one-way: no reverse direction",
+        ),
         ([*ADDRESSES, "--idle", "5"], "--idle 5: expected a time in s, ms, us or ns"),
         ([*ADDRESSES, "--idle", "0"], "--idle 0: must be more than 0"),
         ([*ADDRESSES, "loss", "trace", "no.txt"], "no.txt: cannot be read: No such file"),
@@ -117,7 +123,7 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
             "--loss: words stand without the dashes, e.g. loss 30%",
         ),
         ([*ADDRESSES, "--mansd=4"], "--mansd=4: words stand without the dashes, e.g. mansd 4"),
-        ([*ADDRESSES, "--back", "--delay", "5ms"], "--delay: words stand without the dashes"),
+        ([*ADDRESSES, "--reverse", "--delay", "5ms"], "--delay: words stand without the dashes"),
         ([*ADDRESSES, "-loss", "5%"], "-loss: words stand without the dashes"),
         (
             [*ADDRESSES, "loss", "bernoulli:0.3"],

@@ -30,7 +30,7 @@ def totals(forward: Any, back: Any) -> Statistics:
     link: Any = {
         "name": "uplink", "listen": "127.0.0.1:1", "to": "[fd00::1]:2", "clients": 0,
         "clients_ever": 1, "refused": 0, "discarded": 0, "port_unreachable": 0,
-        "forward": forward, "back": back,
+        "forward": forward, "reverse": back,
     }  # fmt: skip
     return {"time": "", "elapsed_s": 1.0, "engine": "plain", "links": [link]}
 
@@ -96,7 +96,7 @@ def test_a_server_that_is_not_there_and_discarded_answers_are_told() -> None:
 
 def test_both_directions_stand_side_by_side_once_both_are_used() -> None:
     lines = printed(totals(direction(), LOSSY))
-    assert "forward back" in lines
+    assert "forward reverse" in lines
     assert "dropped by loss 0 100" in lines
 
 

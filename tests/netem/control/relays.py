@@ -78,7 +78,7 @@ class FakeRelay:
         return [
             LinkReport(
                 spec.name, spec.listen, spec.to, 1, 3, 0, 0, 0,
-                self._direction(spec.name, "forward"), self._direction(spec.name, "back"),
+                self._direction(spec.name, "forward"), self._direction(spec.name, "reverse"),
             )
             for spec in self.specs
         ]  # fmt: skip

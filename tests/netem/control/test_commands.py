@@ -48,8 +48,8 @@ def test_what_has_happened_is_shown(
         ("set lab --link up loss 5% mansd 4", ["forward"]),
         ("set --link up loss 5% mansd 4", ["forward"]),
         ("set loss 5% --link up mansd 4", ["forward"]),
-        ("set lab loss 5% mansd 4 --direction back --link up", ["back"]),
-        ("set lab --link up --direction both loss 5% mansd 4", ["forward", "back"]),
+        ("set lab loss 5% mansd 4 --direction reverse --link up", ["reverse"]),
+        ("set lab --link up --direction both loss 5% mansd 4", ["forward", "reverse"]),
     ],
 )
 def test_a_link_is_set_in_words(
@@ -67,7 +67,7 @@ def test_a_link_is_set_in_words(
     assert len(out) == 4
     for way in changed:
         assert f"up {way}: loss 5% mansd 4" in out
-    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down back: nothing is done"]
+    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: nothing is done"]
 
 
 def test_files_are_read_where_the_command_is_given(

@@ -75,7 +75,7 @@ def test_the_program_runs() -> None:
         )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == "None\n"
-    assert relay.settings["relay", "back"].mansd == 2
+    assert relay.settings["relay", "reverse"].mansd == 2
 
 
 def test_the_metadata_of_a_fate_trace_are_read(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixt
 
         before = shown(capsys)["links"][0]["forward"]["words"]
         assert (
-            emulator_commands.main(["set", "lab", "--direction", "back", "lozz 5%"])
+            emulator_commands.main(["set", "lab", "--direction", "reverse", "lozz 5%"])
             == ExitStatus.CALLER
         )
         error = capsys.readouterr().err

@@ -19,12 +19,12 @@ def test_the_relay_is_touched_in_its_own_thread_only(
 
 
 def test_a_change_says_since_when_it_holds(relay: FakeRelay, errands: CommandQueue) -> None:
-    relay.counters["up", "back"] = Counters(arrived=17)
-    errands.change("up", ["back"], settings_of("loss 50% mansd 1"))
-    relay.counters["up", "back"].arrived = 20
+    relay.counters["up", "reverse"] = Counters(arrived=17)
+    errands.change("up", ["reverse"], settings_of("loss 50% mansd 1"))
+    relay.counters["up", "reverse"].arrived = 20
     in_force = errands.snapshot().in_force
-    assert in_force["up", "back"].since.arrived == 17
-    assert in_force["up", "back"].words == "loss 50% mansd 1"
+    assert in_force["up", "reverse"].since.arrived == 17
+    assert in_force["up", "reverse"].words == "loss 50% mansd 1"
     assert in_force["up", "forward"].since == Counters()
     assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
 

@@ -11,7 +11,7 @@ def statistics(elapsed_s: float, rate: float | None, seconds: float = 1.0) -> St
     if rate is not None:
         recent = {"seconds": seconds, "arrived_per_s": rate, "loss": None}
     way = {"recent": recent}
-    document = {"elapsed_s": elapsed_s, "links": [{"name": "up", "forward": way, "back": way}]}
+    document = {"elapsed_s": elapsed_s, "links": [{"name": "up", "forward": way, "reverse": way}]}
     return cast(Statistics, document)
 
 
@@ -45,5 +45,5 @@ def test_a_sample_lasts_from_the_one_before() -> None:
 def test_what_is_not_known_is_left_out() -> None:
     history = History()
     history.add(statistics(1, 5))
-    assert list(history.series("up", "back", lambda recent: recent["loss"], 2)) == [None, None]
+    assert list(history.series("up", "reverse", lambda recent: recent["loss"], 2)) == [None, None]
     assert series(history, 2)[1] == pytest.approx(5)

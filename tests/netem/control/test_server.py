@@ -29,10 +29,10 @@ def client(server: ControlServer) -> Any:
 
 
 def test_statistics_are_asked_for(relay: FakeRelay, client: Client) -> None:
-    relay.counters["down", "back"] = Counters(arrived=12, delivered=12)
+    relay.counters["down", "reverse"] = Counters(arrived=12, delivered=12)
     document = client.ask("report")
     assert [link["name"] for link in document["links"]] == ["up", "down"]
-    assert document["links"][1]["back"]["arrived"] == 12
+    assert document["links"][1]["reverse"]["arrived"] == 12
 
 
 def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
@@ -54,12 +54,12 @@ def test_settings_are_told_in_words_and_as_settings(client: Client) -> None:
     assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
     told = LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"]))
     assert told == SETTINGS
-    assert up["back"]["words"] == ""
+    assert up["reverse"]["words"] == ""
 
 
 @pytest.mark.parametrize(
     ("direction", "changed"),
-    [("forward", {"forward"}), ("back", {"back"}), ("both", {"forward", "back"})],
+    [("forward", {"forward"}), ("reverse", {"reverse"}), ("both", {"forward", "reverse"})],
 )
 def test_a_direction_is_changed(
     relay: FakeRelay, client: Client, direction: str, changed: set[str]
@@ -71,16 +71,18 @@ def test_a_direction_is_changed(
         assert settings == (
             settings_of("loss 100% mansd 2") if is_changed else before[link, way]
         )  # fmt: skip
-    told = {way for way in ("forward", "back") if "loss 100%" in answer["links"][1][way]["words"]}
+    told = {
+        way for way in ("forward", "reverse") if "loss 100%" in answer["links"][1][way]["words"]
+    }
     assert told == changed
 
 
 def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
-    client.ask("change", link="up", direction="back", words=["loss", "5%"])
-    assert relay.settings["up", "back"] == settings_of("loss 5%")
+    client.ask("change", link="up", direction="reverse", words=["loss", "5%"])
+    assert relay.settings["up", "reverse"] == settings_of("loss 5%")
     table = settings_of("delay 1ms mansd 3").model_dump(mode="json")
-    client.ask("change", link="up", direction="back", settings=table)
-    assert relay.settings["up", "back"] == settings_of("delay 1ms mansd 3")
+    client.ask("change", link="up", direction="reverse", settings=table)
+    assert relay.settings["up", "reverse"] == settings_of("delay 1ms mansd 3")
 
 
 def test_the_link_may_be_left_out_if_there_is_one() -> None:

@@ -125,8 +125,8 @@ def test_long_words_and_names_with_brackets_are_no_trouble() -> None:
     relay.specs = [
         LinkSpec("[bold]up", ("::1", 5000), ("::1", 6000), words, SETTINGS)
     ]  # fmt: skip
-    relay.counters = {("[bold]up", way): Counters() for way in ("forward", "back")}  # type: ignore[misc]
-    relay.settings = {("[bold]up", way): words for way in ("forward", "back")}  # type: ignore[misc]
+    relay.counters = {("[bold]up", way): Counters() for way in ("forward", "reverse")}  # type: ignore[misc]
+    relay.settings = {("[bold]up", way): words for way in ("forward", "reverse")}  # type: ignore[misc]
     lines = text_of(relay)
     assert "[bold]up  [::1]:5000 → [::1]:6000" in lines[1]
     assert len(lines) <= 24

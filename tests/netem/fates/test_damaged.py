@@ -46,9 +46,9 @@ def test_what_is_spoilt_below_is_right(tmp_path: Path) -> None:
         DOCUMENT | {"missing_events": "0"}, DOCUMENT | {"missing_events": -1},
         DOCUMENT | {"links": 1}, DOCUMENT | {"links": [1]}, DOCUMENT | {"links": [{"name": "up"}]},
         DOCUMENT | {"links": [DOCUMENT["links"][0] | {"name": ["up"]}]},
-        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": "2"}}]},
-        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {}}]},
-        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"back": {"mansd": 1_000_001}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {"mansd": "2"}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {}}]},
+        DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {"mansd": 1_000_001}}]},
     ],
 )  # fmt: skip
 def test_a_document_is_the_programs(document: object, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_a_row_says_what_an_event_says(path: Path) -> None:
     (row,) = pq.read_table(path).to_pylist()
     arrival_ns = told.pop("t_ns")
     assert row == told | {
-        "link": "up", "direction": "back", "flow": 0, "packet": 0, "arrival_ns": arrival_ns,
+        "link": "up", "direction": "reverse", "flow": 0, "packet": 0, "arrival_ns": arrival_ns,
     }  # fmt: skip
 
 
@@ -76,12 +76,12 @@ def test_directions_are_kept_apart_and_a_flow_may_be_silent_in_one(path: Path) -
     fates = read_fates(path).decisions
     assert {key: [len(flow) for flow in flows] for key, flows in fates.items()} == {
         ("a", "forward"): [3, 1],
-        ("a", "back"): [0, 2],
+        ("a", "reverse"): [0, 2],
         ("up", "forward"): [],
-        ("up", "back"): [],
+        ("up", "reverse"): [],
     }
-    assert [decision.fate for decision in fates["a", "back"][1]] == [Fate.DROPPED] * 2
-    assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "back")}
+    assert [decision.fate for decision in fates["a", "reverse"][1]] == [Fate.DROPPED] * 2
+    assert set(read_fates(path, ["up"]).decisions) == {("up", "forward"), ("up", "reverse")}
 
 
 def test_many_rows_are_written_in_groups(path: Path) -> None:

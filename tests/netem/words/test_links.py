@@ -41,7 +41,7 @@ forward.impairments = [
     { kind = "loss", loss = { model = "gilbert_elliott", mean_loss = 0.05, mean_burst = 3 } },
     { kind = "delay", delay_s = 0.02 },
 ]
-back = "loss trace lost.txt"
+reverse = "loss trace lost.txt"
 """
 
 
@@ -59,7 +59,7 @@ def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
         listen=("127.0.0.1", 9000),
         to=("127.0.0.1", 9001),
         forward=settings_of("delay 10ms loss 5% mansd 4"),
-        back=LinkSettings(),
+        reverse=LinkSettings(),
         seed=7,
     )
     assert video == LinkSpec(
@@ -67,7 +67,7 @@ def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
         listen=("::1", 0),
         to=("::1", 9003),
         forward=settings_of("loss burst 5% 3 delay 20ms"),
-        back=LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)),
+        reverse=LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)),
         return_path=False,
         idle_s=5.0,
         most_clients=10,
@@ -97,9 +97,10 @@ LINK = {"name": "a", "listen": ":9000", "to": ":9001"}
         ({"words": "seed 3"}, 'words = "seed 3": seed 3: belongs to the link, not to one of its '),
         ({"words": "", "forward": ""}, 'words = "": is short for forward; give one of them'),
         ({"words": 3}, "words = 3: should be a table"),
-        ({"back": {"mandsd": 3}}, "back.mandsd = 3: unknown key; did you mean mansd?"),
-        ({"back": {"impairments": [{"kind": "dely"}]}}, 'back.impairments.0.kind = "dely": must be '
-         "one of loss, duplicate, corrupt, delay, reorder, rate, blackout; did you mean delay?"),
+        ({"reverse": {"mandsd": 3}}, "reverse.mandsd = 3: unknown key; did you mean mansd?"),
+        ({"reverse": {"impairments": [{"kind": "dely"}]}}, 'reverse.impairments.0.kind = "dely": '
+         "must be one of loss, duplicate, corrupt, delay, reorder, rate, blackout; did you mean "
+         "delay?"),
         ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
           "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "
          "or equal to 1"),
@@ -157,7 +158,7 @@ def test_the_schema_takes_what_the_code_takes() -> None:
     jsonschema.Draft202012Validator.check_schema(json_schema())
     validator = jsonschema.Draft202012Validator(json_schema())
     assert [error.message for error in validator.iter_errors(tomllib.loads(TWO))] == []
-    for wrong in ({}, {"link": []}, {"link": [LINK | {"back": 3}]}, {"link": [LINK | {"x": 3}]}):
+    for wrong in ({}, {"link": []}, {"link": [LINK | {"reverse": 3}]}, {"link": [LINK | {"x": 3}]}):
         assert not validator.is_valid(wrong)
 
 

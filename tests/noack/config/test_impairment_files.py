@@ -114,9 +114,9 @@ def test_a_mistake_in_a_trace_gets_one_line(
         (tmp_path / "t").write_bytes(content)
     settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
     with pytest.raises(CallerError) as caught:
-        read_files(settings, tmp_path, "l.toml: link.0.back")
+        read_files(settings, tmp_path, "l.toml: link.0.reverse")
     assert str(caught.value).startswith(
-        f'l.toml: link.0.back.impairments.0.loss.file = "t": {says}'
+        f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
     )
     with pytest.raises(CallerError) as caught:
         read_files(settings, tmp_path)

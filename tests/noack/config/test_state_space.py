@@ -8,10 +8,10 @@ import pytest
 from scipy import signal
 
 from noack.config.matrix_files import read_matrices
-from noack.config.named_file import NamedFile
 from noack.config.sections.model_section import ModelSection
 from noack.config.state_space import model_of, save_model
 from noack.core.errors import CallerError
+from noack.settings.named_file import NamedFile
 
 A = np.array([[0.0, 1.0], [4.0, 0.0]])
 B = np.array([[0.0], [1.0]])

@@ -12,9 +12,9 @@ from pydantic import BaseModel
 from cosim.studies.campaign.campaign_file import load as load_campaign
 from netem.words.links_file import load_links
 from noack.config import toml_file
-from noack.config.named_file import NamedFile
 from noack.config.scenario_file import load, put, validate
 from noack.core.errors import CallerError
+from noack.settings.named_file import NamedFile
 
 MOST = toml_file.MOST_LEVELS
 READERS = [load, load_campaign, load_links]

@@ -25,7 +25,7 @@ def picture_of(scenario: Scenario) -> Picture:
     loop, system = loop_of(scenario), scenario.plant.system
     kind: str = system.kind
     own = system.internal_names
-    reach = reach_of(loop, scenario.horizon_ns)
+    reach = reach_of(loop, scenario.timing.horizon_ns)
     if isinstance(system, CartPoleSettings):
         return PendulumPicture(0, 2, reach_m=float(reach[0]), pole_m=2 * system.length_m)
     if kind == "quadrotor":

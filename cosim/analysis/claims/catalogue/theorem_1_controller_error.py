@@ -1,4 +1,8 @@
-"""Theorem 1's own Δ (eq:Normec), which exists after a run only: from its recorded trajectory."""
+"""Theorem 1 of the paper, and Theorem 3 for a hold: ‖e_c‖ ≤ Δ βe^{−αt} (eq:Normec).
+
+Its Δ depends on the trajectory and on the true plant, so it exists after a run only. It is the
+largest over all stretches between two deliveries.
+"""
 
 import math
 from collections.abc import Sequence
@@ -6,6 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.shared_bounds import controller_error_bound
 from cosim.record.align import AlignedRun
 from cosim.record.run_record import RunRecord
 from noack.core.linear_systems import Propagator, spectral_abscissa
@@ -15,11 +22,15 @@ from noack.theory.paper_bounds import Interval, longest_interval_s, theorem_1
 Indices = NDArray[np.int64]
 
 
-def theorem_one(record: RunRecord, joined: AlignedRun, until_s: float = math.inf) -> float | None:
-    """The largest Δ over all stretches between two deliveries; None if there is none to be had.
+def trajectory_delta(
+    record: RunRecord, joined: AlignedRun, until_s: float = math.inf
+) -> float | None:
+    """Theorem 1's Δ from a recorded trajectory; None if it has none, or if W ≠ I.
 
-    Theorem 3's for a hold. With W ≠ I the theorem says nothing, and neither does this. Nor does it
-    from ``until_s`` on, when the run has left what the theorem presupposes.
+    Args:
+        record: the run's record.
+        joined: its samples.
+        until_s: an assumption of the theorem was violated from here on.
     """
     loop, trigger = record.loop, record.scenario.decaying
     if loop.weight is not None:
@@ -30,13 +41,14 @@ def theorem_one(record: RunRecord, joined: AlignedRun, until_s: float = math.inf
     if not len(starts):
         return None
     ends = [*events[1:], len(joined.t_ns) - 1][: len(starts)]
+    kappa = _model_decay(record)
     longest_s = [
-        longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, _decay(record))
+        longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, kappa)
         for interval in _intervals(record, joined, starts, ends)
     ]
     # Δ grows with the stretch: of the stretches that begin with an event, the longest is enough.
     stretches: dict[int, int] = {}
-    first = 0  # of the missed ones
+    first = 0  # of the missed events
     for index, start in enumerate(starts):
         while first <= index and event[starts[first]] <= joined.received[start]:
             first += 1
@@ -44,14 +56,17 @@ def theorem_one(record: RunRecord, joined: AlignedRun, until_s: float = math.inf
             stretches[first] = index + 1
     found = [
         theorem_1(loop.H, trigger.alpha_per_s, missed_s)
-        for missed_s in _longest([longest_s[first:end] for first, end in stretches.items()])
+        for missed_s in undominated([longest_s[first:end] for first, end in stretches.items()])
     ]
     delta = max(found, default=1.0)
     return delta if math.isfinite(delta) else None
 
 
-def _longest(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
-    """Those that no other one exceeds throughout: Δ grows with every δ̃_k, the sums from k on."""
+def undominated(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
+    """The stretches that no other one exceeds throughout: only they can have the largest Δ.
+
+    Δ grows with every δ̃_k, the sum of a stretch from its interval k on.
+    """
     most = max(map(len, stretches), default=0)
     reaches = np.zeros((len(stretches), most))
     for row, stretch in zip(reaches, stretches, strict=True):
@@ -63,8 +78,8 @@ def _longest(stretches: Sequence[Sequence[float]]) -> list[Sequence[float]]:
     return [stretches[place] for place in kept]
 
 
-def _decay(record: RunRecord) -> float:
-    """κ, a rate at which the model decays: α where it can."""
+def _model_decay(record: RunRecord) -> float:
+    """κ, a rate at which the model decays: α if the model decays that fast."""
     H = record.loop.H
     if not H.any():
         return 0.0
@@ -74,7 +89,7 @@ def _decay(record: RunRecord) -> float:
 def _intervals(
     record: RunRecord, joined: AlignedRun, starts: Indices, ends: Sequence[int]
 ) -> list[Interval]:
-    """From every event of ``starts`` to the next."""
+    """The trajectory from every event of ``starts`` to the next event."""
     propagate = Propagator(record.loop.H)
     found = []
     for first, end in zip(starts, ends, strict=True):
@@ -89,3 +104,27 @@ def _intervals(
             )
         )
     return found
+
+
+def _bound(run: RunEvidence) -> Bound | None:
+    scenario = run.record.scenario
+    if (
+        not scenario.coverage.is_certifiable
+        or not scenario.coverage.knows_state
+        or scenario.decaying.floor > 0
+    ):
+        return None
+    void = run.paper_violation
+    until_s = run.until_s if void is None else min(run.until_s, void.t_s)
+    delta = trajectory_delta(run.record, run.joined, until_s)
+    if delta is None:
+        return None
+    level = scenario.decaying.beta * np.exp(-scenario.decaying.alpha_per_s * run.t_s)
+    return controller_error_bound(run, "‖e_c‖ ≤ {:.4g} βe^(−αt)", delta * level, delta, void)
+
+
+CLAIM = ClaimDefinition(
+    "the controller's error decays", "Theorem 1 (3 for a hold), Δ from this run's trajectory",
+    "a continuous trigger, a network without delay, at most M − 1 consecutive losses",
+    _bound, needs_ideal_loop=True,
+)  # fmt: skip

@@ -1,0 +1,1 @@
+"""What settings are made of: tables, vectors and matrices, files that a table names."""
