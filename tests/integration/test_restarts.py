@@ -115,7 +115,7 @@ def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None
         assert role == "recorder" or one["last_s"] < one["first_s"]
     for role in RESTARTED:
         assert f"{role} died: killed by SIGKILL at " in restarted.stderr
-        assert f"{role} is back at " in restarted.stderr
+        assert f"{role} runs again at " in restarted.stderr
 
 
 def test_nothing_recorded_is_lost_and_everything_is_replayed(restarted: Finished) -> None:

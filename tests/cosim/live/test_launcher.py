@@ -10,7 +10,7 @@ from cosim.live.launcher import Watcher, _Run, longest_s
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import ExitStatus, MachineError
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import RECORDER, ROLES
 from noack.runtime.join_ticket import new_ticket
 from noack.runtime.signals import Signals
 
@@ -38,6 +38,7 @@ class FakeCoordinator:
 
     def __init__(self, now_s: float, exiting: str = "", **failures: str) -> None:
         self._now_s, self._exiting, self._failures = now_s, exiting, failures
+        self._running: tuple[str, ...] = ROLES
         self.restarts: list[str] = []
 
     def now_ns(self) -> int:
@@ -48,6 +49,9 @@ class FakeCoordinator:
 
     def running_generation(self, role: str) -> None:
         return None
+
+    def is_over(self, role: str) -> bool:
+        return role not in self._running
 
     def is_exiting(self, role: str) -> bool:
         return role == self._exiting
@@ -165,6 +169,18 @@ def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Cas
 def test_a_long_run_has_more_time_after_its_horizon() -> None:
     assert longest_s(20.0) - 20.0 < 30.0
     assert longest_s(3600.0) - 3600.0 > 300.0
+
+
+@pytest.mark.parametrize(
+    ("running", "late"), [(("plant", RECORDER), "plant"), ((RECORDER,), RECORDER)]
+)
+def test_a_run_that_does_not_end_names_the_late_process(
+    case: Case, running: tuple[str, ...], late: str
+) -> None:
+    coordinator = FakeCoordinator(2.0)
+    coordinator._running = running
+    reason = case.run(case.children(None), coordinator)._overdue()
+    assert reason == f"the run did not end at its horizon: no report from {late}"
 
 
 def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
