@@ -137,7 +137,7 @@ class Network:
         updates, sequences, _ = updates_in(packets)
         wrong = [] if len(updates) == len(packets) else ["netem_packet: something is no update"]
         lost = ~effective(updates["fate"])
-        longest = int(updates["drop_run"][lost].max(initial=0))
+        longest = int(updates["consecutive_losses"][lost].max(initial=0))
         self.longest_loss_burst = max(self.longest_loss_burst, longest)
         if longest > self._mansd:
             wrong.append(f"netem_packet: {longest} dropouts in a row, at most {self._mansd} agreed")

@@ -170,7 +170,7 @@ def _acknowledgements(record: RunRecord) -> dict[str, int]:
     return {
         "sent": len(record[CONTROLLER_DELIVERY]),
         "lost": int(crossed.lost.sum()),
-        "longest_loss_run": crossed.longest_loss_burst(),
+        "longest_loss_burst": crossed.longest_loss_burst(),
         "received": len(record[SENSOR_ACKNOWLEDGEMENT]),
     }
 

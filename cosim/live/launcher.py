@@ -32,7 +32,6 @@ from noack.runtime.join_ticket import Ticket, new_ticket, published
 from noack.runtime.life_cycle import HORIZON
 from noack.runtime.signals import Signals
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port, require_free_tcp_port
-from plant_server.systems.system_from_settings import prepare
 
 _STOPPED: Mapping[int, str] = {
     signal.SIGINT: "stopped by the user",
@@ -86,7 +85,7 @@ def launch(
     if control:
         require_free_tcp_port(control, "ports.control")
     if PLANT in spawn:
-        prepare(resolved.plant.system)  # compile now: the start barrier has a time limit
+        resolved.plant.system.prepare()  # compile now: the start barrier has a time limit
     endpoint = f"tcp/{LOOPBACK}:{control or free_tcp_port()}"
     run_dir = new_run_dir(runs, resolved.name)
     resolved = write_scenario(resolved, run_dir)

@@ -51,7 +51,7 @@ class ProgressReport:
             self._see_losses(rows["dropouts"])
         elif table == NETEM_PACKET:
             rows = updates_in(rows)[0]
-            self._see_losses(rows["drop_run"][~effective(rows["fate"])])
+            self._see_losses(rows["consecutive_losses"][~effective(rows["fate"])])
 
     def _see_losses(self, consecutive: NDArray[np.int64]) -> None:
         longest = int(consecutive.max(initial=0))

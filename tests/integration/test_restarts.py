@@ -140,8 +140,8 @@ def test_a_restarted_network_passes_its_first_packet(restarted: Finished) -> Non
     record = load_record(restarted.run_dir)
     _, again = record.lives("netem")
     packets = again.rows["netem_packet"]
-    assert packets["drop_run"][0] == 0
-    assert packets["drop_run"].max() <= 1
+    assert packets["consecutive_losses"][0] == 0
+    assert packets["consecutive_losses"].max() <= 1
 
 
 def test_a_restarted_controller_puts_out_nothing_until_it_knows_a_state(

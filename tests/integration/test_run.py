@@ -207,7 +207,7 @@ def test_no_more_than_mansd_successive_packets_are_lost(record: RunRecord) -> No
         run = run + 1 if fate == Fate.DROPPED else 0
         longest = max(longest, run)
     assert 0 < longest <= mansd
-    assert longest == record["netem_packet"]["drop_run"].max()
+    assert longest == record["netem_packet"]["consecutive_losses"].max()
 
 
 def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:

@@ -38,7 +38,7 @@ SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
     PLANT_ACTUATION: ("input", "sequence", "t_ns"),
     SENSOR_MEASUREMENT: ("input", "sequence", "t_ns", "event"),
-    NETEM_PACKET: ("input", "sequence", "flow", "fate", "drop_run", "size_bytes"),
+    NETEM_PACKET: ("input", "sequence", "flow", "fate", "consecutive_losses", "size_bytes"),
     CONTROLLER_STEP: ("input", "sequence", "t_ns", "model_t_ns"),
     CONTROLLER_DELIVERY: ("input", "sequence", "t_ns", "model_t_ns", "dropouts"),
 }

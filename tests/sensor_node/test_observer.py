@@ -172,7 +172,7 @@ def test_the_trigger_works_on_the_estimate_and_the_update_carries_it(
         outputs = sensor.handle(measurement(k, t_ns, [y, u]), t_ns)
         (record,) = [one for one in outputs if isinstance(one, Record)]
         row = np.array([record.row], types)[0]
-        assert (row["y"].tolist(), row["u_felt"].tolist()) == ([y], [u])
+        assert (row["y"].tolist(), row["u_applied"].tolist()) == ([y], [u])
         # The sensor that measures the state itself does with x̂ what this one does.
         expected = alone.handle(measurement(k, t_ns, row["x"].tolist()), t_ns)
         for mine, others in zip(outputs, expected, strict=True):

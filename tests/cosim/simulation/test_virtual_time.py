@@ -122,7 +122,7 @@ def test_another_network_decides_losses_and_delays(busy: Scenario) -> None:
         packets["fate"] == Fate.DROPPED, [delays_ms[i] is None for i in asked]
     )
     runs = [len(list(run)) for lost, run in itertools.groupby(packets["fate"]) if lost]
-    assert packets["drop_run"].max() == max(runs) == 1
+    assert packets["consecutive_losses"].max() == max(runs) == 1
     sequence = deliveries["sequence"]
     late_ms = (deliveries["now_ns"] - deliveries["t_ns"]) // MS
     np.testing.assert_array_equal(late_ms, [delays_ms[i] for i in sequence])
