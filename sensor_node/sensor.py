@@ -7,7 +7,7 @@ whether or not the update survives the network: nothing is acknowledged.
 from collections.abc import Sequence
 
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
-from noack.config.resolution import loop_of, setpoint_of
+from noack.config.resolution import loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
@@ -15,7 +15,6 @@ from noack.core.model_flow import ModelFlow
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy, Trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
 from sensor_node.observing_sensor import ObservingSensor, observer_of

@@ -39,12 +39,11 @@ from cosim.simulation.continuous.event_detector import (
     QuadraticEventDetector,
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 

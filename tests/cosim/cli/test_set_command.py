@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-import cosim.cli  # noqa: F401 - registers the commands
-from cosim.cli.command import app
-from cosim.cli.set_command import parsed
+from cosim.cli import app
+from cosim.cli.commands.set_command import parsed
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -53,7 +52,7 @@ def test_words_are_keys_and_values() -> None:
     ("words", "why"),
     [
         (["loss.p"], "loss.p: needs a value, e.g."),
-        (["loss.p", "1", "network.loss.probability=2"], "is there twice"),
+        (["loss.p", "1", "network.loss.probability=2"], "is given twice"),
         (["mansd", "9" * 5000], "mansd: not valid TOML"),
     ],
 )

@@ -1,43 +1,16 @@
-"""Quartiles and shares of an ensemble, and how they are written."""
+"""How the page writes numbers, shares and quartiles."""
 
 import math
-from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from cosim.studies.paper.paper_conditions import HORIZON_S
+from cosim.studies.campaign.draw_statistics import quartiles
 from noack.core.linear_systems import Vector
 
-
-class Quartiles(NamedTuple):
-    """Each is the value of a draw, infinite ones included."""
-
-    lower: float
-    median: float
-    upper: float
+HORIZON_S = 40.0
+"""Horizon of the campaign ``paper``; a time that is not reached is written as "> 40"."""
 
 
 _SMALL, _LARGE = 1e-3, 1e6
 """Beyond these, numbers are written with a power of ten."""
-
-
-def quartiles(values: Vector) -> Quartiles:
-    """Lower quartile, median, upper quartile."""
-    found = np.quantile(values, (0.25, 0.5, 0.75), method="inverted_cdf")
-    return Quartiles(*(float(value) for value in found))
-
-
-def paired(first: Vector, second: Vector) -> Vector:
-    """``second`` − ``first`` draw by draw; 0 where neither happens within the horizon."""
-    with np.errstate(invalid="ignore"):
-        difference = second - first
-    return np.where(np.isnan(difference), 0.0, difference)
-
-
-def share(holds: NDArray[np.bool_]) -> float:
-    """Share of the draws in which something holds."""
-    return float(np.mean(holds))
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -1,4 +1,4 @@
-"""The command on two or more runs."""
+"""``noack compare``: two or more runs, side by side."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,10 +14,10 @@ from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import ExitStatus
 
 
-@command(RUNS, [
-    ("noack compare runs/A runs/B", "key numbers side by side, and a page with an overlay"),
+@command(RUNS, 80, [
+    ("noack compare runs/A runs/B", "key numbers, and a page with the curves overlaid"),
     ("noack compare runs/A runs/B runs/C --out overlay.png", "the overlay as a picture"),
-    ("noack compare runs/A runs/B --json", ""),
+    ("noack compare runs/A runs/B --json", "as JSON"),
 ])  # fmt: skip
 def compare(
     directories: Annotated[
@@ -28,12 +28,14 @@ def compare(
             autocompletion=completion.run_directories,
         ),
     ],
+    *,
     out: Annotated[
-        Path, typer.Option("--out", help="The overlay: a page (.html) or a picture (.svg, .png).")
+        Path,
+        typer.Option("--out", help="File of the overlay: a page (.html) or a figure (.svg, .png)."),
     ] = DEFAULT_RUNS / "comparison.html",
     json: JsonOption = False,
 ) -> int:
-    """Compare two or more runs: key numbers, settings that differ, curves overlaid."""
+    """Compare runs: key numbers, settings that differ, curves overlaid."""
     from cosim.live.progress import PatientConsole
     from cosim.studies.comparison.run_comparison import compare_runs
 

@@ -1,4 +1,4 @@
-"""The command that says what this machine grants."""
+"""``noack doctor``: what this machine permits, and whether that suffices for a run."""
 
 from typing import Annotated
 
@@ -20,31 +20,37 @@ from noack.config.scenario_file import load
 from noack.core.errors import ExitStatus
 
 
-@command(FILES, [
+@command(FILES, 10, [
     ("noack doctor", "for the paper's example"),
-    ("noack doctor lane_weighted --set speed=4", "for a run of one's own"),
-    ("noack doctor --seconds 10 --json", "longer, with all numbers"),
+    ("noack doctor lane_weighted --set speed=4", "for another scenario"),
+    ("noack doctor --seconds 10 --json", "measure longer; all numbers as JSON"),
 ])  # fmt: skip
 def doctor(
     scenario: Annotated[
         str,
         typer.Argument(
-            help="The scenario whose rates, ports and allowances count: a file, or the name of a "
-            "shipped one.",
+            help="Scenario file or shipped scenario, for its rates, ports and allowed lateness.",
             autocompletion=scenarios,
         ),
     ] = "lane_following",
+    *,
     settings: SetOption = None,
     seconds: Annotated[
-        float, typer.Option(help="How long wake-ups are watched, each way.", min=0.1, max=3600)
+        float,
+        typer.Option(
+            help="Seconds to measure wake-ups, without and with real-time settings.",
+            min=0.1,
+            max=3600,
+        ),
     ] = 2.0,
     runs: RunsOption = DEFAULT_RUNS,
     json: JsonOption = False,
 ) -> int:
-    """Say what this machine grants, and what that means for a run; 1 if none is possible.
+    """Check this machine: real-time settings, timers, ports, disk.
 
-    Real-time settings, timers and wake-ups, cores, sockets, ports, the disk, the viewer and
-    extras: each is good, limited or bad, with what would be better.
+    Each finding is good, limited or bad, with its meaning for a run and a remedy.
+
+    Exit status 1: a finding is bad, so that no run is possible.
     """
     from cosim.doctor.doctor_table import document, print_findings
     from cosim.doctor.findings import FindingStatus, judge, worst

@@ -1,6 +1,4 @@
-"""Commands for a person with five terminals: one process each."""
-
-from functools import partial
+"""``noack record``, ``plant``, ``sensor``, ``controller``, ``netem``: one terminal per process."""
 
 import typer
 
@@ -17,18 +15,26 @@ from cosim.cli.command import (
     command,
     find_scenario,
 )
-from cosim.cli.run_commands import finalize_run, run_processes
+from cosim.cli.execute_run import RunOutput, run_processes
 from cosim.record.run_directory import DEFAULT_RUNS
 from noack.config.scenario_file import load
 from noack.protocol.topology import RECORDER
 
 
-@command(PROCESSES, [
+def _examples(role: str) -> list[tuple[str, str]]:
+    return [
+        (f"noack {role}", "join the run that `noack record` has opened"),
+        (f"noack {role} --session two --json", "in another session; print its report as JSON"),
+    ]
+
+
+@command(PROCESSES, 10, [
     ("noack record lane_following", "then start the other four, in any order"),
     ("noack record lane_following --session two --live", "beside another run"),
 ])  # fmt: skip
 def record(
     scenario: ScenarioArgument,
+    *,
     settings: SetOption = None,
     session: SessionOption = "default",
     runs: RunsOption = DEFAULT_RUNS,
@@ -39,37 +45,28 @@ def record(
 ) -> int:
     """Open a run and record it; the other four processes join from other terminals."""
     loaded = load(find_scenario(scenario), settings or ())
-    end = partial(finalize_run, report=report, verbose=verbose, json=json)
-    return run_processes(loaded, runs, (RECORDER,), session, live=live, end=end)
+    output = RunOutput(report, verbose, json)
+    return run_processes(loaded, runs, output, spawn=(RECORDER,), session=session, live=live)
 
 
-@command(PROCESSES, [
-    ("noack plant", "joins what `noack record SCENARIO` has opened"),
-    ("noack plant --session two --json", "in another session; its report as JSON"),
-])  # fmt: skip
-def plant(session: SessionOption = "default", json: JsonOption = False) -> int:
-    """Join the open run as the plant: owns the true state, sends measurements."""
+@command(PROCESSES, 20, _examples("plant"))
+def plant(*, session: SessionOption = "default", json: JsonOption = False) -> int:
+    """Join the open run as the plant: integrates the state, sends measurements."""
     from plant_server.__main__ import main
 
     return main(_process_arguments(session, json=json))
 
 
-@command(PROCESSES, [
-    ("noack sensor", "joins what `noack record SCENARIO` has opened"),
-    ("noack sensor --session two --json", "in another session; its report as JSON"),
-])  # fmt: skip
-def sensor(session: SessionOption = "default", json: JsonOption = False) -> int:
+@command(PROCESSES, 30, _examples("sensor"))
+def sensor(*, session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the sensor: runs x_s and the trigger, sends updates."""
     from sensor_node.__main__ import main
 
     return main(_process_arguments(session, json=json))
 
 
-@command(PROCESSES, [
-    ("noack controller", "joins what `noack record SCENARIO` has opened"),
-    ("noack controller --session two --json", "in another session; its report as JSON"),
-])  # fmt: skip
-def controller(session: SessionOption = "default", json: JsonOption = False) -> int:
+@command(PROCESSES, 40, _examples("controller"))
+def controller(*, session: SessionOption = "default", json: JsonOption = False) -> int:
     """Join the open run as the controller: runs x_c, sends u = K x_c."""
     from controller_node.__main__ import main
 
@@ -77,12 +74,12 @@ def controller(session: SessionOption = "default", json: JsonOption = False) -> 
 
 
 @command(
-    PROCESSES,
+    PROCESSES, 50,
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
     add_help_option=False,
-)
+)  # fmt: skip
 def netem(context: typer.Context) -> int:
-    """Join the open run as the lossy network; or serve any UDP program (`noack netem --help`)."""
+    """Join the open run as the network; or relay any UDP program: `noack netem --help`."""
     from netem.__main__ import main
 
     return main(context.args)

@@ -1,4 +1,4 @@
-"""The command that changes a run while it goes on."""
+"""``noack set``: change the runtime parameters of a running run."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,35 +16,38 @@ from noack.core.errors import CallerError, ExitStatus
 
 
 @command(
-    RUNS,
+    RUNS, 45,
     [
-        ("noack set", "what can be changed, and what it is now"),
-        ("noack set loss.p 0.9", "nine in ten packets are lost from now on"),
-        ("noack set mansd 2 trigger.beta 0.3 --json", "two settings at once"),
+        ("noack set", "list the runtime parameters and their values"),
+        ("noack set loss.p 0.9", "lose nine in ten packets from now on"),
+        ("noack set mansd 2 trigger.beta 0.3 --json", "change two at once"),
     ],
     name="set",
     context_settings={"ignore_unknown_options": True},  # -0.5 is a value
-)
+)  # fmt: skip
 def set_(
     settings: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="[KEY VALUE]...",
-            help="What to change, as in the scenario or short, e.g. loss.p 0.9 mansd 2; "
-            "nothing shows what can be changed.",
+            help="Keys as in the scenario, or short, and new values: loss.p 0.9 mansd 2. "
+            "Without any, the runtime parameters are listed.",
             autocompletion=completion.runtime_parameters,
         ),
     ] = None,
+    *,
     session: Annotated[str | None, SESSION] = None,
     run: Annotated[
         Path | None,
         typer.Option(
-            "--run", help="The run with this directory.", autocompletion=completion.run_directories
+            "--run",
+            help="Directory of the run; the newest run by default.",
+            autocompletion=completion.run_directories,
         ),
     ] = None,
     json: JsonOption = False,
 ) -> int:
-    """Change a run while it goes on: losses, M, the trigger, the set-point; the newest run's."""
+    """Change a live run: losses, M, trigger, set-point."""
     from noack.runtime.run_registry import ask, find
 
     wanted = parsed(settings or ())
@@ -58,15 +61,15 @@ def set_(
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     else:
-        _show(Console(), answer)
+        _print_parameters(Console(), answer)
     return ExitStatus.OK
 
 
 def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
-    """Return the settings that words stand for: KEY VALUE, or KEY=VALUE.
+    """Return the settings that words give as KEY VALUE or KEY=VALUE.
 
     Raises:
-        CallerError: a value is missing, or a key is there twice.
+        CallerError: a value is missing, or a key is given twice.
     """
     found: dict[str, Any] = {}
     left = list(words)
@@ -79,12 +82,12 @@ def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
             text = left.pop(0)
         key = full_key(name.strip())
         if key in found:
-            raise CallerError(f"{key}: is there twice")
+            raise CallerError(f"{key}: is given twice")
         found[key] = value_of(text, name)
     return found
 
 
-def _show(console: Console, answer: dict[str, Any]) -> None:
+def _print_parameters(console: Console, answer: dict[str, Any]) -> None:
     short = {key: name for name, key in SHORT.items()}
     table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
     for heading in ("key", "short", "value"):
