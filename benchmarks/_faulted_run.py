@@ -72,7 +72,7 @@ def faulted_run(
             threads.append(threading.Thread(target=lambda: outcomes.append(fault(processes))))
             threads[0].start()
 
-    watcher = Watcher(progress=progress, back=lambda _, t_s: backs_s.append(t_s))
+    watcher = Watcher(progress=progress, restarted=lambda _, t_s: backs_s.append(t_s))
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         begun_s = time.monotonic()
         ending = launch(scenario, Path(runs), watcher=watcher)
