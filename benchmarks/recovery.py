@@ -79,7 +79,7 @@ def suffer(role: str, befall: Callable[[psutil.Process], float]) -> Fault:
             done.append(threading.Thread(target=lambda: ends_s.append(befall(process))))
             done[0].start()
 
-    watcher = Watcher(progress=progress, back=lambda _, t_s: backs_s.append(t_s))
+    watcher = Watcher(progress=progress, restarted=lambda _, t_s: backs_s.append(t_s))
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         begun_s = time.monotonic()
         ending = launch(scenario, Path(runs), watcher=watcher)
