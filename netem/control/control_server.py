@@ -11,9 +11,9 @@ session file (:mod:`netem.control.emulator_session`). Below ``netem/NAME`` it
 A query is a JSON object. It must hold ``token``, the secret of the session file; ``change`` takes
 ``link`` (may be left out if there is one), ``direction`` (``forward``, the default, ``back`` or
 ``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
-:class:`~noack.config.impairments.LinkSettings`). As with ``tc qdisc change``, the new settings
-replace the old; files that words name are read before they are sent. What is wrong with a query is
-answered in one line, and nothing is changed.
+:class:`~noack.impairments.link_settings.LinkSettings`). As with ``tc qdisc change``, the new
+settings replace the old; files that words name are read before they are sent. What is wrong with a
+query is answered in one line, and nothing is changed.
 
 Nobody without the secret gets in: zenoh's connections ask for it as a password (by challenge and
 response, so that it is never sent), and each query is checked for it again.
@@ -41,11 +41,13 @@ from netem.control.command_queue import CommandQueue, Snapshot
 from netem.control.emulator_session import Session, published
 from netem.control.emulator_statistics import statistics
 from netem.engine.relay_interface import DIRECTIONS, Direction
-from netem.words.settings_to_words import text_of
-from netem.words.words_to_settings import settings_of
-from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
+from netem.words.words_to_settings import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError, PeerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 

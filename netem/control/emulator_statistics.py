@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.engine.histogram import coarse, quantile_ns
 from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkReport
-from netem.rule_records import Counters
 from noack.core.clock import NS_PER_S
+from noack.impairments.link_records import Counters
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import text_of
 

@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
 
 from noack.config.disturbances import require_disturbances, variance_at
-from noack.config.impairments import Loss, Mansd, TraceLoss, require_scores
 from noack.config.observers import AnyObserver, KalmanSettings
 from noack.config.plant_systems import LinearSettings
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
@@ -35,6 +34,9 @@ from noack.config.setpoint import input_at
 from noack.config.triggers import AnyTrigger, DecayingSettings, require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import Mansd, require_scores
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.wire_format import MAX_DIMENSION, Flow
 from noack.settings.matrices import require_length, require_shape
 from noack.settings.section import ScenarioSection

@@ -15,7 +15,7 @@ from netem.cli.explain_links import DirectionExplanation, Explanation, LinkExpla
 from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
 MUCH = (

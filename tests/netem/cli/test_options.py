@@ -11,11 +11,11 @@ import pytest
 from netem.__main__ import main
 from netem.cli.emulator_options import parsed, parser, specs_of
 from netem.engine.relay_interface import LinkSpec
-from netem.words.loss_words import LOSS_MODELS
-from netem.words.word_examples import EXAMPLES
-from netem.words.words_to_settings import KEYWORDS, parse, settings_of
-from noack.config.impairments import LinkSettings, LossOf, ScriptedLoss
+from netem.words.words_to_settings import EXAMPLES, KEYWORDS, parse, settings_of
 from noack.core.errors import CallerError
+from noack.impairments.kinds.loss import LOSS_WORDS, LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.scripted import ScriptedLoss
 
 ADDRESSES = ["--listen", ":9000", "--to", ":9001"]
 NOTHING = LinkSettings()
@@ -202,7 +202,7 @@ def test_the_help_fits_into_a_terminal(monkeypatch: pytest.MonkeyPatch, columns:
 
 def test_the_help_has_every_word() -> None:
     text = parser().format_help()
-    for word in (*KEYWORDS, *LOSS_MODELS):
+    for word in (*KEYWORDS, *LOSS_WORDS):
         # Other words for the same stand in the documentation.
         assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
 

@@ -11,11 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.link_machine import Link
-from noack.config.impairment_files import read_files, read_loss
-from noack.config.impairments import Delay, LinkSettings, LossOf, Rate, ScriptedLoss, TraceLoss
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.record_tables import Fate
 
 
@@ -40,7 +44,7 @@ def test_a_trace_loses_what_it_marks(repeat: bool, tmp_path: Path) -> None:
 def test_any_trace(tmp_path_factory: pytest.TempPathFactory, lost: list[bool]) -> None:
     path = tmp_path_factory.getbasetemp() / "any.txt"
     path.write_text("\n".join("01"[flag] for flag in lost))
-    script = read_loss(TraceLoss(file=str(path)), Path("/"))
+    script = TraceLoss(file=str(path)).without_files(Path("/"), "")
     assert isinstance(script, ScriptedLoss)
     assert script.repeat_every == len(lost)
     assert [number in script.lost for number in range(len(lost))] == lost

@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 
-from noack.config.impairments import BernoulliLoss, GilbertElliottLoss
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -18,6 +17,8 @@ from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
 
