@@ -58,7 +58,7 @@ class Inputs:
     def __init__(self) -> None:
         self.scenario: Scenario = resolve(load(find_scenario("lane_following"), ()))
         self.loop: LoopMatrices = loop_of(self.scenario)
-        self.period_ns = self.scenario.plant_period_ns
+        self.period_ns = self.scenario.timing.plant_period_ns
         self.period_s = self.period_ns * 1e-9
         self.key = bytes(range(32))
         self.measurements: list[Message] = []

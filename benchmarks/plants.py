@@ -21,6 +21,7 @@ from benchmarks._report import Benchmark, Goal, Peer, Row, run, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
+from noack.config.plants import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
@@ -44,18 +45,21 @@ class Case(NamedTuple):
     name: str
     scenario: str
     settings: tuple[str, ...] = ()
-    goal: Goal | None = None
+    goal: Goal
 
 
-CASES = (
-    Case("cart_pole", "cart_pole"),
-    Case("four_tank", "four_tank"),
-    Case("quadrotor", "quadrotor_hover"),
-    *(
-        Case(f"vehicle, {model}", "lane_vehicle", (f"plant.system.model={model}",), SHARE)
-        for model in ("kinematic", "single_track", "drift", "multi_body")
-    ),
+CASES = tuple(
+    Case(
+        ", ".join((kind, *map(str, variant.values()))),
+        settings.scenario,
+        tuple(f"plant.system.{key}={value}" for key, value in variant.items()),
+        SHARE,
+    )
+    for kind, settings in PLANTS.items()
+    if settings.scenario not in (None, LINEAR)
+    for variant in settings.variants
 )
+"""Every kind of plant that has a scenario, the linear one aside."""
 
 
 class Steps:
@@ -63,10 +67,12 @@ class Steps:
 
     def __init__(self, scenario: str, settings: tuple[str, ...], count: int) -> None:
         self.resolved: Scenario = resolve(load(find_scenario(scenario), settings))
-        horizon_s = min(self.resolved.horizon_s, count * self.resolved.plant_period_ns / NS_PER_S)
+        horizon_s = min(
+            self.resolved.horizon_s, count * self.resolved.timing.plant_period_ns / NS_PER_S
+        )
         record = simulate(self.resolved.model_copy(update={"horizon_s": horizon_s}))
         self._plant: Plant = plant_of(self.resolved)
-        self._period_ns = self.resolved.plant_period_ns
+        self._period_ns = self.resolved.timing.plant_period_ns
         self._inputs = iter(record[PLANT_STEP]["u"])
         self._step = 0
         self.cpu_ns: list[int] = []
@@ -107,7 +113,7 @@ def timed(
 
 def rows_of(case: Case, ours: Steps, linear: Steps) -> list[Row]:
     """The rows of a case: median, 99 % quantile, and what that is of the period in wall time."""
-    period_us = ours.resolved.plant_period_ns / ours.resolved.speed / 1e3
+    period_us = ours.resolved.timing.plant_period_ns / ours.resolved.speed / 1e3
     found = {q: (float(np.quantile(ours.us, q)), float(np.quantile(linear.us, q)))
              for q in (0.5, 0.99)}  # fmt: skip
     share = 100 * found[0.99][0] / period_us

@@ -79,7 +79,7 @@ def suffer(role: str, befall: Callable[[psutil.Process], float]) -> Fault:
             done.append(threading.Thread(target=lambda: ends_s.append(befall(process))))
             done[0].start()
 
-    watcher = Watcher(progress=progress, back=lambda _, t_s: backs_s.append(t_s))
+    watcher = Watcher(progress=progress, restarted=lambda _, t_s: backs_s.append(t_s))
     with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
         begun_s = time.monotonic()
         ending = launch(scenario, Path(runs), watcher=watcher)
@@ -130,7 +130,7 @@ def killed(role: str) -> tuple[float, float, float]:
 def stopped(role: str) -> float:
     """Let a process stand still; return wall seconds from its end to the last late step of all."""
     fault = suffer(role, stop)
-    period_us = fault.record.scenario.plant_period_ns * 1e-3
+    period_us = fault.record.scenario.timing.plant_period_ns * 1e-3
     last_s = fault.at_s
     for process, table in _STEPS.items():
         now_s = fault.record[table]["now_ns"] * 1e-9

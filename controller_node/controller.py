@@ -76,9 +76,9 @@ class Controller:
         self._inputs = self._first_number = start.first_number
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
         # What went by before a restart, nobody knows.
-        self._newest: int | None = None if start.again else -1
+        self._newest: int | None = None if start.is_restart else -1
         # A model without a state waits for the first tick, which is on record, as its start is not.
-        self._model_ns = phase_ns + self._step * period_ns if start.again else 0
+        self._model_ns = phase_ns + self._step * period_ns if start.is_restart else 0
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
 
     def next_deadline_ns(self) -> int | None:
@@ -193,20 +193,20 @@ def _between(newest: int, sequence: int) -> int:
 def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
     """Return the controller of a resolved scenario; of the plant it learns x(0) at the most."""
     loop = loop_of(resolved)
-    known = resolved.network.initial_sync == "known_state" and not start.again
+    known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input = resolved.controller.safe_input
     return Controller(
         loop.H,
         loop.K,
-        period_ns=resolved.controller_period_ns,
-        phase_ns=resolved.controller_phase_ns,
-        horizon_ns=resolved.horizon_ns,
+        period_ns=resolved.timing.controller_period_ns,
+        phase_ns=resolved.timing.controller_phase_ns,
+        horizon_ns=resolved.timing.horizon_ns,
         mansd=resolved.network.mansd,
         x0=loop.x0 if known else None,
         acknowledges=resolved.is_acknowledged,
         start=start,
         safe_input=None if safe_input is None else np.array(safe_input),
-        predictive=resolved.is_predictive,
+        predictive=resolved.message_sizes.is_predictive,
         setpoint=setpoint_of(resolved),
         schedule=None if resolved.is_acknowledged else ChangeSchedule(resolved, setpoint_of),
     )

@@ -52,7 +52,7 @@ def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
     settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
     if settings.selects_all(n) and not settings.is_noisy:
         return None
-    p = resolved.outputs
+    p = resolved.message_sizes.outputs
     std, bound = (
         np.zeros(p) if given is None else np.array(given)
         for given in (settings.noise_std, settings.noise_bound)

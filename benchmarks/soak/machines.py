@@ -26,7 +26,7 @@ class PlantSteps:
 
     def __init__(self, scenario: Scenario) -> None:
         loop = loop_of(scenario)
-        self._period_ns = scenario.plant_period_ns
+        self._period_ns = scenario.timing.plant_period_ns
         self._Ad, self._Bd = discretise(loop.A, loop.B, self._period_ns)
         self._last: Rows | None = None
 
@@ -49,7 +49,7 @@ class SensorSteps:
 
     def __init__(self, scenario: Scenario) -> None:
         loop, trigger = loop_of(scenario), scenario.decaying
-        self._period_ns = scenario.measurement_period_ns
+        self._period_ns = scenario.timing.measurement_period_ns
         self._step = transition(loop.H, self._period_ns)
         self._weight = np.eye(loop.n) if loop.weight is None else loop.weight
         self._trigger = trigger
@@ -93,8 +93,8 @@ class ControllerTicks:
 
     def __init__(self, scenario: Scenario) -> None:
         self._K = loop_of(scenario).K
-        self._period_ns = scenario.controller_period_ns
-        self._phase_ns = scenario.controller_phase_ns
+        self._period_ns = scenario.timing.controller_period_ns
+        self._phase_ns = scenario.timing.controller_phase_ns
         self._next = 0
 
     def take(self, rows: Rows) -> Iterator[str]:
@@ -137,7 +137,7 @@ class Network:
         updates, sequences, _ = updates_in(packets)
         wrong = [] if len(updates) == len(packets) else ["netem_packet: something is no update"]
         lost = ~effective(updates["fate"])
-        longest = int(updates["drop_run"][lost].max(initial=0))
+        longest = int(updates["consecutive_losses"][lost].max(initial=0))
         self.longest_loss_burst = max(self.longest_loss_burst, longest)
         if longest > self._mansd:
             wrong.append(f"netem_packet: {longest} dropouts in a row, at most {self._mansd} agreed")

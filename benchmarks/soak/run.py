@@ -15,13 +15,13 @@ from benchmarks.soak.figure import memory_figure
 from benchmarks.soak.invariants import Invariants
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
-from cosim.output.report.figure_files import save
-from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.output.report.figure_files import save_figure
+from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.clock import NS_PER_S
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.spool import SpoolTail
+from noack.runtime.spool import SPOOL, SpoolTail
 
 RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
 FREE_PORTS = ("--set", "ports={}")
@@ -121,7 +121,7 @@ class _Soak:
         )  # fmt: skip
         (self._run_dir / RESULT_FILE).write_text(result.dumps(), encoding="utf-8")
         if watched:
-            save(memory_figure(result), self._run_dir / PICTURE_FILE)
+            save_figure(memory_figure(result), self._run_dir / PICTURE_FILE)
         return result
 
     def _watched(self, began_s: float, length_s: float) -> dict[str, Watched]:
@@ -148,7 +148,7 @@ class _Soak:
         pause_s = min(self._length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
         look_s = told_s = moved_s = time.monotonic()
         began_s, told, newest_ns, disk_bytes = math.inf, 0, 0, 0
-        while self._run.poll() is None and newest_ns < self._scenario.horizon_ns:
+        while self._run.poll() is None and newest_ns < self._scenario.timing.horizon_ns:
             self._read()
             now_s = time.monotonic()
             if self._invariants.t_ns > newest_ns:
@@ -162,7 +162,7 @@ class _Soak:
                 self._faults.append(f"nothing was recorded for {_STUCK_S:g} s; the run was ended")
                 self._run.terminate()
                 break
-            share = newest_ns / self._scenario.horizon_ns
+            share = newest_ns / self._scenario.timing.horizon_ns
             if int(10 * share) > told or now_s - told_s > _SAY_S:
                 told, told_s = int(10 * share), now_s
                 self._say(self._progress(share))

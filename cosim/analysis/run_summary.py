@@ -34,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import Flow
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 from noack.theory.assumptions import assumptions
 from plant_server.watchdog import too_old
 
@@ -153,14 +153,14 @@ def _watchdog(record: RunRecord) -> dict[str, Any]:
     there = np.append(taken["sequence"], NO_SEQUENCE)[found] == steps["actuation"]
     newest_ns = np.where(steps["actuation"] != NO_SEQUENCE, np.append(taken["t_ns"], 0)[found], 0)
     # Of an actuation that is not on record nobody knows how old it is.
-    old = there & too_old(steps["t_ns"], newest_ns, scenario.actuation_timeout_ns)
+    old = there & too_old(steps["t_ns"], newest_ns, scenario.timing.actuation_timeout_ns)
     trips = np.flatnonzero(old & ~np.append(False, old[:-1]))
     return {
         "policy": scenario.plant.watchdog.policy,
-        "timeout_s": scenario.actuation_timeout_ns * 1e-9,
+        "timeout_s": scenario.timing.actuation_timeout_ns * 1e-9,
         "trips": len(trips),
         "first_s": float(steps["t_ns"][trips[0]]) * 1e-9 if len(trips) else None,
-        "total_s": int(old.sum()) * scenario.plant_period_ns * 1e-9,
+        "total_s": int(old.sum()) * scenario.timing.plant_period_ns * 1e-9,
     }
 
 
@@ -170,7 +170,7 @@ def _acknowledgements(record: RunRecord) -> dict[str, int]:
     return {
         "sent": len(record[CONTROLLER_DELIVERY]),
         "lost": int(crossed.lost.sum()),
-        "longest_loss_run": crossed.longest_loss_burst(),
+        "longest_loss_burst": crossed.longest_loss_burst(),
         "received": len(record[SENSOR_ACKNOWLEDGEMENT]),
     }
 
@@ -391,10 +391,10 @@ def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
 def _lateness(record: RunRecord, role: str) -> dict[str, float | int | None]:
     scenario = record.scenario
     period_ns = {
-        "plant": scenario.plant_period_ns,
-        "sensor": scenario.measurement_period_ns,
-        "controller": scenario.controller_period_ns,
-        "netem": scenario.plant_period_ns,
+        "plant": scenario.timing.plant_period_ns,
+        "sensor": scenario.timing.measurement_period_ns,
+        "controller": scenario.timing.controller_period_ns,
+        "netem": scenario.timing.plant_period_ns,
     }[role]
     late_us = lateness_us(record, role)
     late_steps = int((late_us * 1e3 * scenario.speed > period_ns).sum())

@@ -49,13 +49,13 @@ def live_run(record: RunRecord) -> LiveRun:
             throughout.
         CallerError: it is of a scenario that exact simulation cannot take.
     """
-    record.scenario.require_unacknowledged()
+    record.scenario.coverage.require_unacknowledged()
     if changes_of(record):
         raise IncomparableError(
             "no ideal loop is like it: its settings were changed during the run"
         )
-    record.scenario.require_unchanging()
-    record.scenario.require_exact()
+    record.scenario.coverage.require_unchanging()
+    record.scenario.coverage.require_exact()
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
     if (again := record.restarted()) is not None:
         raise IncomparableError(
@@ -65,7 +65,7 @@ def live_run(record: RunRecord) -> LiveRun:
         raise IncomparableError(
             f"the record holds {len(sensor)} measurements; {_LEAST_MEASUREMENTS} are needed"
         )
-    period_ns = record.scenario.plant_period_ns
+    period_ns = record.scenario.timing.plant_period_ns
     last = int(sensor["t_ns"][-1]) // period_ns
     steps = steps[: last + 1]
     if len(steps) <= last or (steps["sequence"] != np.arange(last + 1)).any():
@@ -106,7 +106,7 @@ def _require_times(record: RunRecord) -> None:
     Raises:
         IncomparableError: some are not.
     """
-    horizon_ns = record.scenario.horizon_ns
+    horizon_ns = record.scenario.timing.horizon_ns
     for table, column in (
         (SENSOR_MEASUREMENT, "t_ns"),
         (CONTROLLER_STEP, "model_t_ns"),

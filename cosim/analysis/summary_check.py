@@ -51,7 +51,7 @@ class _Latency(_Quantiles):
 class _Acknowledgements(_Part):
     sent: Number
     lost: Number
-    longest_loss_run: Number
+    longest_loss_burst: Number
 
 
 class _Watchdog(_Part):

@@ -32,7 +32,7 @@ class RunRequirements(NamedTuple):
 
 def requirements_of(resolved: Scenario) -> RunRequirements:
     """Return what a resolved scenario asks of the machine that it runs on."""
-    period_ns = round(resolved.plant_period_ns / resolved.speed)
+    period_ns = round(resolved.timing.plant_period_ns / resolved.speed)
     settings = resolved.realtime
     ports = {name: port for name, port in resolved.ports.model_dump().items() if port}
     return RunRequirements(

@@ -21,8 +21,8 @@ _UNTIL_THE_END = 3
 
 def spool_bytes(resolved: Scenario) -> int:
     """What the rows of a run's grids take, without those of events, of which nobody knows."""
-    steps = resolved.horizon_ns // resolved.plant_period_ns + 1
-    ticks = resolved.horizon_ns // resolved.controller_period_ns
+    steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
+    ticks = resolved.timing.horizon_ns // resolved.timing.controller_period_ns
     counts = {
         PLANT_STEP: steps,
         SENSOR_MEASUREMENT: steps // resolved.plant.measure_every,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import as_json
+from cosim.analysis.claims.claim import as_json
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
 from cosim.analysis.model_comparison import linearisation
@@ -21,7 +21,6 @@ from cosim.record.run_directory import (
     RECORD,
     REPORT_FILE,
     SCENARIO_FILE,
-    SPOOL,
     SUMMARY_FILE,
     concluded,
     read_object,
@@ -29,6 +28,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
+from noack.runtime.spool import SPOOL
 
 
 @np.errstate(all="ignore")
@@ -126,7 +126,7 @@ def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
     if not summary["lost_outside_netem"] or longest <= summary["longest_loss_burst"]:
         return {}
     found: Summary = {"longest_loss_burst": longest}
-    if (beyond := claims.beyond_mansd) is not None and not summary["assumption_violations"]:
+    if (beyond := claims.mansd_violation) is not None and not summary["assumption_violations"]:
         at_s, what = beyond
         found["assumption_violations"] = [
             {"t_s": at_s, "process": "recorder", "what": f"MANSD violated: {what}"}

@@ -158,9 +158,9 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
         CallerError: its updates are acknowledged; its plant is not linear, or is disturbed; or its
             state is not measured as it is.
     """
-    resolved.require_unacknowledged()
-    resolved.require_unchanging()
-    resolved.require_exact()
+    resolved.coverage.require_unacknowledged()
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
     ideal, scheduled = ideal_conditions(resolved), nominal_conditions(resolved, late_periods)
     scopes = [scope for scope in (own_plant(resolved), box(resolved)) if scope is not None]
     certificates = [(IDEAL, scope.certificate(ideal)) for scope in scopes]

@@ -140,7 +140,7 @@ def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]
     if found is not None:
         yield "acknowledgements", str(found["sent"])
         yield "  of these lost", f"{found['lost']} ({_percent(found['lost'], found['sent'])})"
-        yield "  longest loss burst", str(found["longest_loss_run"])
+        yield "  longest loss burst", str(found["longest_loss_burst"])
 
 
 def _restarts(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:

@@ -213,7 +213,7 @@ def join_all(record: RunRecord) -> AlignedRun:
     """Join a whole run."""
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
-    reach_ns = int(track.model_ns[-1]) + record.scenario.controller_period_ns
+    reach_ns = int(track.model_ns[-1]) + record.scenario.timing.controller_period_ns
     acknowledged = record.scenario.is_acknowledged
     return join(
         record.loop, record[SENSOR_MEASUREMENT], track, reach_ns,

@@ -43,13 +43,13 @@ def estimation_summary(record: RunRecord, e_c_sup: float | None) -> dict[str, An
         e_c_sup: the largest ‖x_c − x‖, the controller's error against the plant's own state.
     """
     scenario = record.scenario
-    if scenario.knows_state:
+    if scenario.coverage.knows_state:
         return None
     norms = row_norms(estimation_error(record))
     norms, late = (some[np.isfinite(some)] for some in (norms, norms[len(norms) // 2 :]))
     return {
         "observer": None if scenario.observer is None else scenario.observer.kind,
-        "outputs": scenario.outputs,
+        "outputs": scenario.message_sizes.outputs,
         "noise_std": np.sqrt(scenario.plant.measurement.variance(record.loop.n)).tolist(),
         "rms": _rms(norms),
         "rms_second_half": _rms(late),

@@ -12,12 +12,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-from noack.config.plant_systems import FmuSettings, PythonSettings
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
-from noack.config.system_files import unchanged
 from noack.core.errors import CallerError, MachineError, why
 from noack.core.regular_file import read_regular
+from noack.settings.user_files import file_tables, unchanged, with_tables
 
 DEFAULT_RUNS = Path("runs")
 """Where run directories are made, in the folder where a person stands."""
@@ -28,10 +27,7 @@ RECORDING_FILE = "recording.rrd"
 ENDING_FILE = "ending.json"
 SUMMARY_FILE = "summary.json"
 REPORT_FILE = "report.html"
-SPOOL = "spool"
 RECORD = "record"
-PLANT = "plant"
-"""The folder of the file that the plant is made of, if it is of one."""
 LATEST = "latest"
 _LOCK = ".lock"
 _MOST_JSON_BYTES = 64 * 2**20
@@ -65,33 +61,29 @@ def new_run_dir(runs: Path, name: str) -> Path:
 
 
 def write_scenario(resolved: Scenario, run_dir: Path) -> Scenario:
-    """Write the scenario of a run into its directory, with the file that its plant is made of.
+    """Write the scenario of a run into its directory, with the files that the run executes.
 
-    So the run can be replayed when that file has changed, and the directory be taken elsewhere.
+    So the run can be replayed when a file has changed, and the directory can be moved. The file of
+    a plant is copied to ``plant/``, that of a trigger to ``trigger/``, and so on.
 
     Returns:
-        The scenario for the run's processes, who use the kept file.
+        The scenario for the run's processes, which use the copies.
 
     Raises:
-        CallerError: the plant's file is not what it was when the scenario was loaded.
+        CallerError: a file has changed since the scenario was loaded.
         OSError: the directory cannot be written.
     """
-    system, here = resolved.plant.system, resolved
-    if isinstance(system, FmuSettings | PythonSettings) and system.file is not None:
-        file = unchanged(system)
-        kept = run_dir / PLANT / file.name
-        kept.parent.mkdir()
-        shutil.copyfile(file, kept)
-        resolved = _with_file(resolved, f"{PLANT}/{file.name}")
-        here = _with_file(resolved, str(kept.absolute()))
-    (run_dir / SCENARIO_FILE).write_text(dumps(resolved), encoding="utf-8")
-    return here
-
-
-def _with_file(scenario: Scenario, file: str) -> Scenario:
-    system = scenario.plant.system.model_copy(update={"file": file})
-    plant = scenario.plant.model_copy(update={"system": system})
-    return scenario.model_copy(update={"plant": plant})
+    relative, absolute = {}, {}
+    for place, table in file_tables(resolved):
+        file = unchanged(table, place)
+        name = f"{place.split('.')[0]}/{file.name}"
+        (run_dir / name).parent.mkdir()
+        shutil.copyfile(file, run_dir / name)
+        relative[place] = table.model_copy(update={"file": name})
+        absolute[place] = table.model_copy(update={"file": str((run_dir / name).absolute())})
+    text = dumps(with_tables(resolved, relative))
+    (run_dir / SCENARIO_FILE).write_text(text, encoding="utf-8")
+    return with_tables(resolved, absolute)
 
 
 def read_object(path: Path) -> dict[str, Any]:

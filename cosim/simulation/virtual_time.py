@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import ACKNOWLEDGES_TO, CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
 from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
@@ -243,7 +243,7 @@ def simulate(
     """
     acknowledged = resolved.is_acknowledged
     if network is not None:
-        resolved.require_unchanging()
+        resolved.coverage.require_unchanging()
     gathered = _Gathered(tables_of(resolved))
     machines: dict[str, Machine[Any]] = {
         "plant": plant_of(resolved),
@@ -251,7 +251,9 @@ def simulate(
         "netem": network_of(resolved, forward=None if network is None else DecidedLink(network)),
         "controller": controller_of(resolved),
     }
-    shuttle = Shuttle(machines, resolved.entries, gathered.take, acknowledged=acknowledged)
+    shuttle = Shuttle(
+        machines, resolved.message_sizes.entries, gathered.take, acknowledged=acknowledged
+    )
     changes = scheduled(resolved)
     shuttle.announce(changes)
     for change in changes:

@@ -95,7 +95,7 @@ class BatchedRelay:
                 place = slice(len(self._ways), len(self._ways) + 1)
                 self._ways.append(
                     BatchedDirection(
-                        (link.spec.forward, link.spec.back)[side],
+                        (link.spec.forward, link.spec.reverse)[side],
                         link.spec.seed,
                         (link.spec.name, direction),
                         link.spec.decisions.get(direction, ()),
@@ -159,7 +159,7 @@ class BatchedRelay:
         self._look_at_losses()
         reports = []
         for number, link in enumerate(self._links):
-            forward, back = (self._report_way(2 * number + side) for side in range(2))
+            forward, reverse = (self._report_way(2 * number + side) for side in range(2))
             reports.append(
                 LinkReport(
                     name=link.spec.name,
@@ -171,7 +171,7 @@ class BatchedRelay:
                     discarded=link.discarded,
                     port_unreachable=self._port_unreachable(number),
                     forward=forward,
-                    back=back,
+                    reverse=reverse,
                 )
             )
         return reports

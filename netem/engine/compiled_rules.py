@@ -1,6 +1,6 @@
 """Compiles the rules of a link with numba: the very functions that :mod:`netem.link_machine` runs.
 
-What is compiled is kept in the user's cache; see :mod:`noack.runtime.code_cache`.
+What is compiled is kept in the user's cache; see :mod:`noack.core.code_cache`.
 """
 
 import importlib
@@ -21,6 +21,8 @@ import noack.impairments
 from netem import relay_events
 from netem.engine import histogram
 from netem.rule_program import new_flow
+from noack.core import code_cache
+from noack.core.code_cache import cache_folder, compiler
 from noack.impairments import link_records
 from noack.impairments.link_records import (
     NEVER_NS,
@@ -36,8 +38,6 @@ from noack.impairments.stage_dispatch import (
     STAGE_RECORDS,
     apply_stage,
 )
-from noack.runtime import code_cache
-from noack.runtime.code_cache import cache_folder, compiler
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:

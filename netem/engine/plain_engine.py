@@ -68,7 +68,7 @@ class _PlainLink:
         spec = link.spec
         self.ways = (
             PlainDirection(spec, "forward", spec.forward),
-            PlainDirection(spec, "back", spec.back),
+            PlainDirection(spec, "reverse", spec.reverse),
         )
         self.clients: dict[Any, _Client] = {}
         self.by_number: dict[int, _Client] = {}
@@ -178,7 +178,7 @@ class PlainRelay:
                 discarded=link.link.discarded,
                 port_unreachable=link.port_unreachable,
                 forward=link.ways[0].report(_flows(link, link.ways[0])),
-                back=link.ways[1].report(_flows(link, link.ways[1])),
+                reverse=link.ways[1].report(_flows(link, link.ways[1])),
             )
             for link in self._links
         ]

@@ -18,8 +18,8 @@ from noack.impairments.link_settings import LinkSettings
 Address = tuple[str, int]
 """Host as a number (IPv4 or IPv6) and port."""
 
-Direction = Literal["forward", "back"]
-DIRECTIONS: tuple[Direction, Direction] = ("forward", "back")
+Direction = Literal["forward", "reverse"]
+DIRECTIONS: tuple[Direction, Direction] = ("forward", "reverse")
 """From client to server, and from server to client."""
 
 
@@ -34,7 +34,7 @@ class LinkSpec:
     to: Address
     """The server."""
     forward: LinkSettings
-    back: LinkSettings
+    reverse: LinkSettings
     seed: int = 0
     return_path: bool = True
     """False: one way only; all that survives leaves from one socket, and answers are discarded."""
@@ -97,7 +97,7 @@ class LinkReport:
     """How often ICMP said that nobody listens where the server should be; at least so often did a
     datagram come to nobody."""
     forward: DirectionReport
-    back: DirectionReport
+    reverse: DirectionReport
 
 
 class Tap(Protocol):

@@ -50,7 +50,7 @@ class LinkTable(ScenarioSection):
     """The server: HOST:PORT."""
     forward: Side = LinkSettings()
     """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
-    back: Side = LinkSettings()
+    reverse: Side = LinkSettings()
     """From the server back to the clients, likewise."""
     words: Side | None = None
     """Short for forward."""
@@ -85,7 +85,7 @@ class LinkTable(ScenarioSection):
             listen=listen,
             to=parse_address(self.to, f"{place}.to", listen),
             forward=read_files(self.words or self.forward, folder, f"{place}.forward"),
-            back=read_files(self.back, folder, f"{place}.back"),
+            reverse=read_files(self.reverse, folder, f"{place}.reverse"),
             seed=self.seed,
             return_path=self.return_path,
             idle_s=self.idle_s,

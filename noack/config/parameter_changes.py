@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from noack.config.runtime_parameters import LOSS, MANSD, SETPOINT, text_of, trigger_parameters
 from noack.config.scenario import Scenario
+from noack.config.scenario_changes import content_with_settings, with_settings
 from noack.config.toml_file import validated
 from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
@@ -81,9 +82,9 @@ def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
     """
     settings_bytes(settings)
     try:
-        return scenario.changed(settings)
+        return with_settings(scenario, settings)
     except ValidationError:
-        return validated(Scenario, scenario.changed_content(settings), "the change")
+        return validated(Scenario, content_with_settings(scenario, settings), "the change")
     except ValueError as error:
         raise CallerError(f"the change: {error}") from None
 

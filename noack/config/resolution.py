@@ -10,15 +10,17 @@ from typing import Literal
 import numpy as np
 
 from noack.config.named_models import NAMED_MODELS
-from noack.config.observability import observer_gain, unseen_mode
-from noack.config.observers import AnyObserver, LuenbergerSettings
+from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.sections.model_section import ModelSection
 from noack.config.setpoint import input_at
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
+from noack.observers.observability import unobservable_mode
 from noack.protocol.record_tables import entry_names, tables
+from noack.trigger.policy_settings import ModelMatrices
+from noack.trigger.trigger_policy import Policy
 
 _SURELY_FINITE = 600.0
 """‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is still a number; beyond, the exponential itself must tell."""
@@ -85,15 +87,15 @@ def resolve(scenario: Scenario) -> Scenario:
         A = A + _perturbation(rng, plant.draw, plant.uncertainty_A, (n, n))
         B = B + _perturbation(rng, plant.draw, plant.uncertainty_B, (n, m))
     K = np.array(model.gain)
-    _require_finite("plant", A, B, scenario.plant_period_ns)
+    _require_finite("plant", A, B, scenario.timing.plant_period_ns)
     if scenario.mode == "model":
         H = np.array(model.A) + np.array(model.B) @ K
-        _require_finite("model", H, K.T, scenario.controller_period_ns)
+        _require_finite("model", H, K.T, scenario.timing.controller_period_ns)
     drawn: dict[str, object] = {
         "initial_state": tuple(x0.tolist()),
         "initial_state_halfwidth": None,
     }
-    if scenario.is_linear:
+    if scenario.coverage.is_linear:
         drawn |= {"draw": "given", "A": _rows(A), "B": _rows(B)}
     update = {"model": model, "plant": plant.model_copy(update=drawn)}
     return scenario.model_copy(update=update | {"observer": _observer(scenario, model)})
@@ -122,6 +124,17 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
     )
 
 
+def policy_of(resolved: Scenario) -> Policy:
+    """Return the trigger policy of a resolved scenario.
+
+    Raises:
+        CallerError: the policy cannot be used with the scenario's model.
+    """
+    model = resolved.model
+    matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
+    return resolved.trigger.trigger_policy(matrices)
+
+
 def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
     """The set-point x_r, (n,), of a resolved scenario, and u_r, (m,); None if it is 0."""
     given = resolved.controller.setpoint
@@ -134,47 +147,40 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """The row types of the tables that runs of a resolved scenario have."""
     n, m = resolved.model.dimensions
-    acknowledged, predictive = resolved.is_acknowledged, resolved.is_predictive
+    acknowledged, predictive = resolved.is_acknowledged, resolved.message_sizes.is_predictive
     internal = len(resolved.plant.system.internal_names)
     disturbed = {one.at for one in resolved.plant.disturbances}
     return tables(
         n, m, acknowledged=acknowledged, predictive=predictive, internal=internal,
         disturbed_input="input" in disturbed, disturbed_state="state" in disturbed,
-        outputs=0 if resolved.observer is None else resolved.outputs,
-        inputs_reported=resolved.inputs_reported,
+        outputs=0 if resolved.observer is None else resolved.message_sizes.outputs,
+        inputs_reported=resolved.message_sizes.inputs_reported,
     )  # fmt: skip
 
 
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
-    """The observer, with a gain where it has poles."""
+    """The observer with its gain; refused if the measurement does not show an unstable mode."""
     observer = scenario.observer
     if observer is None:
         return None
     A, n = np.array(model.A), len(model.A or ())
     given = scenario.plant.measurement.C
     C = np.eye(n) if given is None else np.array(given)
-    period_ns = scenario.measurement_period_ns
+    period_ns = scenario.timing.measurement_period_ns
     with np.errstate(all="ignore"):
         step = transition(A, period_ns)
     if not np.isfinite(step).all():
         raise CallerError(
-            "model.A: it takes one time between measurements to infinity; check its size"
+            "model.A: e^(AT) is not finite, T being the time between measurements; check its size"
         )
-    if (mode := unseen_mode(step, C)) is not None:
+    if (mode := unobservable_mode(step, C)) is not None:
         rate_per_s = np.log(mode) / (period_ns * 1e-9)
         rate = f"{rate_per_s.real:.3g}" + (f"{rate_per_s.imag:+.3g}j" if rate_per_s.imag else "")
         raise CallerError(
-            f"plant.measurement.C: no observer can follow: the mode e^({rate} t) of "
-            "the model does not show in what is measured, and does not decay"
+            f"plant.measurement.C: the model's mode e^({rate} t) does not decay and does not "
+            "appear in what is measured; no observer can estimate it"
         )
-    if isinstance(observer, LuenbergerSettings) and observer.poles_per_s is not None:
-        try:
-            z = tuple(complex(np.exp(pole * period_ns * 1e-9)) for pole in observer.poles)
-            gain = observer_gain(step, C, z)
-        except ValueError as error:
-            raise CallerError(f"observer.poles_per_s: cannot be placed: {error}") from None
-        return observer.model_copy(update={"gain": _rows(gain), "poles_per_s": None})
-    return observer
+    return observer.resolved(step, C, period_ns)
 
 
 def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:

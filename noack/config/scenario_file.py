@@ -12,8 +12,8 @@ from noack.config import toml_file
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
-from noack.config.system_files import read_system
 from noack.core.errors import CallerError, printable
+from noack.settings.user_files import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
@@ -77,13 +77,12 @@ def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
     if (back := network.acknowledgements) is not None:
         read = _read(back, path.parent, f"{place}.acknowledgements")
         update["acknowledgements"] = back.model_copy(update=read)
-    system = read_system(scenario.plant.system, path.parent, f"{source}: plant.system")
-    return scenario.model_copy(
-        update={
-            "network": network.model_copy(update=update),
-            "plant": scenario.plant.model_copy(update={"system": system}),
-        }
-    )
+    scenario = scenario.model_copy(update={"network": network.model_copy(update=update)})
+    tables = {
+        place: located(table, path.parent, f"{source}: {place}")
+        for place, table in file_tables(scenario)
+    }
+    return with_tables(scenario, tables)
 
 
 def _read(

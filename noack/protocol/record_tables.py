@@ -1,16 +1,19 @@
-"""The tables of the numeric record: one row per input of a machine, defined once for all.
+"""The tables of the numeric record, each with its columns; one row per input of a machine.
 
-Every machine emits its rows as :class:`noack.protocol.machine_interface.Record`; live runs,
-simulation and replay fill the same tables. ``docs/record.md`` documents the columns for readers of
-the Parquet files. Times are nanoseconds of simulated time since the run's epoch: ``t_ns`` is when
-something was due (its nominal time), ``now_ns`` when it was done.
+A machine emits its rows as :class:`noack.protocol.machine_interface.Record`, in the order of the
+columns here; live runs, simulation and replay fill the same tables. Everything else follows from
+:data:`TABLES`: row types, Parquet files, the processes' tables, the description in
+``docs/record.md``. Times are nanoseconds of simulated time since the run's epoch: ``t_ns`` is
+nominal, ``now_ns`` actual.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 PLANT_STEP = "plant_step"
 PLANT_ACTUATION = "plant_actuation"
@@ -25,12 +28,12 @@ NETEM_SETTING = "netem_setting"
 CONTROLLER_SETTING = "controller_setting"
 
 SETTINGS = (SENSOR_SETTING, NETEM_SETTING, CONTROLLER_SETTING)
-"""What each process was told of changes during the run."""
+"""Tables of the changes of settings that each process received during the run."""
 CHANGE_BYTES = 1024
-"""Width of a change in the record: JSON, filled up with zeros."""
+"""Width of a change in the record: JSON, padded with zero bytes."""
 
 PACKET_HEAD_BYTES = 32
-"""Leading bytes of each datagram that the network emulator keeps; it does not interpret them."""
+"""Leading bytes of each datagram that the network emulator records without interpreting them."""
 
 NO_SEQUENCE = -1
 """Stands for "none" in a column of sequence numbers."""
@@ -42,9 +45,9 @@ class Fate(IntEnum):
     DELIVERED = 0
     DROPPED = 1
     FORCED = 2
-    """Delivered although an impairment said no, as M − 1 in a row had not been delivered."""
+    """Delivered by the guarantee, although an impairment would have prevented it."""
     CORRUPTED = 3
-    """Sent on with a flipped bit."""
+    """Forwarded with a flipped bit."""
     OVERFLOWED = 4
     """Dropped from a full queue."""
     BLACKED_OUT = 5
@@ -52,106 +55,215 @@ class Fate(IntEnum):
 
     @property
     def effective(self) -> bool:
-        """Whether the datagram was effectively delivered, unless a later one overtook it."""
+        """Whether the datagram was effectively delivered, unless it is out of order (stale)."""
         return self in (Fate.DELIVERED, Fate.FORCED)
 
 
 def effective(fates: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether each datagram was effectively delivered, unless a later one overtook it, (k,)."""
+    """Whether each datagram was effectively delivered, unless it is out of order (stale), (k,)."""
     return np.isin(fates, [fate for fate in Fate if fate.effective])
 
 
 def entry_names(vector: str, entries: int) -> tuple[str, ...]:
     """Names of a vector's entries, counted from 1: ``x_1``, ``x_2`` and so on.
 
-    They are the columns of the record, and what states and inputs are called that have no names.
+    They are the columns of the Parquet files, and the names of states and inputs without names.
     """
     return tuple(f"{vector}_{i}" for i in range(1, entries + 1))
 
 
-def tables(
-    n: int,
-    m: int,
-    *,
-    acknowledged: bool = False,
-    predictive: bool = False,
-    internal: int = 0,
-    disturbed_input: bool = False,
-    disturbed_state: bool = False,
-    outputs: int = 0,
-    inputs_reported: int = 0,
-) -> Mapping[str, np.dtype[np.void]]:
-    """Return the row types of all tables for ``n`` states and ``m`` inputs.
+@dataclass(frozen=True)
+class RecordShape:
+    """The sizes of a run's vectors; a column of size 0 is not in the record."""
+
+    n: int
+    """States."""
+    m: int
+    """Inputs."""
+    acknowledged: bool = False
+    """Whether updates are acknowledged."""
+    predictive: bool = False
+    """Whether actuations carry the controller's model state."""
+    internal: int = 0
+    """Entries of the plant's own state z."""
+    disturbed_input: bool = False
+    disturbed_state: bool = False
+    outputs: int = 0
+    """Measured outputs from which an observer estimates the state; 0 without an observer."""
+    inputs_reported: int = 0
+    """Numbers of a measurement that are inputs."""
+
+
+class Column(NamedTuple):
+    """A column of a table."""
+
+    name: str
+    unit: str
+    """Empty: a number without unit."""
+    meaning: str
+    entries: Callable[[RecordShape], int] | None = None
+    """Length of a vector; None for a single number."""
+    dtype: str = "<i8"
+
+
+def _vector(name: str, unit: str, entries: Callable[[RecordShape], int], meaning: str) -> Column:
+    return Column(name, unit, meaning, entries, "<f8")
+
+
+def _state(name: str, meaning: str) -> Column:
+    return _vector(name, "model units", lambda shape: shape.n, meaning)
+
+
+def _input(name: str, meaning: str) -> Column:
+    return _vector(name, "model units", lambda shape: shape.m, meaning)
+
+
+def _real(name: str, meaning: str) -> Column:
+    return Column(name, "model units", meaning, None, "<f8")
+
+
+def _bytes(name: str, width: int, meaning: str) -> Column:
+    return Column(name, "bytes", meaning, None, f"V{width}")
+
+
+class Table(NamedTuple):
+    """A table of the record."""
+
+    name: str
+    owner: str
+    """The process that fills it."""
+    row: str
+    """What one row stands for."""
+    columns: tuple[Column, ...]
+    """Besides ``COMMON``."""
+    exists: Callable[[RecordShape], bool] = lambda shape: True
+
+
+COMMON = (
+    Column("input", "", "number of the machine's input, in order over all its tables"),
+    Column("sequence", "", "sequence number of the message, or number of the step"),
+    Column("t_ns", "ns", "nominal time: when the step or message was due"),
+    Column("now_ns", "ns", "actual time"),
+)
+"""The first columns of every table."""
+
+_MODEL_TIME = Column("model_t_ns", "ns", "time of the controller's model")
+_CHANGE = (
+    Column("since_ns", "ns", "from when on the change is in force in this process: T, or later if "
+           "it was received too late"),
+    _bytes("change", CHANGE_BYTES, "the settings by their keys, as JSON, padded with zero bytes"),
+)  # fmt: skip
+
+TABLES = (
+    Table(PLANT_STEP, "plant", "step of the plant", (
+        _state("x", "state at `t_ns`"),
+        _input("u", "applied input from `t_ns` on"),
+        Column("actuation", "", "sequence number of the newest actuation, which u is from unless "
+               "the watchdog replaced it"),
+        _vector("z", "model units", lambda shape: shape.internal,
+                "the system's own state, for a system with more states than x"),
+        _vector("d", "model units", lambda shape: shape.m * shape.disturbed_input,
+                "disturbance added to the input, where there is one"),
+        _vector("w", "model units", lambda shape: shape.n * shape.disturbed_state,
+                "disturbance added to ẋ, where there is one"),
+    )),
+    Table(PLANT_ACTUATION, "plant", "actuation received by the plant; `t_ns` is the model time of "
+          "its input", (
+        _input("u", "input"),
+        _vector("x_c", "model units", lambda shape: shape.n * shape.predictive,
+                "the model's state, with `plant.watchdog.policy = \"model\"` only"),
+    )),
+    Table(SENSOR_MEASUREMENT, "sensor", "measurement received by the sensor", (
+        _state("x", "measured state, or x̂ of the observer"),
+        _state("x_s", "the sensor's model, before a reset"),
+        _real("e_s_norm", "‖W(x_s − x)‖"),
+        _real("compared", "left side of the trigger's comparison, ‖W(x_s − x)‖ for the paper's "
+              "trigger"),
+        _real("threshold", "right side; an event happens if the left side exceeds it, or when a "
+              "timer of the trigger expires"),
+        Column("event", "", "sequence number of the update that was sent, −1 for none"),
+        _vector("y", "model units", lambda shape: shape.outputs,
+                "measured outputs, with an observer only"),
+        _vector("u_applied", "model units",
+                lambda shape: shape.inputs_reported if shape.outputs else 0,
+                "inputs applied in the plant's steps since the last measurement, in order, with an "
+                "observer only"),
+    )),
+    Table(CONTROLLER_DELIVERY, "controller", "update received by the controller; `t_ns` is the "
+          "event's time", (
+        _MODEL_TIME,
+        _state("x", "received state"),
+        _state("x_c_before", "the model before the reset"),
+        _state("x_c", "the model after the reset"),
+        Column("dropouts", "", "updates missing before this one"),
+    )),
+    Table(CONTROLLER_STEP, "controller", "tick of the controller", (
+        _MODEL_TIME,
+        _state("x_c", "the model"),
+        _input("u", "K x_c, with a set-point K(x_c − x_r) + u_r; the safe input while the "
+               "controller has no state"),
+    )),
+    Table(NETEM_PACKET, "netem", "datagram received by the network emulator; `sequence` counts "
+          "the datagrams of its flow", (
+        Column("flow", "", "source: 0 the sensor; 1 the controller, with `network.protocol = "
+               "\"ack\"`"),
+        Column("fate", "", ", ".join(f"{fate.value} {fate.name.lower()}" for fate in Fate)),
+        Column("consecutive_losses", "", "consecutive datagrams up to this one that were not "
+               "effectively delivered, as known then"),
+        Column("release_ns", "ns", "time at which it is to leave, −1 never"),
+        Column("copy_ns", "ns", "time at which its copy is to leave, −1 never"),
+        Column("bit", "", "number of the flipped bit, −1 none"),
+        Column("size_bytes", "bytes", "size of the datagram"),
+        _bytes("head", PACKET_HEAD_BYTES, "its leading bytes, not interpreted"),
+    )),
+    Table(NETEM_RELEASE, "netem", "delayed datagram, or copy, that left the network emulator; "
+          "`sequence` as in `netem_packet`", (
+        Column("flow", "", "as in `netem_packet`"),
+        Column("copy", "", "1 for a copy"),
+        Column("stale", "", "1 if a newer datagram of the flow had left before"),
+    )),
+    Table(SENSOR_SETTING, "sensor", "change of settings received by the sensor; `sequence` numbers "
+          "the changes, `t_ns` is T", _CHANGE),
+    Table(NETEM_SETTING, "netem", "change of settings received by the network emulator", _CHANGE),
+    Table(CONTROLLER_SETTING, "controller", "change of settings received by the controller",
+          _CHANGE),
+    Table(SENSOR_ACKNOWLEDGEMENT, "sensor", "acknowledgement received by the sensor, with "
+          "`network.protocol = \"ack\"` only; `sequence` and `t_ns` of the update", (
+        Column("model_t_ns", "ns", "time of the sensor's model, that of the last measurement"),
+        _state("x_s_before", "the model before the reset"),
+        _state("x_s", "the model after the reset"),
+    ), lambda shape: shape.acknowledged),
+)  # fmt: skip
+
+OWNER: Mapping[str, str] = {table.name: table.owner for table in TABLES}
+"""The process that fills each table."""
+
+
+def tables(n: int, m: int, **more: int) -> Mapping[str, np.dtype[np.void]]:
+    """Return the row types of the tables of a run with ``n`` states and ``m`` inputs.
 
     Args:
         n: number of states.
         m: number of inputs.
-        acknowledged: whether updates are acknowledged, so that there is a table of that, too.
-        predictive: whether actuations carry the controller's model state.
-        internal: number of entries of the plant's own state z that are on record.
-        disturbed_input: whether something is added to the plant's input.
-        disturbed_state: whether something is added to its ẋ.
-        outputs: number of measured outputs from which an observer estimates the state; 0 if there
-            is no observer.
-        inputs_reported: how many numbers of a measurement are inputs.
+        more: other sizes, as in :class:`RecordShape`.
     """
-    x: tuple[DTypeLike, tuple[int]] = ("<f8", (n,))
-    u: tuple[DTypeLike, tuple[int]] = ("<f8", (m,))
-    common = [("input", "<i8"), ("sequence", "<i8"), ("t_ns", "<i8"), ("now_ns", "<i8")]
-    columns: dict[str, list[tuple[object, ...]]] = {
-        PLANT_STEP: [*common, ("x", *x), ("u", *u), ("actuation", "<i8")],
-        PLANT_ACTUATION: [*common, ("u", *u)],
-        SENSOR_MEASUREMENT: [
-            *common, ("x", *x), ("x_s", *x),
-            ("e_s_norm", "<f8"), ("compared", "<f8"), ("threshold", "<f8"), ("event", "<i8"),
-        ],
-        CONTROLLER_DELIVERY: [
-            *common, ("model_t_ns", "<i8"), ("x", *x), ("x_c_before", *x), ("x_c", *x),
-            ("dropouts", "<i8"),
-        ],
-        CONTROLLER_STEP: [*common, ("model_t_ns", "<i8"), ("x_c", *x), ("u", *u)],
-        NETEM_PACKET: [
-            *common, ("flow", "<i8"), ("fate", "<i8"), ("drop_run", "<i8"),
-            ("release_ns", "<i8"), ("copy_ns", "<i8"), ("bit", "<i8"),
-            ("size_bytes", "<i8"), ("head", f"V{PACKET_HEAD_BYTES}"),
-        ],
-        NETEM_RELEASE: [*common, ("flow", "<i8"), ("copy", "<i8"), ("stale", "<i8")],
-    }  # fmt: skip
-    for table in SETTINGS:
-        columns[table] = [*common, ("since_ns", "<i8"), ("change", f"V{CHANGE_BYTES}")]
-    if internal:
-        columns[PLANT_STEP].append(("z", "<f8", (internal,)))
-    if disturbed_input:
-        columns[PLANT_STEP].append(("d", *u))
-    if disturbed_state:
-        columns[PLANT_STEP].append(("w", *x))
-    if outputs:
-        columns[SENSOR_MEASUREMENT] += [
-            ("y", "<f8", (outputs,)), ("u_felt", "<f8", (inputs_reported,)),
-        ]  # fmt: skip
-    if predictive:
-        columns[PLANT_ACTUATION].append(("x_c", *x))
-    if acknowledged:
-        columns[SENSOR_ACKNOWLEDGEMENT] = [
-            *common, ("model_t_ns", "<i8"), ("x_s_before", *x), ("x_s", *x),
-        ]  # fmt: skip
-    return {table: np.dtype(fields) for table, fields in columns.items()}
+    shape = RecordShape(n, m, **more)  # type: ignore[arg-type]
+    return {
+        table.name: np.dtype([*_fields((*COMMON, *table.columns), shape)])
+        for table in TABLES
+        if table.exists(shape)
+    }
 
 
-OWNER: Mapping[str, str] = {
-    PLANT_STEP: "plant",
-    PLANT_ACTUATION: "plant",
-    SENSOR_MEASUREMENT: "sensor",
-    SENSOR_ACKNOWLEDGEMENT: "sensor",
-    CONTROLLER_STEP: "controller",
-    CONTROLLER_DELIVERY: "controller",
-    NETEM_PACKET: "netem",
-    NETEM_RELEASE: "netem",
-    SENSOR_SETTING: "sensor",
-    NETEM_SETTING: "netem",
-    CONTROLLER_SETTING: "controller",
-}
-"""Which process fills which table; ``sensor_acknowledgement`` is not in every run."""
+def _fields(columns: tuple[Column, ...], shape: RecordShape) -> list[tuple[Any, ...]]:
+    found: list[tuple[Any, ...]] = []
+    for column in columns:
+        if column.entries is None:
+            found.append((column.name, column.dtype))
+        elif (entries := column.entries(shape)) > 0:
+            found.append((column.name, column.dtype, (entries,)))
+    return found
+
 
 UPDATES, ACKNOWLEDGEMENTS = 0, 1
 """The network emulator's flows in a run: from the sensor, and from the controller."""

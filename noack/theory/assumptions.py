@@ -13,16 +13,6 @@ import numpy as np
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import SteadyState, steady_state
-from noack.config.triggers import (
-    AbsoluteSettings,
-    AnyTrigger,
-    DeadlineSettings,
-    DecayingSettings,
-    DwellSettings,
-    MixedSettings,
-    RelativeSettings,
-    SelfTriggeredSettings,
-)
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
@@ -55,10 +45,10 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     """Return the paper's assumptions for a resolved scenario, with verdicts."""
     loop = loop_of(resolved)
     return [
-        *([_closed_loop(loop)] if resolved.is_linear else _not_linear(loop, resolved)),
+        *([_closed_loop(loop)] if resolved.coverage.is_linear else _not_linear(loop, resolved)),
         *_trigger(loop, resolved),
         *_protocol(resolved),
-        *([_unstable_and_distinct(loop.A)] if resolved.is_linear else []),
+        *([_unstable_and_distinct(loop.A)] if resolved.coverage.is_linear else []),
         _mansd(resolved),
         _continuous_time(resolved),
         *_disturbed(resolved),
@@ -95,15 +85,15 @@ def _disturbed(resolved: Scenario) -> list[Assumption]:
 
 def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     """What an observer, or noise, makes of "the sensor measures x"."""
-    if resolved.knows_state:
+    if resolved.coverage.knows_state:
         return []
     found = steady_state(resolved)
-    rms = float(np.sqrt(np.trace(found.covariance)))
+    rms, p = float(np.sqrt(np.trace(found.covariance))), resolved.message_sizes.outputs
     how = (
         "with noise"
         if resolved.observer is None
-        else f"by an observer ({resolved.observer.kind}), from y of {resolved.outputs} "
-        + ("entry" if resolved.outputs == 1 else "entries")
+        else f"by an observer ({resolved.observer.kind}), from y of {p} "
+        + ("entry" if p == 1 else "entries")
     )
     measured = Assumption(
         "the sensor measures x", "Section II", AssumptionStatus.VIOLATED,
@@ -135,7 +125,7 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
     is left of the one in the other, and three times that to be rarely beyond. With time the first
     one grows as the plant does, and every threshold is reached.
     """
-    least = least_threshold(resolved.trigger)
+    least = resolved.trigger.least_threshold
     if least is None:
         return []
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
@@ -149,27 +139,10 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
     ]  # fmt: skip
 
 
-def least_threshold(trigger: AnyTrigger) -> float | None:
-    """Below what a trigger's threshold of ‖e_s‖_W never falls; None of one that has none."""
-    match trigger:
-        case DecayingSettings() | SelfTriggeredSettings():
-            return trigger.floor
-        case AbsoluteSettings():
-            return trigger.delta
-        case RelativeSettings():
-            return 0.0
-        case MixedSettings():
-            return trigger.epsilon
-        case DeadlineSettings() | DwellSettings():
-            return least_threshold(trigger.rule)
-        case _:
-            return None
-
-
 def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
-    if resolved.is_decaying:
+    if resolved.coverage.is_decaying:
         rate = _decay_rate(loop, resolved.decaying.alpha_per_s)
-        return [rate] if resolved.is_linear else []
+        return [rate] if resolved.coverage.is_linear else []
     policy = resolved.trigger.policy
     return [
         Assumption(
@@ -262,8 +235,8 @@ def _mansd(resolved: Scenario) -> Assumption:
 
 
 def _continuous_time(resolved: Scenario) -> Assumption:
-    period_ms = 1e3 * resolved.measurement_period_ns / NS_PER_S
-    control_ms = 1e3 * resolved.controller_period_ns / NS_PER_S
+    period_ms = 1e3 * resolved.timing.measurement_period_ns / NS_PER_S
+    control_ms = 1e3 * resolved.timing.controller_period_ns / NS_PER_S
     return Assumption(
         "continuous trigger; network and input without delay",
         "Section II",

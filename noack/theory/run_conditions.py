@@ -16,8 +16,11 @@ def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkCond
     network that has no bound is taken at four times its jitter; a run that exceeds that leaves the
     conditions.
     """
-    step_ns, tick_ns = resolved.plant_period_ns, resolved.controller_period_ns
-    phase_ns, sample_ns = resolved.controller_phase_ns, step_ns * resolved.plant.measure_every
+    step_ns, tick_ns = resolved.timing.plant_period_ns, resolved.timing.controller_period_ns
+    phase_ns, sample_ns = (
+        resolved.timing.controller_phase_ns,
+        step_ns * resolved.plant.measure_every,
+    )
     # From a step back to the tick before: 0 < age ≤ tick, and age ≡ −phase modulo the gcd, all of
     # which occur sooner or later. From a measurement on to the next tick: 0 ≤ wait < tick.
     newest_ns = tick_ns - phase_ns % math.gcd(step_ns, tick_ns)

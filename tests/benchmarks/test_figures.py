@@ -12,7 +12,7 @@ from benchmarks._runs import Line, execute, first_step_s
 from benchmarks._ticks import LOOPS, Ticks
 from benchmarks.latency import Sample
 from benchmarks.lateness import Kernel
-from cosim.live.progress import account_line
+from cosim.live.progress import progress_text
 
 NAMES = (
     "demo_run", "flood", "latency", "lateness", "startup", "recovery", "machines", "plants",
@@ -110,9 +110,9 @@ def test_lateness_is_not_judged_without_sched_fifo_or_cyclictest(
 def test_the_first_step_is_bounded_by_the_promptest_progress_line() -> None:
     lines = [
         Line(100.9, "noack: something else"),
-        Line(102.0, account_line(ACCOUNT | {"t_s": 0.25}, 20.0)),
-        Line(102.2, account_line(ACCOUNT | {"t_s": 0.5}, 20.0)),  # an epoch at 101.75 or before
-        Line(103.0, account_line(ACCOUNT | {"t_s": 1.0}, 20.0)),
+        Line(102.0, progress_text(ACCOUNT | {"t_s": 0.25}, 20.0)),
+        Line(102.2, progress_text(ACCOUNT | {"t_s": 0.5}, 20.0)),  # an epoch at 101.75 or before
+        Line(103.0, progress_text(ACCOUNT | {"t_s": 1.0}, 20.0)),
     ]
     assert first_step_s(100.0, lines) == pytest.approx(1.75)
 

@@ -88,7 +88,7 @@ def _one_changed(choices: Choices, column: pa.ChunkedArray) -> Any:
         elif pa.types.is_floating(column.type):
             value = choices.real()
         elif pa.types.is_dictionary(column.type):
-            value = choices.one(["forward", "back", "up", "", "other"])
+            value = choices.one(["forward", "reverse", "up", "", "other"])
         elif isinstance(values[at], bytes):
             value = bytes(damaged(choices, values[at])).ljust(len(values[at]), b"\0")
     values[at] = value

@@ -33,7 +33,7 @@ SHORT = [*AT_RATE, *settings(speed=4.0, horizon_s=HORIZON_S)]
 F_SETPIPE_SZ = 1031
 AS_A_TERMINAL = os.environ | {"FORCE_COLOR": "1", "TERM": "dumb"}
 """That cannot redraw a line: progress comes in lines, through a pipe, too."""
-EVENTS, VOID = " s  events ", "claims that this touches are void from "
+EVENTS, VOID = " s  events ", "void (assumption violated) from "
 
 
 def run(runs: Path) -> list[str]:

@@ -125,7 +125,7 @@ def test_the_simulated_run_has_the_same_fates(live: RunRecord, simulated: RunRec
     count = min(len(live[NETEM_PACKET]), len(simulated[NETEM_PACKET]))
     assert count > 100
     # Live, updates come a little later: when they leave differs, and so who overtakes whom.
-    for column in ("sequence", "flow", "fate", "drop_run", "bit"):
+    for column in ("sequence", "flow", "fate", "consecutive_losses", "bit"):
         here, there = (record[NETEM_PACKET][column][:count] for record in (live, simulated))
         np.testing.assert_array_equal(here, there, column)
     copied = [record[NETEM_PACKET]["copy_ns"][:count] >= 0 for record in (live, simulated)]

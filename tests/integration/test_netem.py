@@ -101,7 +101,7 @@ def test_it_serves_any_udp_program(words: str, run: int, engine: str) -> None:
 def test_answers_find_back_and_have_words_of_their_own(family: int) -> None:
     host = "[::1]" if family == socket.AF_INET6 else "127.0.0.1"
     with server(family) as (there, to), client(family) as here:
-        arguments = ["--listen", f"{host}:0", "--to", to, "--back", "loss periodic 1/2"]
+        arguments = ["--listen", f"{host}:0", "--to", to, "--reverse", "loss periodic 1/2"]
         with emulator(*arguments) as (process, [port]):
             here.sendto(b"ask", (host.strip("[]"), port))
             question, asker = there.recvfrom(100)

@@ -51,7 +51,7 @@ def test_the_plant_goes_on_by_its_policy_and_the_run_says_so(start: Start) -> No
     (watchdog,) = [one for one in said if "the watchdog's" in one["text"]]
     assert watchdog["t_ns"] == acted["t_ns"][0]
     assert watchdog["text"].startswith(
-        f"claims that this touches are void from {first_s:.3f} s on: the input was "
+        f"void (assumption violated) from {first_s:.3f} s on: the input was "
     )
     # An input is too old for a certificate before it is too old for the watchdog.
     void = [one for one in summary["claims"] if one["source"] == "certificate"]

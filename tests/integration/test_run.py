@@ -102,13 +102,15 @@ def test_the_resolved_scenario_repeats_itself(record: RunRecord, finished: Finis
 
 def test_every_sample_is_there(record: RunRecord) -> None:
     scenario = record.scenario
-    steps = scenario.horizon_ns // scenario.plant_period_ns + 1
+    steps = scenario.timing.horizon_ns // scenario.timing.plant_period_ns + 1
     plant, sensor = record["plant_step"], record["sensor_measurement"]
-    assert np.array_equal(plant["t_ns"], np.arange(steps) * scenario.plant_period_ns)
+    assert np.array_equal(plant["t_ns"], np.arange(steps) * scenario.timing.plant_period_ns)
     every = scenario.plant.measure_every
     assert np.array_equal(sensor["t_ns"], plant["t_ns"][::every])
     assert np.array_equal(sensor["x"], plant["x"][::every])
-    ticks = (scenario.horizon_ns - scenario.controller_phase_ns) // scenario.controller_period_ns
+    ticks = (
+        scenario.timing.horizon_ns - scenario.timing.controller_phase_ns
+    ) // scenario.timing.controller_period_ns
     assert len(record["controller_step"]) == ticks + 1
 
 
@@ -123,7 +125,7 @@ def test_datagrams_flow_only_the_way_the_picture_says(record: RunRecord) -> None
 
 
 def test_the_plant_moves_exactly_as_its_held_input_says(record: RunRecord) -> None:
-    loop, h_s = record.loop, record.scenario.plant_period_ns * 1e-9
+    loop, h_s = record.loop, record.scenario.timing.plant_period_ns * 1e-9
     n, m = loop.n, loop.m
     both = expm(np.block([[loop.A, loop.B], [np.zeros((m, n + m))]]) * h_s)
     x, u = record["plant_step"]["x"], record["plant_step"]["u"]
@@ -168,7 +170,7 @@ def test_x_c_is_reset_only_at_deliveries(record: RunRecord) -> None:
         late_s = (delivery["model_t_ns"] - delivery["t_ns"]) * 1e-9
         assert late_s >= 0
         assert np.allclose(delivery["x_c"], expm(loop.H * late_s) @ delivery["x"], atol=1e-12)
-    period_ns = record.scenario.controller_period_ns
+    period_ns = record.scenario.timing.controller_period_ns
     untouched = np.diff(steps["input"]) == 1  # no delivery between two ticks
     # One before a late tick may have taken the model's time further than that.
     untouched &= np.diff(steps["model_t_ns"]) == period_ns
@@ -205,7 +207,7 @@ def test_no_more_than_mansd_successive_packets_are_lost(record: RunRecord) -> No
         run = run + 1 if fate == Fate.DROPPED else 0
         longest = max(longest, run)
     assert 0 < longest <= mansd
-    assert longest == record["netem_packet"]["drop_run"].max()
+    assert longest == record["netem_packet"]["consecutive_losses"].max()
 
 
 def test_the_fates_depend_on_the_seed_only(record: RunRecord) -> None:

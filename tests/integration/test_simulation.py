@@ -38,7 +38,7 @@ SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
     PLANT_ACTUATION: ("input", "sequence", "t_ns"),
     SENSOR_MEASUREMENT: ("input", "sequence", "t_ns", "event"),
-    NETEM_PACKET: ("input", "sequence", "flow", "fate", "drop_run", "size_bytes"),
+    NETEM_PACKET: ("input", "sequence", "flow", "fate", "consecutive_losses", "size_bytes"),
     CONTROLLER_STEP: ("input", "sequence", "t_ns", "model_t_ns"),
     CONTROLLER_DELIVERY: ("input", "sequence", "t_ns", "model_t_ns", "dropouts"),
 }
@@ -57,7 +57,7 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
     The plant and the controller have two kinds of input each, and only their order is a race; it
     shows in the ``input`` numbers. The plant's held actuation shows what got through in time.
     """
-    first_ns = simulated.scenario.horizon_ns + 1
+    first_ns = simulated.scenario.timing.horizon_ns + 1
     for table, columns in (
         (PLANT_STEP, ("input", "actuation")),
         (CONTROLLER_STEP, ("input",)),
@@ -111,6 +111,6 @@ def compare(live: RunRecord, simulated: RunRecord, until_ns: int) -> None:
             )
         compared += len(rows)
     assert until_ns < ENOUGH_S * 1e9 or compared > 60
-    if until_ns > simulated.scenario.horizon_ns:
+    if until_ns > simulated.scenario.timing.horizon_ns:
         for table in SAME:
             assert len(live[table]) == len(simulated[table]), table

@@ -244,7 +244,7 @@ def test_packets_are_numbered_by_flow_and_losses_counted_by_flow() -> None:
     found = [rows_of(link.handle(Datagram(flow, b""), 0))[0] for flow in (0, 0, 1, 0, 1, 1, 0)]
     assert [row["input"] for row in found] == list(range(7))
     assert [row["sequence"] for row in found] == [0, 1, 0, 2, 1, 2, 3]
-    assert [row["drop_run"] for row in found] == [0, 1, 0, 2, 1, 2, 0]
+    assert [row["consecutive_losses"] for row in found] == [0, 1, 0, 2, 1, 2, 0]
     forced = [row["fate"] == Fate.FORCED for row in found]
     assert forced == [True, False, True, False, False, False, True]
 

@@ -7,11 +7,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.stats import kstest
 
-from noack.config.disturbances import GaussianDisturbance, StepDisturbance, UniformDisturbance
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
 from noack.core.random_streams import normals
+from noack.disturbances.gaussian import GaussianDisturbance
+from noack.disturbances.step import StepDisturbance
+from noack.disturbances.uniform import UniformDisturbance
 from noack.protocol.machine_interface import Record
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import disturbance_of
@@ -45,7 +47,7 @@ def steps_of(plant: Plant, scenario: Scenario, count: int) -> tuple[Any, list[Me
     rows, sent = [], []
     for k in range(count):
         plant.handle(Message(Flow.ACTUATION, k, 0, np.array([np.sin(0.1 * k)])), 0)
-        for out in plant.on_timer(k * scenario.plant_period_ns):
+        for out in plant.on_timer(k * scenario.timing.plant_period_ns):
             if isinstance(out, Record):
                 rows.append(out.row)
             elif isinstance(out, Message):

@@ -156,5 +156,5 @@ def test_what_an_actuation_carried_is_on_record() -> None:
 def test_by_default_fifty_periods_of_the_controller_are_allowed() -> None:
     plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
     resolved = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
-    assert resolved.actuation_timeout_ns == 250 * MS
+    assert resolved.timing.actuation_timeout_ns == 250 * MS
     assert resolved.plant.watchdog.policy == "hold"

@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
-from noack.config.observability import observer_gain, unseen_mode
 from noack.config.resolution import resolve, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import validate
-from noack.config.state_estimation import EstimationModel, believed_model, steady_state, true_model
+from noack.config.state_estimation import assumed_model, steady_state, true_model
 from noack.core.linear_systems import Matrix, Vector, discretise
+from noack.observers.estimation_model import EstimationModel
+from noack.observers.kalman import KalmanObserver
+from noack.observers.luenberger import LuenbergerObserver
+from noack.observers.observability import observer_gain, unobservable_mode
 from noack.protocol.machine_interface import Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
+from sensor_node.observing_sensor import AppliedInputTracker
 from sensor_node.sensor import sensor_of
-from sensor_node.state_observer import AppliedInputTracker, KalmanObserver, LuenbergerObserver
 
 A = np.array([[0.0, 1.0], [4.0, -0.3]])
 B = np.array([[0.0], [1.5]])
@@ -29,7 +32,8 @@ R = np.array([[0.03]])
 
 def model(steps: int = 1) -> EstimationModel:
     Ad, Bd = discretise(A, B, H_NS)
-    return EstimationModel(Ad, Bd, C, Q, R, steps)
+    _, Gd = discretise(A, np.eye(2), H_NS)
+    return EstimationModel(Ad, Bd, Gd, C, Q, R, steps)
 
 
 @pytest.fixture
@@ -139,9 +143,9 @@ def test_complex_poles_and_more_outputs_are_placed_as_well() -> None:
 
 def test_what_does_not_show_is_told_by_its_eigenvalue() -> None:
     Ad = np.diag([1.5, 0.5, 0.9])
-    assert unseen_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
-    assert unseen_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
-    assert unseen_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
+    assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
+    assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
+    assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
 
 
 def test_missing_measurements_are_bridged_by_the_first_input_that_is_known() -> None:
@@ -168,7 +172,7 @@ def test_the_trigger_works_on_the_estimate_and_the_update_carries_it(
         outputs = sensor.handle(measurement(k, t_ns, [y, u]), t_ns)
         (record,) = [one for one in outputs if isinstance(one, Record)]
         row = np.array([record.row], types)[0]
-        assert (row["y"].tolist(), row["u_felt"].tolist()) == ([y], [u])
+        assert (row["y"].tolist(), row["u_applied"].tolist()) == ([y], [u])
         # The sensor that measures the state itself does with x̂ what this one does.
         expected = alone.handle(measurement(k, t_ns, row["x"].tolist()), t_ns)
         for mine, others in zip(outputs, expected, strict=True):
@@ -199,7 +203,7 @@ def test_a_sensor_that_is_started_anew_begins_its_observer_anew_and_says_so(
     t_ns, y, u = 400_000_000, 0.7, 0.1
     again = sensor_of(scenario, Start(1, t_ns)).handle(measurement(40, t_ns, [y, u]), t_ns)
     (notice,) = [one for one in again if isinstance(one, Notice)]
-    assert notice.text == "the observer begins anew, from its initial estimate"
+    assert notice.text == "the observer restarts from its initial estimate"
     # From x̂ = 0 and P(0) = I: y weighs P/(P + R), and says nothing of the velocity.
     np.testing.assert_allclose(estimates(again), [y / (1 + 1e-4), 0.0], rtol=1e-12)
     first = sensor_of(scenario).handle(measurement(0, 0, [y, 0.0]), 0)
@@ -217,13 +221,13 @@ def test_what_the_filter_is_not_told_it_takes_from_the_scenario(observed: dict[s
     ]
     del observed["observer"]["input_std"]
     scenario = resolved(observed)
-    believed, h = believed_model(scenario), 0.01
+    believed, h = assumed_model(scenario), 0.01
     into = np.array([h**2 / 2, h])  # the double integrator's, of a held input
     expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
     np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
     assert believed.R.tolist() == [[0.01**2]]
     observed["observer"] |= {"process_std": [0.0, 0.0], "input_std": [1.0], "noise_std": [0.5]}
-    told = believed_model(resolved(observed))
+    told = assumed_model(resolved(observed))
     np.testing.assert_allclose(told.Q, np.outer(into, into), rtol=1e-9)
     assert told.R.tolist() == [[0.25]]
     np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)

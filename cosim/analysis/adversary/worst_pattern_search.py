@@ -60,7 +60,7 @@ def find_worst(
     certificate: ScenarioCertificate | None = None,
     report: SearchReport = lambda what, nodes, value: None,
 ) -> Worst:
-    """Find the pattern, with at most M − 1 updates lost in a row, that is worst for the loop.
+    """Find the pattern, with at most M − 1 consecutive updates lost, that is worst for the loop.
 
     The loop is the paper's, in exact continuous time on an instant network, from a delivered start.
     The same arguments give the same result.

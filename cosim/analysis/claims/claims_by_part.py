@@ -1,13 +1,12 @@
-"""The claims about a run whose settings are changed while it goes on.
+"""The claims about a run whose settings change during the run.
 
-What is claimed at the start is so up to the change. What follows is judged as a run of its own, in
-deviations from the set-point, whose time begins with the first event after the change whose update
-the controller has: there x_s = x, and x_c is reset to it. In between nothing is claimed.
+The claims at the start end at the first change. What follows is checked as a run of its own, in
+deviations from the set-point. Its time begins with the first event after the change whose update
+the controller received: there x_s = x, and x_c is reset to it. Nothing is claimed in between.
 
-Such a run begins with another input than none. Until the plant feels the first update, u is what
-the controller's older knowledge made of it; how far from Kx that was is on record, and a
-certificate holds if it is of input errors no smaller than that
-(:class:`noack.theory.scenario_certificates.CertificateScope`).
+Such a run begins with an input of the run before: until the plant applies the first input of this
+part, u was computed from older updates. ‖u − Kx‖ is on record, and the certificate holds if it
+covers input errors of that size (:class:`noack.theory.scenario_certificates.CertificateScope`).
 """
 
 import math
@@ -17,21 +16,16 @@ from functools import cached_property
 
 import numpy as np
 
-from cosim.analysis.claims.claim_evaluation import (
-    Claim,
-    ClaimEvaluation,
-    ClaimVerdict,
-    Envelope,
-    RunPart,
-)
+from cosim.analysis.claims.claim import Claim, Envelope, void_claim
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
-from cosim.analysis.claims.observed_conditions import Left
+from cosim.analysis.claims.observed_conditions import VoidFrom, earliest
+from cosim.analysis.claims.run_evidence import RunPart
 from cosim.record.recorded_changes import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.runtime_parameters import text_of
 from noack.config.scenario import Scenario
-from noack.config.triggers import DecayingSettings
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
 from noack.protocol.record_tables import (
@@ -43,17 +37,18 @@ from noack.protocol.record_tables import (
     SETTINGS,
 )
 from noack.theory.scenario_certificates import BOX, OWN_PLANT
+from noack.trigger.decaying import DecayingSettings
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")
 _LEAST_BETA = 1e-300
 _AT_REST = 1e-9
-"""Of the larger term: what A x_r + B u_r may differ from 0 by for the plant to rest there."""
+"""A plant rests at the set-point if |A x_r + B u_r| is at most this share of its larger term."""
 
 
 @dataclass(frozen=True)
 class RunClaims:
-    """The claims about a run, part by part; computed when asked for, and once.
+    """The claims about a run, part by part; each property is computed once.
 
     Args:
         record: the run's record.
@@ -67,7 +62,7 @@ class RunClaims:
 
     @property
     def judged_until_s(self) -> float | None:
-        """Up to when a run that was stopped is judged; None if it is judged to its end."""
+        """The claims about a stopped run end here; None: they are checked to its end."""
         end_ns = common_end_ns(self.record)
         return None if end_ns is None else end_ns / NS_PER_S
 
@@ -77,7 +72,7 @@ class RunClaims:
 
     @cached_property
     def parts(self) -> list[ClaimEvaluation | Claim]:
-        """The claims of each part; where nothing can be claimed, the word on it."""
+        """The claims of each part; for a part without claims, the reason as a void claim."""
         record, changes = self._judged, self._changes
         at_0 = setpoint_of(record.scenario)
         if not changes and at_0 is None:
@@ -97,17 +92,16 @@ class RunClaims:
         return ClaimEvaluation(self._judged).conditions
 
     @property
-    def beyond_mansd(self) -> Left:
-        """When more than M − 1 updates in a row had been lost, whoever lost them."""
-        if not self._changes:
-            return ClaimEvaluation(self._judged).beyond_mansd
-        found: list[Left] = []
+    def mansd_violation(self) -> VoidFrom | None:
+        """When more than M − 1 consecutive updates had been lost, for whatever reason."""
+        found: list[VoidFrom | None] = []
         for one in self.parts:
-            if isinstance(one, ClaimEvaluation) and one.part is not None:
-                left = one.beyond_mansd
-                if left is not None and left[0] < one.part.until_s:
-                    found.append((left[0] + one.part.from_s, left[1]))
-        return min(filter(None, found), default=None)
+            if isinstance(one, Claim) or (void := one.mansd_violation) is None:
+                continue
+            if void.t_s < one.until_s:
+                from_s = 0.0 if one.part is None else one.part.from_s
+                found.append(void._replace(t_s=void.t_s + from_s))
+        return earliest(found)
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict, in the run's time."""
@@ -128,7 +122,7 @@ class RunClaims:
         return found
 
     def envelopes(self) -> list[Envelope]:
-        """The certified curves, at the measurements, each over the part that it is of."""
+        """The curves of all bounds, each over its own part of the run."""
         found: list[Envelope] = []
         for one in self.parts:
             if isinstance(one, Claim):
@@ -136,43 +130,40 @@ class RunClaims:
             if one.part is None:
                 return one.envelopes()
             if setpoint_of(self._judged.scenario) is not None or one.part.from_s > 0:
-                # In deviations from another set-point, or with other constants.
+                # Its bounds are of deviations from another set-point, or begin later.
                 continue
             found += [_until(envelope, one.part.until_s) for envelope in one.envelopes()]
         return found
 
     def _after(self, made: RecordedChange, until_ns: int) -> ClaimEvaluation | Claim:
-        """The claims of the run of its own that follows a change."""
-        record, text = self._judged, text_of(made.change.settings)
-        at_s, end_s = made.first_ns / NS_PER_S, until_ns / NS_PER_S
-        late_ns = made.everywhere_ns
+        """The claims about the part of the run that follows a change."""
+        record = self._judged
         deliveries = record[CONTROLLER_DELIVERY]
-        after = deliveries[deliveries["t_ns"] >= late_ns]
-        sensor = record[SENSOR_MEASUREMENT]
-        after = after[np.isin(after["sequence"], sensor["event"])]
-        why = f"changed at {at_s:.3f} s: {text}; "
-        if late_ns == NEVER_NS:
-            why += "not every process heard of it"
-        elif not len(after) or after["t_ns"][0] >= until_ns:
-            why += "no update was delivered after it" + (
-                "" if until_ns == NEVER_NS else f", up to {end_s:.3f} s"
-            )
-        else:
-            origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
-            own = _part_of(record, made.scenario, origin_ns, sequence)
-            part = RunPart(
-                record,
-                origin_ns / NS_PER_S,
-                _seconds(until_ns) - origin_ns / NS_PER_S,
-                _start_error(own, ClaimEvaluation(own).started_s),
-                _void(record, made.scenario),
-            )
-            return ClaimEvaluation(own, part)
-        until_s = None if until_ns == NEVER_NS else end_s
-        return Claim(
-            "what is claimed after a change", "claims", "none", None, None, None,
-            ClaimVerdict.VOID, at_s, why, at_s, until_s,
-        )  # fmt: skip
+        after = deliveries[deliveries["t_ns"] >= made.everywhere_ns]
+        after = after[np.isin(after["sequence"], record[SENSOR_MEASUREMENT]["event"])]
+        if made.everywhere_ns == NEVER_NS:
+            return _nothing_after(made, until_ns, "not every process received the change")
+        if not len(after) or after["t_ns"][0] >= until_ns:
+            up_to = "" if until_ns == NEVER_NS else f", up to {until_ns / NS_PER_S:.3f} s"
+            return _nothing_after(made, until_ns, f"no update was delivered after it{up_to}")
+        origin_ns, sequence = int(after["t_ns"][0]), int(after["sequence"][0])
+        own = _part_of(record, made.scenario, origin_ns, sequence)
+        part = RunPart(
+            record,
+            origin_ns / NS_PER_S,
+            _seconds(until_ns) - origin_ns / NS_PER_S,
+            _start_error(own, ClaimEvaluation(own).started_s),
+            _void(record, made.scenario),
+        )
+        return ClaimEvaluation(own, part)
+
+
+def _nothing_after(made: RecordedChange, until_ns: int, why: str) -> Claim:
+    """A void claim for the part after a change, which says why there are no claims."""
+    at_s, text = made.first_ns / NS_PER_S, text_of(made.change.settings)
+    until_s = None if until_ns == NEVER_NS else until_ns / NS_PER_S
+    why = f"changed at {at_s:.3f} s: {text}; {why}"
+    return void_claim("claims after a change", "claims", at_s, why, until_s)
 
 
 def _seconds(t_ns: int) -> float:
@@ -190,13 +181,13 @@ def _until(envelope: Envelope, until_s: float) -> Envelope:
 def _part_of(
     record: RunRecord, scenario: Scenario, origin_ns: int, sequence: int | None
 ) -> RunRecord:
-    """Return what follows an event as the record of a run of its own.
+    """Return the part of a run that follows an event, as the record of a run of its own.
 
     Args:
         record: the run's record.
-        scenario: of the part, in the run's time.
-        origin_ns: time of the event, from which time counts.
-        sequence: its number; None for the start of the run.
+        scenario: the scenario of the part.
+        origin_ns: time of the event, which becomes time 0.
+        sequence: number of the event; None for the start of the run.
     """
     setpoint = setpoint_of(scenario)
     loop = loop_of(scenario)
@@ -214,7 +205,7 @@ def _part_of(
             kept = kept[kept["sequence"] >= sequence]
         rows[table] = _shifted(kept, origin_ns, x_r, u_r)
     sensor = rows[SENSOR_MEASUREMENT]
-    if sequence is not None and len(sensor):  # what was before the reset is of the run before
+    if sequence is not None and len(sensor):  # before the reset it was of the part before
         sensor["x_s"][0] = sensor["x"][0]
         sensor["e_s_norm"][0] = sensor["compared"][0] = 0.0
         rows[CONTROLLER_DELIVERY]["dropouts"][:1] = 0
@@ -248,16 +239,16 @@ def _shifted(rows: Rows, origin_ns: int, x_r: Vector, u_r: Vector) -> Rows:
 
 
 def _start_error(own: RunRecord, started_s: float) -> float:
-    """sup‖u − Kx‖ e^{αt} over the steps until the plant felt the first update.
+    """sup‖u − Kx‖ e^{αt} over the steps until the plant applied the first input of the part.
 
-    Within a step, in which u is held, ‖u − Kx‖ is no more than at the worse of its ends, and what x
-    may bend in between: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
+    u is held within a step, so ‖u − Kx‖ is at most its larger value at both ends plus the curvature
+    of x in between: Δt²/8 sup‖K A ẋ‖, with ẋ = e^{As}(Ax + Bu).
     """
     loop, steps = own.loop, own[PLANT_STEP]
     steps = steps[: int(np.searchsorted(steps["t_ns"] * 1e-9, started_s)) + 1]
     if len(steps) < 2:
         return 0.0
-    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.plant_period_ns * 1e-9
+    x, u, dt_s = steps["x"], steps["u"][:-1], own.scenario.timing.plant_period_ns * 1e-9
     ends = np.maximum(row_norms(u - x[:-1] @ loop.K.T), row_norms(u - x[1:] @ loop.K.T))
     speed = x[:-1] @ loop.A.T + u @ loop.B.T
     grown = math.exp(min(float(np.linalg.norm(loop.A, 2)) * dt_s, 700.0))
@@ -268,9 +259,9 @@ def _start_error(own: RunRecord, started_s: float) -> float:
 
 
 def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
-    """Why nothing is certified at a scenario's set-point, by scope: a plant may not rest there."""
+    """By scope: why there is no certificate at a set-point, where the plant may not rest."""
     setpoint = setpoint_of(scenario)
-    if setpoint is None or not scenario.is_linear:
+    if setpoint is None or not scenario.coverage.is_linear:
         return {}
     x_r, u_r = setpoint
     loop, plant = record.loop, scenario.plant
@@ -278,8 +269,8 @@ def _void(record: RunRecord, scenario: Scenario) -> Mapping[str, str]:
     largest = max(float(np.abs(drift).max()), float(np.abs(loop.A).max() * np.abs(x_r).max()))
     if float(np.abs(drift + push).max()) > _AT_REST * largest:
         why = (
-            "the plant does not rest at the set-point as the model does, A x_r + B u_r ≠ 0: a "
-            "constant disturbance, of which a certificate knows nothing"
+            "the plant does not rest at the set-point as the model does (A x_r + B u_r ≠ 0); a "
+            "certificate does not cover this constant disturbance"
         )
         return {OWN_PLANT: why, BOX: why}
     half_A, half_B = plant.uncertainty_A, plant.uncertainty_B

@@ -1,7 +1,7 @@
-"""Up to when all processes of a run took part in it, and the record of the run up to there.
+"""The common end of a stopped run: the time up to which all its processes took part.
 
-The processes of a run that is stopped end some milliseconds apart. What one of them does without
-the others is not the loop's doing, so claims and their conditions are judged up to the common time.
+The processes of a stopped run end some milliseconds apart. Claims and conditions are checked up to
+the common end only, because the loop is incomplete after it.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 _PACES = {
     "plant": (PLANT_STEP, "t_ns"),
@@ -23,13 +23,13 @@ _PACES = {
     "netem": (NETEM_PACKET, "now_ns"),
     "controller": (CONTROLLER_STEP, "t_ns"),
 }
-"""The table and column by which each process's rows are put into the order of the run's time."""
+"""By process: the table and column with the times of its steps."""
 
 
 def common_end_ns(record: RunRecord) -> int | None:
-    """The time up to which every process of a stopped run had done what was due.
+    """The time that every process of a stopped run had reached.
 
-    None if the run was not stopped, or if a process left no word of how far it had come.
+    None if the run was not stopped, or if a process did not report its time.
     """
     reports = [record.reports.get(role, {}) for role in LOOP_ROLES]
     if all(report.get("ended") == HORIZON for report in reports):
@@ -39,14 +39,14 @@ def common_end_ns(record: RunRecord) -> int | None:
     measured_ns = record[SENSOR_MEASUREMENT]["t_ns"]
     if len(known_ns) < len(reports) or not len(measured_ns):
         return None
-    # A sensor has no deadlines of its own: it has come as far as it was sent measurements.
+    # A sensor has no deadlines of its own: its time is that of its last measurement.
     return int(min(*known_ns, measured_ns[-1]))
 
 
 def up_to_common_end(record: RunRecord) -> RunRecord:
     """Return the record of a run up to its common end; the record itself if it has none.
 
-    Of each process the rows are kept that precede its first one beyond that time, in all tables.
+    The rows of each process are cut at its first row beyond that time, in all tables.
     """
     end_ns = common_end_ns(record)
     if end_ns is None:

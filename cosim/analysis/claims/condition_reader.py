@@ -1,8 +1,9 @@
-"""Reads the conditions of a run off its rows, as they come in or all at once.
+"""Reads the conditions of a run from its rows: batch by batch during the run, or all at once.
 
-Each process's rows come in their order, but one process's may come long after another's. What
-depends on rows that are still to come waits for them. Only :meth:`ConditionReader.end` says that
-there are none, and that what is not known is late. Only what waits is kept.
+The rows of one process arrive in order; those of different processes may be far apart. A row that
+depends on rows of another process waits for them, and only waiting rows are kept.
+:meth:`ConditionReader.end` closes the run: updates and inputs that are still missing then count as
+late.
 """
 
 from collections import deque
@@ -38,13 +39,13 @@ _Batches = list[tuple[NDArray[Any], ...]]
 """Columns of rows that wait, batch by batch."""
 
 _KEPT_TICKS = 512
-"""A process hands over its tables one after the other, up to 256 rows of each."""
+"""A process sends its tables one after the other, up to 256 rows of each."""
 _NEVER = 2**63 - 1
 _NO_TIMES: Times = np.zeros(0, np.int64)
 
 
 def read_conditions(record: RunRecord) -> ObservedConditions:
-    """Read the conditions off the record of a run, complete or not: what is not known is late."""
+    """Read the conditions from the record of a run; what an incomplete record lacks is late."""
     observer = ConditionReader(record.scenario)
     for table in record.tables:
         observer.take(table, record[table])
@@ -52,14 +53,14 @@ def read_conditions(record: RunRecord) -> ObservedConditions:
 
 
 class ConditionReader:
-    """Finds out under which conditions a run takes place.
+    """Determines the conditions under which a run takes place.
 
     Args:
         scenario: the resolved scenario.
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        self._timeout_s = scenario.actuation_timeout_ns / NS_PER_S
+        self._timeout_s = scenario.timing.actuation_timeout_ns / NS_PER_S
         self._gaps = _Gaps()
         self._sensors = _Sensors()
         self._ticks = _Ticks()
@@ -75,24 +76,25 @@ class ConditionReader:
         }
 
     def take(self, table: str, rows: Rows) -> None:
-        """Take rows that follow those of the table that were taken before."""
+        """Add rows of a table, in their order."""
         if len(rows) and table in self._takes:
             self._takes[table](rows)
 
     def observed(self) -> ObservedConditions:
-        """What has been found out since it was asked for last.
+        """What became known since the last call.
 
-        As long as the plant has not felt the controller, ``start_s`` is how far that is known.
+        Until the plant has applied an input of the controller, ``start_s`` is the time up to which
+        it is known that it has not.
         """
         return self._observed(None)
 
     def end(self) -> ObservedConditions:
-        """The rest of it; no more rows come."""
+        """What was still waiting; no more rows come."""
         return self._observed(max(self._inputs.newest_ns, self._gaps.newest_ns))
 
     @property
     def waiting(self) -> int:
-        """How many things wait for rows that are still to come."""
+        """How many rows wait for others."""
         return self._inputs.waiting + self._ticks.waiting + self._updates.waiting
 
     def _measured(self, rows: Rows) -> None:
@@ -103,13 +105,14 @@ class ConditionReader:
 
     def _observed(self, end_ns: int | None) -> ObservedConditions:
         ended = end_ns is not None
-        self._inputs.learn(self._ticks.told(ended=ended), self._ticks.newest, ended=ended)
-        hold, watchdog, safe_input = self._inputs.judged(ended=ended)
-        self._updates.deliveries(self._inputs.applied_input(ended=ended))
+        receipts = self._ticks.receipts(ended=ended)
+        self._inputs.add_receipts(receipts, self._ticks.newest, ended=ended)
+        hold, watchdog, safe_input = self._inputs.classified(ended=ended)
+        self._updates.add_applied(self._inputs.applied(ended=ended))
         start_s = self._inputs.start_ns * 1e-9 if self._inputs.started else np.inf
         losses, delay = self._updates.resolved(start_s, end_ns)
         if not self._inputs.started and not ended:
-            start_s = self._inputs.judged_ns * 1e-9
+            start_s = self._inputs.classified_ns * 1e-9
         return ObservedConditions(
             losses, self._gaps.gaps(end_ns), delay, hold, start_s, watchdog, safe_input,
             self._sensors.restarts(), self._timeout_s,
@@ -117,7 +120,7 @@ class ConditionReader:
 
 
 class _Gaps:
-    """Times between measurements, from the start and to the end, too."""
+    """Times between measurements, including those after the start and before the end."""
 
     def __init__(self) -> None:
         self._times: list[Times] = []
@@ -139,7 +142,7 @@ class _Gaps:
 
 
 class _Sensors:
-    """When a sensor took another's place."""
+    """When a sensor was restarted."""
 
     def __init__(self) -> None:
         self._newest = 0
@@ -157,18 +160,18 @@ class _Sensors:
         return SampledSeries(t_ns * 1e-9, of * 1.0)
 
 
-class _Told(NamedTuple):
-    """Updates that the controller took."""
+class _Receipts(NamedTuple):
+    """Updates that the controller received."""
 
     sequence: Times
     model_ns: Times
-    """When its model had it."""
+    """Model time of the reset."""
     tick: Times
-    """The first tick that knew of it."""
+    """The first tick computed with the update."""
 
 
 class _Ticks:
-    """Finds the tick that first knew of each update."""
+    """Finds the first tick computed with each update."""
 
     def __init__(self) -> None:
         self._ticks: _Batches = []
@@ -186,8 +189,8 @@ class _Ticks:
     def waiting(self) -> int:
         return sum(len(inputs) for inputs, *_ in self._taken)
 
-    def told(self, *, ended: bool) -> _Told:
-        """What became known since the last time; at the end, also what no tick knew of."""
+    def receipts(self, *, ended: bool) -> _Receipts:
+        """Updates whose tick became known; at the end, also those without a tick."""
         inputs, ticks = _columns(self._ticks, 2)
         taken, sequence, model_ns = _columns(self._taken, 3)
         first = np.searchsorted(inputs, taken, "right")
@@ -195,31 +198,31 @@ class _Ticks:
         self._taken = [(taken[known:], sequence[known:], model_ns[known:])]
         self._ticks = [(inputs[-_KEPT_TICKS:], ticks[-_KEPT_TICKS:])]
         tick = np.append(ticks, _NEVER)[first[:known]]
-        # What a controller took that died before its next tick, its successor does not know.
+        # A controller that died before its next tick: a restarted one does not have the update.
         of = taken[:known] // GENERATION
         kept = (tick == _NEVER) | (tick // GENERATION == of)
-        return _Told(sequence[:known][kept], model_ns[:known][kept], tick[kept])
+        return _Receipts(sequence[:known][kept], model_ns[:known][kept], tick[kept])
 
 
 class _Inputs:
-    """What the plant's inputs rest on, step by step."""
+    """The origin of the plant's inputs, step by step."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._period_ns = scenario.plant_period_ns
-        self._timeout_ns = scenario.actuation_timeout_ns
+        self._period_ns = scenario.timing.plant_period_ns
+        self._timeout_ns = scenario.timing.actuation_timeout_ns
         self._replaces = scenario.plant.watchdog.policy != "hold"
         known = scenario.network.initial_sync == "known_state"
-        self._knowing: dict[int, int] = {0: 0} if known else {}
-        """Of each generation of the controller, the first tick that knew a state."""
+        self._first_state: dict[int, int] = {0: 0} if known else {}
+        """By generation of the controller: its first tick with a state."""
         self._ticked = NO_SEQUENCE
         self._steps: _Batches = []
         self._actuations: _Batches = []
         self._received = NO_SEQUENCE
         self._latched = NO_SEQUENCE
         self._latches: _Batches = []
-        self._told: _Batches = []
+        self._receipts: _Batches = []
         self.newest_ns = 0
-        self.judged_ns = 0
+        self.classified_ns = 0
         self.start_ns = 0
         self.started = False
 
@@ -235,87 +238,91 @@ class _Inputs:
 
     @property
     def waiting(self) -> int:
-        held = (self._steps, self._latches, self._told)
+        held = (self._steps, self._latches, self._receipts)
         return sum(len(batch[0]) for batches in held for batch in batches)
 
-    def learn(self, told: _Told, ticked: int, *, ended: bool) -> None:
-        """Take what became known of the controller: updates, and its newest tick."""
-        for tick in told.tick[np.diff(told.tick // GENERATION, prepend=-1) > 0].tolist():
-            self._knowing.setdefault(tick // GENERATION, tick)
-        self._told.append(told)
+    def add_receipts(self, receipts: _Receipts, ticked: int, *, ended: bool) -> None:
+        """Add updates that the controller received, and the number of its newest tick."""
+        ticks = receipts.tick
+        for tick in ticks[np.diff(ticks // GENERATION, prepend=-1) > 0].tolist():
+            self._first_state.setdefault(tick // GENERATION, tick)
+        self._receipts.append(receipts)
         self._ticked = _NEVER if ended else ticked
 
-    def judged(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
-        """Of the steps that can be judged: ages of inputs, of what the watchdog replaced, and
-        sizes of safe inputs."""  # noqa: D205, D209
+    def classified(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
+        """Classify the steps whose input is known.
+
+        Returns:
+            Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
+        """
         t_ns, newest, sizes = _columns(self._steps, 3)
         ready = newest <= (_NEVER if ended else self._received)
-        ready &= (newest <= self._ticked) | (self._knows_from(newest) < _NEVER)
+        ready &= (newest <= self._ticked) | (self._first_with_state(newest) < _NEVER)
         count = int(np.minimum.accumulate(ready).sum())
         self._steps = [(t_ns[count:], newest[count:], sizes[count:])]
         t_ns, newest, sizes = t_ns[:count], newest[:count], sizes[:count]
         model_ns = self._model_ns(newest)
         highest = np.maximum.accumulate(np.append(self._latched, newest))
         there = newest != NO_SEQUENCE
-        feels = there & (highest[1:] >= self._knows_from(highest[1:]))
-        began = np.logical_or.accumulate(np.append(self.started, feels))[:-1]
+        controlled = there & (highest[1:] >= self._first_with_state(highest[1:]))
+        began = np.logical_or.accumulate(np.append(self.started, controlled))[:-1]
         if count:
-            self.judged_ns = int(t_ns[-1])
+            self.classified_ns = int(t_ns[-1])
             rises = np.diff(highest) > 0
             self._latches.append((highest[1:][rises], t_ns[rises]))
             self._latched = int(highest[-1])
-        if not self.started and feels.any():
-            self.started, self.start_ns = True, int(t_ns[np.argmax(feels)])
-        # A plant that is late latches what is of its future.
+        if not self.started and controlled.any():
+            self.started, self.start_ns = True, int(t_ns[np.argmax(controlled)])
+        # A late plant may latch an input whose model time is ahead of the step.
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
-        replaced = feels & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
-        # Before the plant has felt the controller, no input is what is presupposed.
-        safe = there & ~feels & (began | ~(sizes == 0))
-        step_s, kept = t_ns * 1e-9, feels & ~replaced
+        replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
+        # Until the first input with a state, the certificates assume that the input is 0.
+        safe = there & ~controlled & (began | ~(sizes == 0))
+        step_s, kept = t_ns * 1e-9, controlled & ~replaced
         return (
             SampledSeries(step_s[kept], age_ns[kept] * 1e-9),
             SampledSeries(step_s[replaced], (t_ns - model_ns)[replaced] * 1e-9),
             SampledSeries(step_s[safe], sizes[safe]),
         )
 
-    def _knows_from(self, ticks: Times) -> Times:
-        """The first tick, of the same generation of the controller, that knew a state."""
+    def _first_with_state(self, ticks: Times) -> Times:
+        """The first tick with a state, of the same generation of the controller."""
         of, which = np.unique(ticks // GENERATION, return_inverse=True)
-        first = [self._knowing.get(number, _NEVER) for number in of.tolist()]
+        first = [self._first_state.get(number, _NEVER) for number in of.tolist()]
         return np.array(first, dtype=np.int64)[which]
 
     def _model_ns(self, newest: Times) -> Times:
-        """Time of the model behind each actuation; of one that is not on record, 0."""
+        """Model time of each actuation; 0 for one that is not on record."""
         sequence, t_ns = _columns(self._actuations, 2)
         found = np.searchsorted(sequence, newest)
         there = np.append(sequence, NO_SEQUENCE)[found] == newest
         model_ns = np.where(there & (newest != NO_SEQUENCE), np.append(t_ns, 0)[found], 0)
-        # A step that is still to come has the newest of these, or one that is still to come.
+        # A later step has the newest of these actuations, or a later one.
         used = int(np.searchsorted(sequence, newest[-1])) if len(newest) else 0
         self._actuations = [(sequence[used:], t_ns[used:])]
         return model_ns
 
-    def applied_input(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
-        """Updates that the plant felt since the last time, in order.
+    def applied(self, *, ended: bool) -> list[tuple[int, int, int | None]]:
+        """Updates that took effect on the plant since the last call, in order.
 
         Returns:
-            Sequence number, when the controller's model had it, and when the plant felt it, in ns,
-            which is None if it never did.
+            Sequence number; model time of the reset, ns; time of the first step with an input
+            computed with the update, ns, None if there was none.
         """
-        sequence, model_ns, tick = _columns(self._told, 3)
+        sequence, model_ns, tick = _columns(self._receipts, 3)
         latched, t_ns = _columns(self._latches, 2)
         first = np.searchsorted(latched, tick)
         known = len(tick) if ended else int((first < len(latched)).sum())
-        felt_ns = [int(t_ns[i]) if i < len(latched) else None for i in first[:known]]
-        self._told = [(sequence[known:], model_ns[known:], tick[known:])]
-        needed = latched > self._ticked  # ticks that are still to come are later than these
+        applied_ns = [int(t_ns[i]) if i < len(latched) else None for i in first[:known]]
+        self._receipts = [(sequence[known:], model_ns[known:], tick[known:])]
+        needed = latched > self._ticked  # later ticks are beyond these
         self._latches = [(latched[needed], t_ns[needed])]
-        numbers = zip(sequence[:known].tolist(), model_ns[:known].tolist(), felt_ns, strict=True)
+        numbers = zip(sequence[:known].tolist(), model_ns[:known].tolist(), applied_ns, strict=True)
         return list(numbers)
 
 
 class _Updates:
-    """What became of each event's update."""
+    """The outcome of each event's update."""
 
     def __init__(self) -> None:
         self._events: deque[tuple[int, int]] = deque()
@@ -335,25 +342,25 @@ class _Updates:
             self._passed[sequence] = self._passed.get(sequence, False) or passed
             self._newest_packet = max(self._newest_packet, sequence)
 
-    def deliveries(self, applied_input: list[tuple[int, int, int | None]]) -> None:
-        self._taken.extend(applied_input)
+    def add_applied(self, applied: list[tuple[int, int, int | None]]) -> None:
+        self._taken.extend(applied)
 
     @property
     def waiting(self) -> int:
         return len(self._events) + len(self._taken) + len(self._passed)
 
     def resolved(self, start_s: float, end_ns: int | None) -> tuple[PacketLosses, SampledSeries]:
-        """What became of the events since the last time, in their order."""
+        """Losses and delays of the events that were resolved since the last call, in order."""
         losses: list[tuple[int, float]] = []
         delays: list[tuple[int, int]] = []
         while self._events:
             found = self._fate(*self._events[0], end_ns)
             if found is None:
                 break
-            made_up_s, acts_ns = found
+            replaced_s, acts_ns = found
             self._resolved, t_ns = self._events.popleft()
-            losses.append((t_ns, made_up_s))
-            # What the start brings with it is the start's.
+            losses.append((t_ns, replaced_s))
+            # A delay before the first input is part of the start.
             if acts_ns is not None and acts_ns * 1e-9 > start_s:
                 delays.append((t_ns, max(acts_ns - t_ns, 0)))
         for sequence in [one for one in self._passed if one <= self._resolved]:
@@ -367,10 +374,10 @@ class _Updates:
     def _fate(
         self, sequence: int, event_ns: int, end_ns: int | None
     ) -> tuple[float, int | None] | None:
-        """After which time a newer update made up for a lost one, and when it acted if it did.
+        """When a newer update replaced a lost one, in s, and when the update took effect, in ns.
 
-        None if that is not known yet. An update that is under way at the end is not lost, but as
-        late as it could be.
+        None if that is not known yet. An update in flight at the end is not lost; it counts as
+        delivered at the end.
         """
         while self._taken and self._taken[0][0] < sequence:
             self._taken.popleft()
@@ -379,16 +386,16 @@ class _Updates:
             if passed is False:
                 return np.inf, None
             return None if end_ns is None else (0.0, end_ns)
-        taken, model_ns, felt_ns = self._taken[0]
-        felt_ns = end_ns if felt_ns is None else felt_ns
+        taken, model_ns, applied_ns = self._taken[0]
+        applied_ns = end_ns if applied_ns is None else applied_ns
         if taken == sequence:
-            return None if felt_ns is None else (0.0, max(felt_ns, model_ns))
+            return None if applied_ns is None else (0.0, max(applied_ns, model_ns))
         if passed is None and end_ns is None and self._newest_packet < sequence:
-            return None  # the network's word on it is still to come
+            return None  # its row of netem_packet is still to come
         if not passed:
             return np.inf, None
-        # Had it only been overtaken, a newer one made up for it.
-        return None if felt_ns is None else ((felt_ns - event_ns) * 1e-9, None)
+        # It was delivered out of order: a newer update replaced it.
+        return None if applied_ns is None else ((applied_ns - event_ns) * 1e-9, None)
 
 
 def _columns(batches: _Batches, count: int) -> tuple[NDArray[Any], ...]:

@@ -1,6 +1,6 @@
-"""Under which conditions a run really took place, in the plant's time."""
+"""The conditions under which a run took place, in the plant's time."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,21 +13,25 @@ _TOLERANCE_S = 1e-9
 Reals = NDArray[np.float64]
 
 
-Left = tuple[float, str] | None
-"""When a run left the conditions of a claim, and how; None if it never did."""
+class VoidFrom(NamedTuple):
+    """From when on claims are void, because an assumption was violated or data is missing."""
+
+    t_s: float
+    why: str
+
 
 CAUSES = {
-    "dropouts": "{:.0f} updates lost in a row, {:.0f} allowed",
+    "dropouts": "{:.0f} consecutive updates lost, {:.0f} allowed",
     "sampling": "no measurement for {:.4g} s, {:.4g} s allowed",
-    "delay": "an update was felt after {:.4g} s, {:.4g} s allowed",
+    "delay": "an update took effect after {:.4g} s, {:.4g} s allowed",
     "hold": "an input was {:.4g} s old, {:.4g} s allowed",
-    "start": "the plant felt no input until {:.4g} s, {:.4g} s allowed",
-    "watchdog": "the input was the watchdog's: the newest actuation was {:.4g} s old, "
+    "start": "the plant applied no input until {:.4g} s, {:.4g} s allowed",
+    "watchdog": "the watchdog replaced the input: the newest actuation was {:.4g} s old, "
     "{:.4g} s allowed",
-    "safe input": "the input was the controller's safe one, up to {:.4g}: it knew no state",
-    "restart": "the sensor was started anew: what it transmits first is no event of the trigger",
+    "safe input": "the controller had no state and sent its safe input, largest entry {:.4g}",
+    "restart": "the sensor was restarted: its first transmission is no event of the trigger",
 }
-"""How conditions can be left, and how that is said, of the worst value and the limit."""
+"""The assumptions that a run can violate, each with its message: worst value and limit."""
 
 
 class SampledSeries(NamedTuple):
@@ -42,34 +46,33 @@ class SampledSeries(NamedTuple):
 
 
 class PacketLosses(NamedTuple):
-    """The events, and which of their updates never came."""
+    """The events, and which of their updates were lost."""
 
     t_s: Reals
     """(k,)"""
-    made_up_s: Reals
-    """(k,) After which time the plant felt a newer update instead: infinite if the update was
-    dropped, 0 if it came or was still to come; in between if it was overtaken."""
+    replaced_after_s: Reals
+    """(k,) Time until a newer update took effect instead: infinite if the update was dropped, 0 if
+    it was delivered or in flight, in between if it was delivered out of order (stale)."""
 
-    def runs(self, delay_s: float, before: int = 0) -> SampledSeries:
-        """Successive losses at every event; what was overtaken within ``delay_s`` is not lost.
+    def consecutive(self, delay_s: float, before: int = 0) -> SampledSeries:
+        """Consecutive losses up to every event.
 
         Args:
-            delay_s: how late an update may be felt.
-            before: losses up to these events.
+            delay_s: allowed delay; an update that was replaced within it is not lost.
+            before: consecutive losses before the first of these events.
         """
-        runs, run = [], before
-        for made_up_s in self.made_up_s.tolist():
-            lost = made_up_s == np.inf or made_up_s > delay_s + _TOLERANCE_S
-            run = run + 1 if lost else 0
-            runs.append(run)
-        return SampledSeries(self.t_s, np.array(runs, dtype=np.float64))
+        counts, count = [], before
+        for replaced_s in self.replaced_after_s.tolist():
+            lost = replaced_s == np.inf or replaced_s > delay_s + _TOLERANCE_S
+            count = count + 1 if lost else 0
+            counts.append(count)
+        return SampledSeries(self.t_s, np.array(counts, dtype=np.float64))
 
 
 class AssumptionViolation(NamedTuple):
-    """How a run left the conditions in one respect."""
+    """The first time at which a run violated one assumption, and by how much in all."""
 
     t_s: float
-    """When it first did."""
     cause: str
     """One of ``CAUSES``."""
     worst: float
@@ -82,41 +85,41 @@ class AssumptionViolation(NamedTuple):
 
 
 class ObservedConditions(NamedTuple):
-    """What :class:`noack.theory.certificate.NetworkConditions` presupposes, as it was."""
+    """The conditions of :class:`noack.theory.certificate.NetworkConditions`, as observed."""
 
     losses: PacketLosses
-    """Updates that the controller never took."""
+    """Updates that the controller never received, or received too late."""
     sampling: SampledSeries
     """Time since the measurement before, in seconds, at every measurement."""
     delay: SampledSeries
-    """From an event until the controller had its update and the plant felt it, at the event."""
+    """From an event until the plant applied an input computed with its update, at the event."""
     hold: SampledSeries
-    """How far the model's time behind the input was from now at most, at every step."""
+    """Largest difference between the time and the model time of the applied input, per step."""
     start_s: float
-    """When the plant began to feel the controller; infinite if never."""
+    """When the plant applied the first input of a controller with a state; infinite if never."""
     watchdog: SampledSeries
-    """Age of the newest actuation at every step whose input was the watchdog's instead."""
+    """Age of the newest actuation at every step at which the watchdog replaced the input."""
     safe_input: SampledSeries
-    """Largest entry of the input at every step whose input was of a controller without a state:
-    one other than 0 before the plant felt the controller, and any after that."""
+    """Largest entry of the input at every step at which it came from a controller without a state:
+    only inputs other than 0 before ``start_s``, and any input after that."""
     restarts: SampledSeries
-    """At the first measurement of every sensor that took another's place: its generation."""
+    """Generation of every restarted sensor, at its first measurement."""
     timeout_s: float
     """Age at which the watchdog acts."""
 
-    def departures(
-        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES), run: int = 0
+    def violations(
+        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES), lost: int = 0
     ) -> list[AssumptionViolation]:
-        """In which respects the conditions were left.
+        """The conditions that the run violated.
 
         Args:
             conditions: the conditions.
-            causes: which respects count.
-            run: updates that were lost in a row before.
+            causes: which of ``CAUSES`` to check.
+            lost: consecutive losses before the first event.
         """
         start = SampledSeries(np.zeros(1), np.array([self.start_s]))
         every: dict[str, tuple[SampledSeries, float]] = {
-            "dropouts": (self.losses.runs(conditions.delay_s, run), conditions.dropouts),
+            "dropouts": (self.losses.consecutive(conditions.delay_s, lost), conditions.dropouts),
             "sampling": (self.sampling, conditions.sampling_s),
             "delay": (self.delay, conditions.delay_s),
             "hold": (self.hold, conditions.hold_s),
@@ -133,14 +136,16 @@ class ObservedConditions(NamedTuple):
                 found.append(AssumptionViolation(first_s, cause, worst, limit))
         return found
 
-    def left(self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES)) -> Left:
-        """When and how the run first left the conditions; None if it never did."""
-        return earliest(self.departures(conditions, causes))
+    def first_violation(
+        self, conditions: NetworkConditions, causes: Collection[str] = tuple(CAUSES)
+    ) -> VoidFrom | None:
+        """When the run first violated one of the conditions; None if never."""
+        return earliest(VoidFrom(one.t_s, one.text) for one in self.violations(conditions, causes))
 
     def summary(self) -> dict[str, float | None]:
         """The largest value of each condition."""
         return {
-            "dropouts": self.losses.runs(0.0).largest(),
+            "dropouts": self.losses.consecutive(0.0).largest(),
             "sampling_s": self.sampling.largest(),
             "delay_s": self.delay.largest(),
             "hold_s": self.hold.largest(),
@@ -148,6 +153,6 @@ class ObservedConditions(NamedTuple):
         }
 
 
-def earliest(departures: Collection[AssumptionViolation]) -> Left:
-    """When and how the conditions were first left; None if they were not."""
-    return min(((one.t_s, one.text) for one in departures), default=None)
+def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:
+    """The first of several; None if there is none."""
+    return min(filter(None, found), default=None)

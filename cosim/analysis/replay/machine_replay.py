@@ -67,7 +67,7 @@ def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
     names = rows.dtype.names or ()
     if ROUTES[OWNER[table]].receives is Flow.ACTUATION:
         return tuple(column for column in ("u", "x_c") if column in names)
-    return ("y", "u_felt") if "y" in names else ("x",)
+    return ("y", "u_applied") if "y" in names else ("x",)
 
 
 def replay_machine(role: str, record: RunRecord) -> MachineReplay:

@@ -95,12 +95,14 @@ def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
     dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
     forced = np.isin(deliveries["sequence"], crossed.sequence[crossed.rows["fate"] == Fate.FORCED])
     scenario, names = record.scenario, record.loop.state_names
-    known = "x" if scenario.knows_state else "x̂"
+    known = "x" if scenario.coverage.knows_state else "x̂"
     figure = signal_figures.paper_figure(
         mode=scenario.mode,
         t_s=_seconds(joined.t_ns),
-        x=joined.x if scenario.knows_state else true_states(record[PLANT_STEP], joined.t_ns),
-        x_hat=None if scenario.knows_state else joined.x,
+        x=joined.x
+        if scenario.coverage.knows_state
+        else true_states(record[PLANT_STEP], joined.t_ns),
+        x_hat=None if scenario.coverage.knows_state else joined.x,
         x_s=joined.x_s,
         x_c=joined.x_c,
         state_names=names,
@@ -130,11 +132,15 @@ def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
 
 def _known(scenario: Scenario) -> str:
     """What the sensor knows of x, where it does not measure x itself."""
-    if scenario.knows_state:
+    if scenario.coverage.knows_state:
         return ""
     if scenario.observer is None:
         return "x̂ is what is measured, x with noise. "
-    outputs = "1 measured output" if scenario.outputs == 1 else f"{scenario.outputs} outputs"
+    outputs = (
+        "1 measured output"
+        if scenario.message_sizes.outputs == 1
+        else f"{scenario.message_sizes.outputs} outputs"
+    )
     return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
 
 
@@ -153,7 +159,11 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFi
             "The controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, "
             "leaves it while packets are lost."
         )
-        + ("" if record.scenario.knows_state else " Both are against x̂, what the sensor knows.")
+        + (
+            ""
+            if record.scenario.coverage.knows_state
+            else " Both are against x̂, what the sensor knows."
+        )
         + _dashed(bounds),
         "Error norms over time on a logarithmic axis: "
         f"‖e_s‖ up to {_largest(joined.e_s_norm)}, ‖e_c‖ up to {_largest(joined.e_c_norm)}.",
@@ -199,7 +209,7 @@ def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
 
 def _lateness(record: RunRecord) -> RunFigure:
     scenario = record.scenario
-    period_us = scenario.plant_period_ns / (1e3 * scenario.speed)
+    period_us = scenario.timing.plant_period_ns / (1e3 * scenario.speed)
     late_us = {role: lateness_us(record, role) for role in LOOP_ROLES}
     longest = ", ".join(f"{role} {_largest(late)} µs" for role, late in late_us.items())
     return RunFigure(

@@ -20,7 +20,7 @@ from cosim.record.align import (
 from cosim.record.estimation_error import true_states
 from cosim.record.recorded_changes import claimed_until_s, model_flow
 from cosim.record.run_record import Rows, updates_in
-from noack.config.resolution import loop_of, tables_of
+from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
@@ -38,7 +38,6 @@ from noack.protocol.wire_format import Flow
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify
-from noack.trigger.policy_from_settings import policy_of
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""
@@ -80,7 +79,7 @@ class ViewFeed:
         self._claimed_until_s = np.inf
         # Where the sensor does not know x, the plant's own is shown.
         self._plant: Rows | None = None
-        if not scenario.knows_state:
+        if not scenario.coverage.knows_state:
             self._plant = np.zeros(0, self._types[PLANT_STEP])
         self._last_event_ns: int | None = None
         self._last_delivery_ns: int | None = None
@@ -110,7 +109,7 @@ class ViewFeed:
         reach_ns = int(self._track.model_ns[-1])
         if final:
             until_ns = None
-            reach_ns += self._scenario.controller_period_ns
+            reach_ns += self._scenario.timing.controller_period_ns
         else:
             waiting = self._pending[SENSOR_MEASUREMENT]
             newest_ns = int(waiting[-1]["t_ns"][-1]) if waiting else reach_ns
@@ -118,7 +117,7 @@ class ViewFeed:
             until_ns = max(reach_ns, newest_ns - int(_PATIENCE_S * wall_ns))
             until_ns -= int(_LAG_S * wall_ns)
         self._packets(self._take(NETEM_PACKET, None))
-        self._view.travel(self._scenario.horizon_ns if until_ns is None else until_ns)
+        self._view.travel(self._scenario.timing.horizon_ns if until_ns is None else until_ns)
         self._inputs(steps)
         self._undrawn.append(deliveries)
         self._deliveries(until_ns)
@@ -202,11 +201,13 @@ class ViewFeed:
 
         None of what is beyond the theory.
         """
-        if not self._scenario.is_certifiable or self._loop.setpoint is not None:
+        if not self._scenario.coverage.is_certifiable or self._loop.setpoint is not None:
             return None  # at a set-point it would be of the deviations
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
-            self._view.certified_interval(certificate.inter_event_s, self._scenario.horizon_ns)
+            self._view.certified_interval(
+                certificate.inter_event_s, self._scenario.timing.horizon_ns
+            )
         return certificate
 
     def _certified(

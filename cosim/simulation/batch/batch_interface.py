@@ -16,7 +16,7 @@ from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
 from netem.rule_program import empty_state, program_of, stream_names
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
@@ -24,7 +24,6 @@ from noack.core.random_streams import stream_keys
 from noack.impairments.link_records import PacketDecision, dtype_of
 from noack.impairments.link_settings import LinkSettings
 from noack.trigger import self_triggered_interval
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
@@ -111,9 +110,9 @@ def setting_of(resolved: Scenario) -> Setting:
     Raises:
         CallerError: the scenario is one that exact simulation cannot take.
     """
-    resolved.require_unacknowledged()
-    resolved.require_unchanging()
-    resolved.require_exact()
+    resolved.coverage.require_unacknowledged()
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
     loop = loop_of(resolved)
     return Setting(
         H=loop.H,

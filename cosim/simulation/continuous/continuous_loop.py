@@ -39,12 +39,11 @@ from cosim.simulation.continuous.event_detector import (
     QuadraticEventDetector,
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 
@@ -123,7 +122,7 @@ class ContinuousLoop:
             CallerError: it is another.
         """
         if not isinstance(self.trigger, DecayingTrigger):
-            raise CallerError('trigger.policy: this is for the paper\'s trigger, "decaying", only')
+            raise CallerError('trigger.policy: needs the paper\'s trigger, "decaying"')
         return self.trigger
 
     def threshold(self, t_s: float) -> float:
@@ -383,7 +382,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     Raises:
         CallerError: it is a scenario that exact simulation cannot take.
     """
-    resolved.require_unacknowledged()
-    resolved.require_unchanging()
-    resolved.require_exact()
+    resolved.coverage.require_unacknowledged()
+    resolved.coverage.require_unchanging()
+    resolved.coverage.require_exact()
     return ContinuousLoop(loop_of(resolved), policy_of(resolved))

@@ -94,7 +94,11 @@ def drawn_scenario(scenario: Scenario, seed: int, draw: int) -> Scenario:
     )
     plant = scenario.plant.model_copy(
         update={
-            **({"draw": "given", "A": _rows(A), "B": _rows(B)} if scenario.is_linear else {}),
+            **(
+                {"draw": "given", "A": _rows(A), "B": _rows(B)}
+                if scenario.coverage.is_linear
+                else {}
+            ),
             "initial_state": tuple(x0),
             "initial_state_halfwidth": None,
         }

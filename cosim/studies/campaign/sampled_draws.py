@@ -21,6 +21,7 @@ from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
+from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
@@ -31,7 +32,6 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.trigger.policy_from_settings import policy_of
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class SampledWork:
     def _cost(self, record: RunRecord) -> float:
         loop, steps = record.loop, record[PLANT_STEP]
         n, m = loop.n, loop.m
-        if not record.scenario.is_linear:
+        if not record.scenario.coverage.is_linear:
             return self._trapezoid(record)
         held = {"d": loop.B, "w": np.eye(n)}
         added = [name for name in held if name in (steps.dtype.names or ())]
@@ -114,7 +114,7 @@ class SampledWork:
         drift = np.zeros((size, size))
         drift[:n, :n], drift[:n, n:] = loop.A, through
         block = np.block([[-drift.T, weight], [np.zeros((size, size)), drift]])
-        block = expm(block * (record.scenario.plant_period_ns / NS_PER_S))
+        block = expm(block * (record.scenario.timing.plant_period_ns / NS_PER_S))
         over_a_step = block[size:, size:].T @ block[:size, size:]
         z = np.hstack([steps[name] for name in ("x", "u", *added)])[:-1]
         return float(np.einsum("ki,ij,kj->", z, over_a_step, z))
@@ -125,7 +125,7 @@ class SampledWork:
         R = np.eye(record.loop.m) if self.R is None else self.R
         of_x = np.einsum("ki,ij,kj->k", x, Q, x)
         of_u = np.einsum("ki,ij,kj->k", u, R, u)
-        step_s = record.scenario.plant_period_ns / NS_PER_S
+        step_s = record.scenario.timing.plant_period_ns / NS_PER_S
         return float(step_s * (0.5 * (of_x[1:] + of_x[:-1]) + of_u).sum())
 
 

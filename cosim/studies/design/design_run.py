@@ -40,7 +40,7 @@ def design(
         CallerError: the limits or the scenario do not allow it.
     """
     first = next(iter(families.values()))
-    first.require_exact()
+    first.coverage.require_exact()
     if limits.settling_s > first.horizon_s:
         raise CallerError(
             f"--settling: {limits.settling_s:g} s lie beyond horizon_s = {first.horizon_s:g}"

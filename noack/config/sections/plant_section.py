@@ -4,11 +4,13 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.disturbances import AnyDisturbance
-from noack.config.observers import Measurement
-from noack.config.plant_systems import AnySystem, LinearSettings
+from noack.config.disturbances import AnyDisturbance, variance_at
+from noack.config.plants import AnyPlant
 from noack.config.sections.matrix_file_section import require_read
+from noack.config.sections.measurement_section import MeasurementSection
 from noack.config.sections.rates import RateHz, require_whole_period
+from noack.observers.estimation_model import NoiseVariances
+from noack.plants.linear import LinearSettings
 from noack.settings.matrices import Row, Rows, require_non_negative
 from noack.settings.section import ScenarioSection
 
@@ -27,7 +29,7 @@ class WatchdogSection(ScenarioSection):
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
-    system: AnySystem = LinearSettings()
+    system: AnyPlant = LinearSettings()
     """What it is: a table with ``kind``; a linear system unless given."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
@@ -52,7 +54,7 @@ class PlantSection(ScenarioSection):
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     """A measurement is sent every so many steps."""
-    measurement: Measurement = Measurement()
+    measurement: MeasurementSection = MeasurementSection()
     disturbances: tuple[AnyDisturbance, ...] = ()
     """What disturbs it, one added to the other."""
     watchdog: WatchdogSection = WatchdogSection()
@@ -81,3 +83,11 @@ class PlantSection(ScenarioSection):
                 require_non_negative(row, key)
         require_non_negative(self.initial_state_halfwidth or (), "initial_state_halfwidth")
         return self
+
+    def noise_variances(self, n: int, m: int) -> NoiseVariances:
+        """Variances of the random disturbances and of the measurement noise."""
+        return NoiseVariances(
+            at_state=variance_at("state", self.disturbances, n),
+            at_input=variance_at("input", self.disturbances, m),
+            output=self.measurement.variance(n),
+        )

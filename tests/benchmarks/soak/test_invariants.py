@@ -93,7 +93,7 @@ def unsent(tables: Tables) -> None:
 def lost_in_a_row(tables: Tables) -> None:
     rows = tables["netem_packet"]
     rows["fate"][5:10] = 1
-    rows["drop_run"][5:10] = 1 + np.arange(5)
+    rows["consecutive_losses"][5:10] = 1 + np.arange(5)
 
 
 def not_finite(tables: Tables) -> None:

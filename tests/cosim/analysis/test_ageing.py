@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import dumps, summarise
 from cosim.record.run_record import RunRecord

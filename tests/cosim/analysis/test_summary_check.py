@@ -44,7 +44,7 @@ FULL = {
                    "sup_e_c_norm": 1.0},
     "disturbances": [{"at": "input", "rms": 0.1, "max": 0.2}],
     "assumption_violations": [{"t_s": 0.1, "process": "netem", "what": "MANSD violated"}],
-    "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_run": 1},
+    "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_burst": 1},
     "lateness_us": {"plant": QUANTILES | {"steps": 3, "late_steps": 3}},
     "latency_us": QUANTILES | {"updates": 3},
     "realtime": {"plant": {"sched_fifo": "granted"}},

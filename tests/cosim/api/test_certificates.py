@@ -61,5 +61,5 @@ def test_what_cannot_be_asked_is_one_line(options: dict[str, object], said: str)
 
 
 def test_what_has_no_certificate_is_one_line() -> None:
-    with pytest.raises(noack.NoackError, match="linear plants"):
+    with pytest.raises(noack.NoackError, match="linear plant"):
         noack.certify("cart_pole")

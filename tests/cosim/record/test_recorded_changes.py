@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
-from cosim.analysis.claims.claim_evaluation import ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
@@ -97,7 +97,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
     for row in record[NETEM_PACKET]:
         if row["fate"] in (Fate.DELIVERED, Fate.FORCED):
             continue
-        if row["drop_run"] == 1:
+        if row["consecutive_losses"] == 1:
             began_ns = row["now_ns"]
         ends_ns = [t_ns for t_ns, _ in caps[1:]] + [2**63 - 1]
         allowed = [
@@ -105,7 +105,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
             for (since_ns, cap), end_ns in zip(caps, ends_ns, strict=True)
             if since_ns <= row["now_ns"] and end_ns > began_ns
         ]
-        assert row["drop_run"] <= max(allowed)
+        assert row["consecutive_losses"] <= max(allowed)
     assert summarise(record, 0, "horizon")["assumption_violations"] == []
 
 
@@ -205,7 +205,7 @@ def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> N
         "plant": plant_of(resolved), "sensor": sensor_of(resolved),
         "netem": network_of(resolved), "controller": controller_of(resolved),
     }  # fmt: skip
-    shuttle = Shuttle(machines, resolved.entries, gathered.take)
+    shuttle = Shuttle(machines, resolved.message_sizes.entries, gathered.take)
     for now_ns in shuttle.run():
         for role in [role for role, at_ns in told_ns.items() if at_ns <= now_ns]:
             shuttle._emit(role, machines[role].announce(change, now_ns))
@@ -255,5 +255,5 @@ def test_the_machines_of_the_baseline_refuse(machine_of: Callable[[Scenario], An
 def test_who_decides_every_fate_cannot_have_changes() -> None:
     listed = [{"at_s": 1.0, "set": {"network.mansd": 1}}]
     resolved = resolve(validate(CONTENT | {"changes": listed}, "here"))
-    with pytest.raises(CallerError, match="settings stay as they are"):
+    with pytest.raises(CallerError, match="settings that stay the same"):
         simulate(resolved, lambda data, now_ns: 0)

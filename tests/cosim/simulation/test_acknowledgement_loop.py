@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_summary import summarise
 from cosim.live.simulated_run import simulate_run
@@ -137,7 +138,7 @@ def test_the_models_agree_whenever_all_acknowledgements_have_arrived(record: Run
 @pytest.mark.parametrize("overrides", [(), MESSY])
 def test_the_sensor_waits_for_an_acknowledgement_or_the_timeout(overrides: tuple[str, ...]) -> None:
     record = simulate(acknowledged(*overrides))
-    timeout_ns = record.scenario.acknowledgement_timeout_ns
+    timeout_ns = record.scenario.timing.acknowledgement_timeout_ns
     assert timeout_ns == 50_000_000
     found, answers = events(record), record[SENSOR_ACKNOWLEDGEMENT]
     too_soon = waited = 0
@@ -152,12 +153,14 @@ def test_the_sensor_waits_for_an_acknowledgement_or_the_timeout(overrides: tuple
 
 
 def test_by_default_the_timeout_allows_for_the_delays_there_and_back() -> None:
-    assert acknowledged("network.acknowledgements={}").acknowledgement_timeout_ns == 50_000_000
+    assert (
+        acknowledged("network.acknowledgements={}").timing.acknowledgement_timeout_ns == 50_000_000
+    )
     late = (
         'network.impairments=[{kind="delay", delay_s=0.02, jitter_s=0.01}]',
         'network.acknowledgements={impairments=[{kind="delay", delay_s=0.04}]}',
     )
-    assert acknowledged(*late).acknowledgement_timeout_ns == 120_000_000
+    assert acknowledged(*late).timing.acknowledgement_timeout_ns == 120_000_000
 
 
 def test_lost_acknowledgements_cost_transmissions_and_none_has_none_to_lose() -> None:

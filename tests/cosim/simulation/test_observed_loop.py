@@ -202,7 +202,7 @@ def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line
     del observed["observer"]
     del observed["plant"]["measurement"]
     record = run(observed)
-    assert record.scenario.knows_state
+    assert record.scenario.coverage.knows_state
     sources = [claim.source for claim in ClaimEvaluation(record).judge()]
     assert sources == ["(I1)", "(I1)", "eq:LossEv3"]
     summary = summarise(record, 0, "horizon")
@@ -234,7 +234,7 @@ def test_what_is_exact_or_certified_is_refused_in_one_line(observed: dict[str, A
     del observed["observer"]
     observed["plant"]["measurement"] = {"noise_std": [0.1, 0.0]}
     noisy = resolved(observed)
-    assert [one.is_certifiable for one in (scenario, estimated, noisy)] == [False] * 3
+    assert [one.coverage.is_certifiable for one in (scenario, estimated, noisy)] == [False] * 3
     for take in (continuous_loop_of, setting_of, lambda one: study(one, 0)):
         for one, key in (
             (scenario, "plant.disturbances: "),

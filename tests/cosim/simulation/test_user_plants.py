@@ -99,7 +99,7 @@ def test_a_run_keeps_its_plant_and_is_replayed_elsewhere_when_the_original_is_go
     (kept,) = (elsewhere / "plant").iterdir()
     kept.write_bytes(kept.read_bytes() + b"\n")
     record = load_record(elsewhere)  # what was recorded can be read all the same
-    with pytest.raises(CallerError, match="is not what it was: its SHA-256 is") as refused:
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is") as refused:
         replay(record)
     assert "\n" not in str(refused.value)
 

@@ -65,7 +65,7 @@ def test_everything_happens_and_everything_is_on_time(busy: Scenario) -> None:
         (SENSOR_MEASUREMENT, 10 * MS, 0),
         (CONTROLLER_STEP, 10 * MS, 5 * MS),
     ):
-        due = np.arange(phase_ns, busy.horizon_ns + 1, period_ns)
+        due = np.arange(phase_ns, busy.timing.horizon_ns + 1, period_ns)
         np.testing.assert_array_equal(record[table]["t_ns"], due)
         np.testing.assert_array_equal(record[table]["now_ns"], due)
     assert len(record[PLANT_ACTUATION]) == len(record[CONTROLLER_STEP])
@@ -122,7 +122,7 @@ def test_another_network_decides_losses_and_delays(busy: Scenario) -> None:
         packets["fate"] == Fate.DROPPED, [delays_ms[i] is None for i in asked]
     )
     runs = [len(list(run)) for lost, run in itertools.groupby(packets["fate"]) if lost]
-    assert packets["drop_run"].max() == max(runs) == 1
+    assert packets["consecutive_losses"].max() == max(runs) == 1
     sequence = deliveries["sequence"]
     late_ms = (deliveries["now_ns"] - deliveries["t_ns"]) // MS
     np.testing.assert_array_equal(late_ms, [delays_ms[i] for i in sequence])
@@ -191,7 +191,7 @@ def test_progress_is_told_as_time_goes_on(busy: Scenario) -> None:
     simulate(longer, progress=told.append)
     assert len(told) > 3
     assert told == sorted(told)
-    assert 0 <= told[0] < told[-1] <= longer.horizon_ns
+    assert 0 <= told[0] < told[-1] <= longer.timing.horizon_ns
 
 
 def test_the_summary_knows_a_simulated_run_and_claims_no_timing(busy: Scenario) -> None:

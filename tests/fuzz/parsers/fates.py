@@ -25,7 +25,9 @@ SPECS = [
     LinkSpec("down", ("127.0.0.1", 9002), ("127.0.0.1", 9003), LinkSettings(), LinkSettings()),
 ]  # fmt: skip
 DOCUMENT: dict[str, Any] = json.loads(description(SPECS, 0)[METADATA])
-KNOWN = Vocabulary((*DOCUMENT, "name", "forward", "back", "mansd", "seed"), ("up", "down", "1", ""))
+KNOWN = Vocabulary(
+    (*DOCUMENT, "name", "forward", "reverse", "mansd", "seed"), ("up", "down", "1", "")
+)
 
 
 def _rows() -> pa.Table:
@@ -36,7 +38,7 @@ def _rows() -> pa.Table:
         ("up", "forward", 0, 1, 20, 100, 1, 1, -1, -1, -1, -1, 0),
         ("up", "forward", 1, 0, 21, 100, 4, 1, -1, -1, -1, -1, 0),
         ("up", "forward", 0, 2, 30, 100, 3, 2, 7, 9, 13, -1, 0),
-        ("up", "back", 0, 0, 35, 100, 0, 0, 0, -1, -1, -1, 0),
+        ("up", "reverse", 0, 0, 35, 100, 0, 0, 0, -1, -1, -1, 0),
         ("up", "forward", 0, 3, 40, 100, 2, 0, 5, -1, -1, -1, 3),
     ]
     columns = zip(*rows, strict=True)

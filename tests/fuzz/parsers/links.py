@@ -32,7 +32,7 @@ BASE = {
         {
             "name": "up", "listen": ":9000", "to": "127.0.0.1:9001", "seed": 7, "idle_s": 5.0,
             "words": "delay 10ms 2ms loss gemodel 1% 10% mansd 4 first",
-            "back": {
+            "reverse": {
                 "mansd": 3,
                 "impairments": [
                     {"kind": "loss", "loss": {"model": "trace", "file": "trace.txt"}},
@@ -67,7 +67,7 @@ def one_input(data: bytes) -> None:
     path = write_named(workspace(), "links.toml", data)
     with refusal(str(path), lines=True), patch("noack.runtime.address.socket.getaddrinfo", numeric):
         for spec in load_links(path):
-            for settings in (spec.forward, spec.back):
+            for settings in (spec.forward, spec.reverse):
                 assert LinkSettings.model_validate_json(settings.model_dump_json()) == settings
                 if words_can_say(settings):
                     assert settings_of(text_of(settings)) == settings

@@ -28,7 +28,7 @@ name = "uplink"
 listen = "127.0.0.1:9000"
 to = "[::1]:9001"
 words = "loss 50% mansd 4"
-back = "delay 10ms"
+reverse = "delay 10ms"
 seed = 7
 
 [[link]]
@@ -77,46 +77,50 @@ def one_line(text: str) -> str:
 
 def test_words_are_explained(explain: Explain) -> None:
     out = one_line(explain("loss burst 5% 3 mansd 2 first"))
-    assert "bad times begin with probability 1.75439% per datagram" in out
-    assert "mansd 2 the cap: at most 2 successive datagrams of a flow are not delivered" in out
-    assert "first the first datagram of each flow is delivered" in out
-    assert "predicted loss in the long run: 3.947% (without the cap 5%)" in out
+    assert "the bad state begins with probability 1.75439% per packet" in out
+    assert (
+        "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
+    )
+    assert "first the first packet of each flow is delivered" in out
+    assert "expected loss rate: 3.947% (without the cap 5%)" in out
     assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out
-    assert "but tc lacks: mansd 2 (a cap on successive losses), first (that the first" in out
+    assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out
 
 
 def test_what_the_prediction_does_not_count_is_said(explain: Explain) -> None:
     out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
-    assert "33.33% (without the cap 50%), not counting what is overtaken (stale)" in out
-    assert "what would be below 0 is 0 (25% of the draws)" in out
+    assert (
+        "33.33% (without the cap 50%), not counting packets delivered out of order (stale)" in out
+    )
+    assert "negative delays become 0 (25% of the draws)" in out
 
 
 def test_where_tc_can_do_nothing_that_is_said(explain: Explain) -> None:
     out = one_line(explain("loss worst mansd 2"))
-    assert "tc cannot do it; it lacks: loss worst (a worst case), mansd 2 (" in out
+    assert "not possible with tc, which lacks: loss worst (a worst case), mansd 2 (" in out
     assert "tc qdisc" not in out
 
 
 @pytest.mark.parametrize(
     ("arguments", "titles"),
     [
-        ("", ["in both directions, in each by itself: nothing happens"]),
+        ("", ["both directions, each by itself: no impairment"]),
         ("loss 5%", ["forward, from clients to the server, in this order",
-                     "back, from the server to clients: nothing happens"]),
-        ("--back loss 5%", ["forward, from clients to the server: nothing happens",
-                            "back, from the server to clients, in this order"]),
-        ("loss 5% --back loss 6%", ["forward, from clients to the server, in this order",
-                                    "back, from the server to clients, in this order"]),
-        ("loss 5% --back loss none", ["forward, from clients to the server, in this order",
-                                      "back, from the server to clients, in this order"]),
-        ("--both loss 5%", ["in both directions, in each by itself, in this order"]),
+                     "reverse, from the server to clients: no impairment"]),
+        ("--reverse loss 5%", ["forward, from clients to the server: no impairment",
+                            "reverse, from the server to clients, in this order"]),
+        ("loss 5% --reverse loss 6%", ["forward, from clients to the server, in this order",
+                                    "reverse, from the server to clients, in this order"]),
+        ("loss 5% --reverse loss none", ["forward, from clients to the server, in this order",
+                                      "reverse, from the server to clients, in this order"]),
+        ("--both loss 5%", ["both directions, each by itself, in this order"]),
         ("--one-way loss 5%", ["forward, from clients to the server, in this order",
-                               "back: one way only, what the server answers is not relayed"]),
+                               "reverse: not relayed; the server's answers are discarded"]),
     ],
 )  # fmt: skip
 def test_each_direction_is_explained(explain: Explain, arguments: str, titles: list[str]) -> None:
     lines = explain(*shlex.split(arguments)).splitlines()
-    assert [line for line in lines if line.startswith(("forward", "back", "in both"))] == titles
+    assert [line for line in lines if line.startswith(("forward", "reverse", "both"))] == titles
 
 
 def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) -> None:
@@ -124,9 +128,9 @@ def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) ->
     uplink, video = out.split("\n\nvideo: 127.0.0.1:9002 → 127.0.0.1:9003\n")
     assert uplink.startswith("uplink: 127.0.0.1:9000 → [::1]:9001, seed 7\n")
     assert "loses 50%" in uplink
-    assert "holds each datagram back by 10ms" in uplink
+    assert "delays each packet by 10ms" in uplink
     assert "loses 20%" in video
-    assert video.endswith("back: one way only, what the server answers is not relayed\n")
+    assert video.endswith("reverse: not relayed; the server's answers are discarded\n")
 
 
 @pytest.mark.parametrize("columns", [120, 80, 60])
@@ -134,7 +138,8 @@ def test_all_of_it_fits_into_a_terminal(
     explain: Explain, links_file: Path, monkeypatch: pytest.MonkeyPatch, columns: int
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
-    for out in (explain(MUCH, "--both"), explain("--links", str(links_file))):
+    tables = explain(MUCH, "--both").partition("\nas a file of links")[0]
+    for out in (tables, explain("--links", str(links_file))):
         assert max(map(len, out.splitlines())) <= columns
 
 
@@ -145,7 +150,7 @@ def test_what_is_to_be_copied_is_whole_at_any_width(
     for columns in ("200", "80", "60", "30"):
         monkeypatch.setenv("COLUMNS", columns)
         out = explain("delay 10ms 2ms distribution normal loss gemodel 1% 10% 70% 0.1%")
-        command = out[out.index("tc qdisc") :].partition("\nbut")[0]
+        command = out[out.index("tc qdisc") :].partition("\ndifference")[0]
         commands.add(tuple(command.replace("\\\n", "").split()))
     whole = (
         "tc qdisc add dev DEVICE root netem limit 16384 delay 10ms 2ms distribution normal "
@@ -158,8 +163,8 @@ def test_what_is_to_be_copied_is_whole_at_any_width(
     "arguments",
     [
         MUCH,
-        f"{MUCH} --seed 9 --back delay 10ms",
-        f"--back {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
+        f"{MUCH} --seed 9 --reverse delay 10ms",
+        f"--reverse {MUCH} --listen [::1]:7 --to 192.0.2.1:53",
         "loss 5% --both --idle 5s",
         "delay 0 samples 1ms,2ms --one-way",
         "",
@@ -184,16 +189,16 @@ def test_links_are_explained_as_json(explain: Explain, links_file: Path) -> None
     assert uplink["forward"]["predicted_loss"] == pytest.approx(15 / 31)
     assert uplink["forward"]["predicted_loss_without_cap"] == pytest.approx(0.5)
     assert uplink["forward"]["tc"] == "limit 16384 loss random 50%"
-    assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on successive losses)"]
-    assert uplink["back"] is not None
-    assert uplink["back"]["words"] == "delay 10ms"
-    assert (video["forward"]["words"], video["back"]) == ("loss 20%", None)
+    assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on consecutive losses)"]
+    assert uplink["reverse"] is not None
+    assert uplink["reverse"]["words"] == "delay 10ms"
+    assert (video["forward"]["words"], video["reverse"]) == ("loss 20%", None)
 
 
 def test_each_direction_is_explained_as_json(explain: Explain) -> None:
-    (link,) = explain.links("delay 10ms loss 5%", "--back", "corrupt 1%")
+    (link,) = explain.links("delay 10ms loss 5%", "--reverse", "corrupt 1%")
     assert link["name"] == "relay"
-    for side, words in (("forward", "delay 10ms loss 5%"), ("back", "corrupt 1%")):
+    for side, words in (("forward", "delay 10ms loss 5%"), ("reverse", "corrupt 1%")):
         direction: Any = link[side]  # type: ignore[literal-required]
         assert direction["words"] == words
         settings = LinkSettings.model_validate_json(json.dumps(direction["settings"]))

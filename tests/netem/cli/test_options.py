@@ -31,7 +31,7 @@ def the_link(**changes: Any) -> LinkSpec:
         "listen": ("127.0.0.1", 9000),
         "to": ("127.0.0.1", 9001),
         "forward": NOTHING,
-        "back": NOTHING,
+        "reverse": NOTHING,
     }
     return LinkSpec(**given | changes)
 
@@ -43,16 +43,19 @@ def the_link(**changes: Any) -> LinkSpec:
         (["loss", "5%", "mansd", "4"], {"forward": "loss 5% mansd 4"}),
         (["loss 5%", "mansd 4"], {"forward": "loss 5% mansd 4"}),
         (["rate", "1mbit", "-14"], {"forward": "rate 1mbit -14"}),
-        (["loss", "5%", "--back", "delay", "3ms"], {"forward": "loss 5%", "back": "delay 3ms"}),
-        (["--back", "delay 3ms", "--seed", "3"], {"back": "delay 3ms", "seed": 3}),
-        (["--both", "loss", "5%"], {"forward": "loss 5%", "back": "loss 5%"}),
-        (["loss", "5%", "--both"], {"forward": "loss 5%", "back": "loss 5%"}),
+        (
+            ["loss", "5%", "--reverse", "delay", "3ms"],
+            {"forward": "loss 5%", "reverse": "delay 3ms"},
+        ),
+        (["--reverse", "delay 3ms", "--seed", "3"], {"reverse": "delay 3ms", "seed": 3}),
+        (["--both", "loss", "5%"], {"forward": "loss 5%", "reverse": "loss 5%"}),
+        (["loss", "5%", "--both"], {"forward": "loss 5%", "reverse": "loss 5%"}),
         (["loss", "5%", "seed", "7"], {"forward": "loss 5%", "seed": 7}),
         (["--one-way", "--idle", "500ms"], {"return_path": False, "idle_s": 0.5}),
     ],
 )
 def test_a_command_line_describes_a_link(arguments: list[str], changes: dict[str, Any]) -> None:
-    for side in ("forward", "back"):
+    for side in ("forward", "reverse"):
         if side in changes:
             changes = changes | {side: settings_of(changes[side])}
     assert specs([*ADDRESSES, *arguments]) == (the_link(**changes),)
@@ -83,8 +86,8 @@ def test_files_in_words_lie_in_the_working_directory(
 ) -> None:
     (tmp_path / "lost.txt").write_text("010")
     monkeypatch.chdir(tmp_path)
-    (link,) = specs([*ADDRESSES, "--back", "loss", "trace", "lost.txt"])
-    assert link.back.impairments == (LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)
+    (link,) = specs([*ADDRESSES, "--reverse", "loss", "trace", "lost.txt"])
+    assert link.reverse.impairments == (LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)
 
 
 def test_links_come_from_a_file(tmp_path: Path) -> None:
@@ -97,45 +100,55 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--listen", ":9000"], "--listen and --to go together"),
-        (["--to", ":9000"], "--listen and --to go together"),
+        (["--listen", ":9000"], "--listen and --to must be given together"),
+        (["--to", ":9000"], "--listen and --to must be given together"),
+        (
+            ["shwo", "lab"],
+            "shwo: neither a command (show, set, watch) nor a word; did",
+        ),
         (["loss", "5%"], "an emulator on its own needs --listen and --to, or --links"),
         (["--listen", "x", "--to", ":9"], "--listen: expected HOST:PORT, e.g. 127.0.0.1:9000"),
         (["--listen", ":0", "--to", "no such:9"], "--to: no such: no such host"),
         ([*ADDRESSES, "lsos", "5%"], "lsos: no such word; did you mean loss?"),
-        ([*ADDRESSES, "--back", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
-        ([*ADDRESSES, "--back", "seed", "5"], "seed 5: belongs to the link"),
+        ([*ADDRESSES, "--reverse", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
+        ([*ADDRESSES, "--reverse", "seed", "5"], "seed 5: belongs to the link"),
         ([*ADDRESSES, "--seed", "-1"], "--seed -1: must be 0 or more"),
-        ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words say seed 1 already"),
-        ([*ADDRESSES, "--both", "--back", "loss", "5%"], "--back: goes without --both"),
-        ([*ADDRESSES, "--one-way", "--back", "loss", "5%"], "--one-way: nothing goes back"),
+        ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words have seed 1 already"),
+        (
+            [*ADDRESSES, "--both", "--reverse", "loss", "5%"],
+            "--reverse and --both exclude each other",
+        ),
+        (
+            [*ADDRESSES, "--one-way", "--reverse", "loss", "5%"],
+            "--one-way: no reverse direction",
+        ),
         ([*ADDRESSES, "--idle", "5"], "--idle 5: expected a time in s, ms, us or ns"),
         ([*ADDRESSES, "--idle", "0"], "--idle 0: must be more than 0"),
         ([*ADDRESSES, "loss", "trace", "no.txt"], "no.txt: cannot be read: No such file"),
         (
             [*ADDRESSES, "--loss", "bernoulli:0.3"],
-            "--loss: words stand without the dashes, e.g. loss 30%",
+            "--loss: write words without the dashes, e.g. loss 30%",
         ),
-        ([*ADDRESSES, "--mansd=4"], "--mansd=4: words stand without the dashes, e.g. mansd 4"),
-        ([*ADDRESSES, "--back", "--delay", "5ms"], "--delay: words stand without the dashes"),
-        ([*ADDRESSES, "-loss", "5%"], "-loss: words stand without the dashes"),
+        ([*ADDRESSES, "--mansd=4"], "--mansd=4: write words without the dashes, e.g. mansd 4"),
+        ([*ADDRESSES, "--reverse", "--delay", "5ms"], "--delay: write words without the dashes"),
+        ([*ADDRESSES, "-loss", "5%"], "-loss: write words without the dashes"),
         (
             [*ADDRESSES, "loss", "bernoulli:0.3"],
-            "loss bernoulli:0.3: no such word; here it is loss PERCENT, e.g. loss 30%",
+            "loss bernoulli:0.3: no such word; here it is loss 30%",
         ),
         (
             [*ADDRESSES, "loss", "gilbert_elliott"],
-            "loss gilbert_elliott: no such word; here it is loss gemodel or loss burst",
+            "loss gilbert_elliott: no such word; here it is loss gemodel 1% 10%",
         ),
         (
             [*ADDRESSES, "loss", "worst_case"],
             "loss worst_case: no such word; here it is loss worst",
         ),
-        (["--session", "x", "loss", "5%"], "--session: joins a run, and goes alone"),
-        (["--session=noack", "--idle", "5s"], "--session: joins a run, and goes alone"),
+        (["--session", "x", "loss", "5%"], "--session joins a run and allows only --json"),
+        (["--session=noack", "--idle", "5s"], "--session joins a run and allows only --json"),
         (["--links", "no.toml"], "no.toml: no such file"),
-        (["--links", "no.toml", "loss", "5%"], "words: stands in the file that --links names"),
-        (["--links", "no.toml", "--one-way"], "--one-way: stands in the file that --links names"),
+        (["--links", "no.toml", "loss", "5%"], "words: with --links, set this in the file"),
+        (["--links", "no.toml", "--one-way"], "--one-way: with --links, set this in the file"),
     ],
 )
 def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
@@ -149,7 +162,10 @@ def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
     ("arguments", "says"),
     [
         ([*ADDRESSES, "lsos", "5%"], "noack netem: lsos: no such word; did you mean loss?\n"),
-        ([*ADDRESSES, "--capture", "-", "--json"], "noack netem: --capture -: the standard output"),
+        (
+            [*ADDRESSES, "--capture", "-", "--json"],
+            "noack netem: --capture -: --json and --stats",
+        ),
         ([*ADDRESSES, "--stats", "0"], "noack netem: --stats 0: must be 0.01 s or more"),
         (
             [*ADDRESSES, "--record-fates", "a.parquet", "--replay-fates", "./a.parquet"],
@@ -157,9 +173,9 @@ def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
         ),
         (
             [*ADDRESSES, "--record-fates", __file__],
-            f"noack netem: --record-fates {__file__}: is there already, and no Parquet file",
+            f"noack netem: --record-fates {__file__}: exists and is not a Parquet file",
         ),
-        (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session: joins a run"),
+        (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session joins a run"),
         (
             [*ADDRESSES, "--replay-fates", "no.parquet"],
             "noack netem: no.parquet: cannot be read",

@@ -78,7 +78,7 @@ class FakeRelay:
         return [
             LinkReport(
                 spec.name, spec.listen, spec.to, 1, 3, 0, 0, 0,
-                self._direction(spec.name, "forward"), self._direction(spec.name, "back"),
+                self._direction(spec.name, "forward"), self._direction(spec.name, "reverse"),
             )
             for spec in self.specs
         ]  # fmt: skip
@@ -100,12 +100,12 @@ _: Relay = FakeRelay()
 @contextmanager
 def running(relay: Relay) -> Iterator[CommandQueue]:
     """Run a relay in a thread of its own."""
-    errands, stopping = CommandQueue(relay), threading.Event()
-    thread = threading.Thread(target=relay.run, args=(stopping.is_set, errands.run))
+    commands, stopping = CommandQueue(relay), threading.Event()
+    thread = threading.Thread(target=relay.run, args=(stopping.is_set, commands.run_pending))
     thread.start()
     try:
-        yield errands
+        yield commands
     finally:
         stopping.set()
         thread.join()
-        errands.close()
+        commands.close()

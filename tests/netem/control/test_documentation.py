@@ -69,13 +69,13 @@ def programs() -> list[str]:
 def test_the_program_runs() -> None:
     relay = FakeRelay("relay")
     program, _ = programs()
-    with running(relay) as errands, ControlServer("lab", errands):
+    with running(relay) as commands, ControlServer("lab", commands):
         done = subprocess.run(
             [sys.executable, "-c", program], capture_output=True, text=True, check=False
         )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == "None\n"
-    assert relay.settings["relay", "back"].mansd == 2
+    assert relay.settings["relay", "reverse"].mansd == 2
 
 
 def test_the_metadata_of_a_fate_trace_are_read(tmp_path: Path) -> None:

@@ -29,10 +29,10 @@ def client(server: ControlServer) -> Any:
 
 
 def test_statistics_are_asked_for(relay: FakeRelay, client: Client) -> None:
-    relay.counters["down", "back"] = Counters(arrived=12, delivered=12)
+    relay.counters["down", "reverse"] = Counters(arrived=12, delivered=12)
     document = client.ask("report")
     assert [link["name"] for link in document["links"]] == ["up", "down"]
-    assert document["links"][1]["back"]["arrived"] == 12
+    assert document["links"][1]["reverse"]["arrived"] == 12
 
 
 def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
@@ -54,12 +54,12 @@ def test_settings_are_told_in_words_and_as_settings(client: Client) -> None:
     assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
     told = LinkSettings.model_validate_json(json.dumps(up["forward"]["settings"]))
     assert told == SETTINGS
-    assert up["back"]["words"] == ""
+    assert up["reverse"]["words"] == ""
 
 
 @pytest.mark.parametrize(
     ("direction", "changed"),
-    [("forward", {"forward"}), ("back", {"back"}), ("both", {"forward", "back"})],
+    [("forward", {"forward"}), ("reverse", {"reverse"}), ("both", {"forward", "reverse"})],
 )
 def test_a_direction_is_changed(
     relay: FakeRelay, client: Client, direction: str, changed: set[str]
@@ -71,23 +71,25 @@ def test_a_direction_is_changed(
         assert settings == (
             settings_of("loss 100% mansd 2") if is_changed else before[link, way]
         )  # fmt: skip
-    told = {way for way in ("forward", "back") if "loss 100%" in answer["links"][1][way]["words"]}
+    told = {
+        way for way in ("forward", "reverse") if "loss 100%" in answer["links"][1][way]["words"]
+    }
     assert told == changed
 
 
 def test_words_may_be_a_list_and_settings_an_object(relay: FakeRelay, client: Client) -> None:
-    client.ask("change", link="up", direction="back", words=["loss", "5%"])
-    assert relay.settings["up", "back"] == settings_of("loss 5%")
+    client.ask("change", link="up", direction="reverse", words=["loss", "5%"])
+    assert relay.settings["up", "reverse"] == settings_of("loss 5%")
     table = settings_of("delay 1ms mansd 3").model_dump(mode="json")
-    client.ask("change", link="up", direction="back", settings=table)
-    assert relay.settings["up", "back"] == settings_of("delay 1ms mansd 3")
+    client.ask("change", link="up", direction="reverse", settings=table)
+    assert relay.settings["up", "reverse"] == settings_of("delay 1ms mansd 3")
 
 
 def test_the_link_may_be_left_out_if_there_is_one() -> None:
     from tests.netem.control.relays import running as run
 
     relay = FakeRelay("only")
-    with run(relay) as errands, ControlServer("lab", errands), Client(find(None)) as client:
+    with run(relay) as commands, ControlServer("lab", commands), Client(find(None)) as client:
         client.ask("change", words="loss 5%")
     assert relay.settings["only", "forward"] == settings_of("loss 5%")
 
@@ -99,8 +101,8 @@ def test_the_link_may_be_left_out_if_there_is_one() -> None:
         ({"link": "up", "words": "loss 500%"}, "loss 500%"),
         ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
         ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
-        ({"words": "loss 5%"}, "which link. There are up, down"),
-        ({"link": "left", "words": "loss 5%"}, "no link 'left'; there are up, down"),
+        ({"words": "loss 5%"}, "which link. Links: up, down"),
+        ({"link": "left", "words": "loss 5%"}, "no link 'left'; links: up, down"),
         ({"link": "up"}, "give words, or settings"),
         ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
         ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
@@ -180,7 +182,7 @@ def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) ->
 
 
 def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
-    errands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+    commands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held, free = threading.Event(), threading.Event()
 
@@ -188,17 +190,17 @@ def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
         held.set()
         assert free.wait(60)
 
-    monkeypatch.setattr("netem.control.control_server.statistics", slow)
+    monkeypatch.setattr("netem.control.statistics_thread.statistics", slow)
     assert held.wait(60)
     try:
         for _ in range(10):
-            errands.snapshot()  # done by the relay's thread
+            commands.snapshot()  # done by the relay's thread
     finally:
         free.set()
 
 
-def test_when_it_ends_nothing_is_left(errands: CommandQueue) -> None:
-    with ControlServer("lab", errands):
+def test_when_it_ends_nothing_is_left(commands: CommandQueue) -> None:
+    with ControlServer("lab", commands):
         session = find("lab")
     assert running() == []
     more = {"connect/timeout_ms": 500}

@@ -65,7 +65,7 @@ def test_everything_that_a_relay_counts_is_there(relay: FakeRelay) -> None:
     assert found["loss"]["drawn"] == pytest.approx((8 + 4) / 100)
     assert found["loss"]["lost"] == pytest.approx((8 + 4 + 2 + 1) / 100)
     assert found["recent"] is None
-    assert (down["name"], down["forward"]["arrived"], down["back"]["mansd"]) == ("down", 0, None)
+    assert (down["name"], down["forward"]["arrived"], down["reverse"]["mansd"]) == ("down", 0, None)
 
 
 def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> None:

@@ -169,7 +169,7 @@ def drain(endpoint: socket.socket) -> list[tuple[bytes, Address]]:
 def link(
     to: Address,
     forward: LinkSettings | None = None,
-    back: LinkSettings | None = None,
+    reverse: LinkSettings | None = None,
     *,
     host: str = HOSTS[4],
     **others: Any,
@@ -177,4 +177,4 @@ def link(
     """A link on loopback, to a server, on any free port."""
     own = {"name": "test", "listen": (host, 0), "seed": 7} | others
     nothing = LinkSettings()
-    return LinkSpec(to=to, forward=forward or nothing, back=back or nothing, **own)
+    return LinkSpec(to=to, forward=forward or nothing, reverse=reverse or nothing, **own)

@@ -43,7 +43,7 @@ def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
 @settings(max_examples=60)
 @given(
     forward=any_settings.capped,
-    back=any_settings.capped,
+    reverse=any_settings.capped,
     rounds=st.lists(st.integers(1, 40), min_size=1, max_size=4),
     other=st.none() | any_settings.capped,
     segment=st.booleans(),
@@ -51,19 +51,19 @@ def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
 def test_the_cap_holds_in_both_directions_for_every_client(
     engine: Engine,
     forward: LinkSettings,
-    back: LinkSettings,
+    reverse: LinkSettings,
     rounds: list[int],
     other: LinkSettings | None,
     segment: bool,
 ) -> None:
     assert forward.mansd is not None
-    assert back.mansd is not None
-    forward_cap, back_cap = forward.mansd, back.mansd
+    assert reverse.mansd is not None
+    forward_cap, back_cap = forward.mansd, reverse.mansd
     if other is not None:
         assert other.mansd is not None
         forward_cap = max(forward_cap, other.mansd)
     with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
-        spec = link(name_of(server), forward, back)
+        spec = link(name_of(server), forward, reverse)
         with running([spec], engine, segment=segment) as one:
             there, sent = one.relay.addresses()["test"], 0
             for count in rounds:
@@ -83,15 +83,15 @@ def test_the_cap_holds_in_both_directions_for_every_client(
                 assert longest_loss_burst(received, sent) <= forward_cap
             for number in range(sent):
                 for source in by_source:
-                    server.sendto(sealed(number, "back", 30), source)
-            one.settled(sent * CLIENTS, "back")
+                    server.sendto(sealed(number, "reverse", 30), source)
+            one.settled(sent * CLIENTS, "reverse")
             for client in clients:
                 received = [payload for payload, _ in drain(client)]
                 assert longest_loss_burst(received, sent) <= back_cap
             report = one.report()
     assert report.forward.counters.longest_loss_burst <= forward_cap
-    assert report.back.counters.longest_loss_burst <= back_cap
-    for way in (report.forward, report.back):
+    assert report.reverse.counters.longest_loss_burst <= back_cap
+    for way in (report.forward, report.reverse):
         assert way.unintended == {"lost_in_kernel": 0}
 
 

@@ -91,7 +91,7 @@ def test_one_way_all_leaves_from_one_port_and_answers_go_nowhere(
             assert drain(server) == []
     assert len(sources) == 1
     assert (report.clients_ever, report.forward.counters.arrived) == (2, 2)
-    assert report.back.counters.arrived == 0
+    assert report.reverse.counters.arrived == 0
     if sys.platform == "linux":
         assert report.discarded == 10
     ports = tap.events["source_port"][tap.events["departure"] == 1]
@@ -120,7 +120,7 @@ def test_only_the_servers_answers_come_back(engine: Engine) -> None:
         server.sendto(b"truth", path)
         assert client.recv(100) == b"truth"
         assert drain(client) == []
-        assert one.report().back.counters.arrived == 1
+        assert one.report().reverse.counters.arrived == 1
 
 
 def test_a_server_that_is_not_there_yet_is_told_and_costs_nothing_later(
@@ -201,7 +201,7 @@ def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> No
         assert report.forward.settings == lossy
         assert report.forward.flows[0].packets == 8
         with pytest.raises(CallerError, match="none of this name"):
-            one.ask(lambda: one.relay.change("another", "back", late))
+            one.ask(lambda: one.relay.change("another", "reverse", late))
 
 
 def test_idle_clients_are_forgotten_and_come_back_as_new_flows(engine: Engine) -> None:
@@ -339,13 +339,13 @@ def test_what_the_kernel_drops_is_counted_to_the_last(
                 server.sendto(b"y", path)
 
         one.ask(answer)
-        one.until(lambda: all_of(one.relay.report()[0].back) == many)
+        one.until(lambda: all_of(one.relay.report()[0].reverse) == many)
         report = one.report()
-    for way in (report.forward, report.back):
+    for way in (report.forward, report.reverse):
         assert way.unintended["lost_in_kernel"] > 1000
     said = capfd.readouterr().err
     assert "link test, forward:" in said
-    assert "link test, back:" in said
+    assert "link test, reverse:" in said
     assert "lost in the kernel" in said
 
 

@@ -24,8 +24,8 @@ def replayed(
     spec: LinkSpec, side: int, events: NDArray[Any], payloads: list[bytes], began_ns: int
 ) -> dict[int, list[bytes]]:
     """Give the machine what arrived, when it did; check decisions; return what leaves, by flow."""
-    own: LinkSettings = (spec.forward, spec.back)[side]
-    machine = Link(own, spec.seed, spec.name, ("forward", "back")[side])
+    own: LinkSettings = (spec.forward, spec.reverse)[side]
+    machine = Link(own, spec.seed, spec.name, ("forward", "reverse")[side])
     left: dict[int, list[bytes]] = defaultdict(list)
 
     def take(outputs: Any) -> None:
@@ -55,16 +55,16 @@ def replayed(
 @settings(max_examples=60)
 @given(
     forward=any_settings.harsh,
-    back=any_settings.harsh,
+    reverse=any_settings.harsh,
     sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=30, max_size=150),
     segment=st.booleans(),
 )
 def test_fates_and_order_are_the_machines(
-    engine: Engine, forward: LinkSettings, back: LinkSettings, sizes: list[int], segment: bool
+    engine: Engine, forward: LinkSettings, reverse: LinkSettings, sizes: list[int], segment: bool
 ) -> None:
     tap = KeepAll()
     with endpoints(*["127.0.0.1"] * (CLIENTS + 1)) as (server, *clients):
-        spec = link(name_of(server), forward, back)
+        spec = link(name_of(server), forward, reverse)
         with running([spec], engine, taps=[tap], segment=segment) as one:
             there = one.relay.addresses()["test"]
             for k, size in enumerate(sizes):
@@ -73,7 +73,7 @@ def test_fates_and_order_are_the_machines(
             came = drain(server)
             for data, source in came:
                 server.sendto(data, source)
-            one.settled(len(came), "back")
+            one.settled(len(came), "reverse")
         ports = [name_of(client)[1] for client in clients]
         at_clients = [[data for data, _ in drain(client)] for client in clients]
         events, began_ns = tap.events, one.relay.began_unix_ns

@@ -61,7 +61,7 @@ class Emulator:
             # A program may end with something on its way to it.
             usual = ("compiling", "Ctrl-C ends", "ICMP port unreachable")
             assert any(words in line for words in usual), stderr
-        for direction in ("forward", "back"):
+        for direction in ("forward", "reverse"):
             assert not any(link[direction]["unintended"].values()), link[direction]["unintended"]
         return link
 

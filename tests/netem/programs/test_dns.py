@@ -33,7 +33,7 @@ QUESTIONS = 4
 
 class Case(NamedTuple):
     forward: str
-    back: str
+    reverse: str
     most: int
     """Tries that are enough."""
 
@@ -112,7 +112,7 @@ def answered(case: Case) -> Iterator[bool]:
     """Whether each try gets an answer, by the rules alone."""
     there, back = (
         Link(settings_of(shlex.split(words)), 0, LINK_NAME, direction)
-        for words, direction in ((case.forward, "forward"), (case.back, "back"))
+        for words, direction in ((case.forward, "forward"), (case.reverse, "reverse"))
     )
     while True:
         yield passes(there) and passes(back)
@@ -125,7 +125,7 @@ def passes(link: Link) -> bool:
 def ask(emulate: Emulate, case: Case) -> list[Asked]:
     """Ask all questions; what is answered is what the rules foretell."""
     with dns_server() as server:
-        emulator = emulate(server, case.forward, "--back", case.back)
+        emulator = emulate(server, case.forward, "--reverse", case.reverse)
         with closing(Client(emulator.host, emulator.port)) as client:
             asked = [client.ask(number) for number in range(QUESTIONS)]
         link = emulator.finish()

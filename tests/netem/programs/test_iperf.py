@@ -56,13 +56,13 @@ def run(emulate: Emulate, words: Sequence[str], *options: str) -> Ran:
     return Ran(measured, emulator, emulator.finish())
 
 
-@pytest.mark.parametrize("reverse", [False, True], ids=["forward", "back"])
+@pytest.mark.parametrize("reverse", [False, True], ids=["forward", "reverse"])
 def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, reverse: bool) -> None:
     # The first datagram of a stream opens it: iperf3 does not repeat it.
     words = ("--both", "loss 10% mansd 3 first")
     options = (*SIZE, "--bitrate", "1M", "--time", "1", "--parallel", str(STREAMS))
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
-    direction = "back" if reverse else "forward"
+    direction = "reverse" if reverse else "forward"
     of = ran.link[direction]
     assert of["longest_loss_burst"] <= 3
     assert of["fates"]["dropped"] == of["arrived"] - of["forwarded"] > 0
@@ -81,14 +81,14 @@ def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, rever
     assert dropped_of_all == of["fates"]["dropped"]
 
 
-@pytest.mark.parametrize("reverse", [False, True], ids=["forward", "back"])
+@pytest.mark.parametrize("reverse", [False, True], ids=["forward", "reverse"])
 def test_iperf3_sees_the_order_in_which_the_emulator_lets_out(
     emulate: Emulate, reverse: bool
 ) -> None:
     words = ("--both", "delay 10ms reorder 20% loss 5% duplicate 3% mansd 5 first")
     options = (*SIZE, "--bitrate", "1M", "--time", "1")
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
-    direction = "back" if reverse else "forward"
+    direction = "reverse" if reverse else "forward"
     of = ran.link[direction]
     assert of["longest_loss_burst"] <= 5
     assert of["delivered_out_of_order"] > 50

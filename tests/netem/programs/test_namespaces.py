@@ -151,7 +151,7 @@ def test_each_client_address_is_a_flow_with_a_way_back(
         flow = flows[url(address, CLIENT_PORT)]
         assert flow["packets"] == COUNT
         there_fates = [row["fate"] for row in emulator.fates("forward", flow["flow"])]
-        back_fates = [row["fate"] for row in emulator.fates("back", flow["flow"])]
+        back_fates = [row["fate"] for row in emulator.fates("reverse", flow["flow"])]
         passed = [f"{address} {n}" for n, fate in enumerate(there_fates) if fate in LET_OUT]
         of_server = [one for one in seen if one[2].startswith(f"{address} ")]
         # The server sees the emulator, at a port for each client, and what the emulator let out.

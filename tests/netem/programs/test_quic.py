@@ -90,7 +90,7 @@ def test_content_comes_through_unchanged_both_ways(
     answer, link = asyncio.run(go())
     assert received == [content]
     assert answer == content[::-1]
-    for direction in ("forward", "back"):
+    for direction in ("forward", "reverse"):
         of = link[direction]
         assert of["arrived_bytes"] > CONTENT_BYTES
         assert of["fates"]["dropped"] > 0

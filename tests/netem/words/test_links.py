@@ -43,7 +43,7 @@ forward.impairments = [
     { kind = "loss", loss = { model = "gilbert_elliott", mean_loss = 0.05, mean_burst = 3 } },
     { kind = "delay", delay_s = 0.02 },
 ]
-back = "loss trace lost.txt"
+reverse = "loss trace lost.txt"
 """
 
 
@@ -61,7 +61,7 @@ def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
         listen=("127.0.0.1", 9000),
         to=("127.0.0.1", 9001),
         forward=settings_of("delay 10ms loss 5% mansd 4"),
-        back=LinkSettings(),
+        reverse=LinkSettings(),
         seed=7,
     )
     assert video == LinkSpec(
@@ -69,7 +69,7 @@ def test_links_are_given_in_words_or_tables(tmp_path: Path) -> None:
         listen=("::1", 0),
         to=("::1", 9003),
         forward=settings_of("loss burst 5% 3 delay 20ms"),
-        back=LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)),
+        reverse=LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1,), repeat_every=3)),)),
         return_path=False,
         idle_s=5.0,
         most_clients=10,
@@ -99,9 +99,10 @@ LINK = {"name": "a", "listen": ":9000", "to": ":9001"}
         ({"words": "seed 3"}, 'words = "seed 3": seed 3: belongs to the link, not to one of its '),
         ({"words": "", "forward": ""}, 'words = "": is short for forward; give one of them'),
         ({"words": 3}, "words = 3: should be a table"),
-        ({"back": {"mandsd": 3}}, "back.mandsd = 3: unknown key; did you mean mansd?"),
-        ({"back": {"impairments": [{"kind": "dely"}]}}, 'back.impairments.0.kind = "dely": must be '
-         "one of blackout, corrupt, delay, duplicate, loss, rate, reorder; did you mean delay?"),
+        ({"reverse": {"mandsd": 3}}, "reverse.mandsd = 3: unknown key; did you mean mansd?"),
+        ({"reverse": {"impairments": [{"kind": "dely"}]}}, 'reverse.impairments.0.kind = "dely": '
+         "must be one of blackout, corrupt, delay, duplicate, loss, rate, reorder; did you mean "
+         "delay?"),
         ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
           "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "
          "or equal to 1"),
@@ -159,7 +160,7 @@ def test_the_schema_takes_what_the_code_takes() -> None:
     jsonschema.Draft202012Validator.check_schema(json_schema())
     validator = jsonschema.Draft202012Validator(json_schema())
     assert [error.message for error in validator.iter_errors(tomllib.loads(TWO))] == []
-    for wrong in ({}, {"link": []}, {"link": [LINK | {"back": 3}]}, {"link": [LINK | {"x": 3}]}):
+    for wrong in ({}, {"link": []}, {"link": [LINK | {"reverse": 3}]}, {"link": [LINK | {"x": 3}]}):
         assert not validator.is_valid(wrong)
 
 

@@ -108,7 +108,7 @@ def test_what_names_no_file_stays_as_it_is(tmp_path: Path) -> None:
         (None, "cannot be read: No such file or directory"),
         (b"01x1", "has a 'x'; a trace is of 0 and 1, and white space"),
         (b"01\xff", "has a 'ÿ'; a trace is of 0 and 1"),
-        (b" \n", "is empty; a trace has a 1 for each lost datagram"),
+        (b" \n", "is empty; a trace has a 1 for each lost packet"),
     ],
 )
 def test_a_mistake_in_a_trace_gets_one_line(
@@ -118,9 +118,9 @@ def test_a_mistake_in_a_trace_gets_one_line(
         (tmp_path / "t").write_bytes(content)
     settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="t")),))
     with pytest.raises(CallerError) as caught:
-        read_files(settings, tmp_path, "l.toml: link.0.back")
+        read_files(settings, tmp_path, "l.toml: link.0.reverse")
     assert str(caught.value).startswith(
-        f'l.toml: link.0.back.impairments.0.loss.file = "t": {says}'
+        f'l.toml: link.0.reverse.impairments.0.loss.file = "t": {says}'
     )
     with pytest.raises(CallerError) as caught:
         read_files(settings, tmp_path)
@@ -133,7 +133,7 @@ def test_a_mistake_in_a_trace_gets_one_line(
         ("t", 0.0, None, "cannot be read: No such file or directory"),
         ("t", 0.0, "0.01\nslow\n", "line 2: slow: expected one delay, e.g. 0.0125 or 12.5ms"),
         ("t", 0.0, "0.01\n1h\n", "line 2: 1h: expected one delay"),
-        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; 2 to 1000000 are of use"),
+        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; expected 2 to 1000000"),
         ("t", 0.0, "0.01\n4000\n", "has a delay beyond 3600 s"),
         ("t", 0.001, "0.01\n0.02\n", "observed delays are taken as they are, and have no jitter"),
         ("t.dist", 0.0, "1 2 3", "a distribution table is scaled by the jitter, which is 0"),

@@ -84,7 +84,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"kind": "rate", "rate_bps": 1000, "queue": 0}, "greater than or equal to 1"),
     (
         {"kind": "rate", "rate_bps": 1, "queue": 1_000_000},
-        "rate_bps: a full queue of the longest datagrams would take more than a century",
+        "rate_bps: a full queue of the longest packets would take more than a century",
     ),
     ({"kind": "blackout", "intervals_s": []}, "at least 1 item"),
     (

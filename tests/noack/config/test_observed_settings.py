@@ -40,7 +40,7 @@ def said_of(content: dict[str, Any], **changes: Any) -> str:
          "plant.disturbances.0.until_s = 1.0: must be later than from_s"),
         ({"kind": "sine", "amplitude": [1.0]}, "plant.disturbances.0.hz: missing"),
         ({"kind": "sin", "amplitude": [1.0]}, "plant.disturbances.0.kind = \"sin\": must be one of "
-         "uniform, gaussian, sine, step; did you mean sine?"),
+         "gaussian, sine, step, uniform; did you mean sine?"),
         ({"kind": "sine", "amplitude": [1.0], "hz": 1.0, "at": "output"},
          "plant.disturbances.0.at = \"output\": should be 'input' or 'state'"),
         ({"kind": "uniform", "std": [1.0]}, "plant.disturbances.0.std = [1.0]: unknown key"),
@@ -60,7 +60,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         "disturbances": [{"kind": "uniform", "at": "state", "bound": [1.0] * 4}],
     }  # fmt: skip
     assert said_of(content) == (
-        'file: plant.disturbances.0.at = "state": "state" is for linear plants; '
+        'file: plant.disturbances.0.at = "state": "state" needs a linear plant; '
         'this one can be disturbed at "input"'
     )
 
@@ -70,7 +70,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
     [
         ({"C": [[1.0, 0.0]]}, None,
          "plant.measurement.C = [[1.0, 0.0]]: without an [observer] the sensor has to measure "
-         "every state; give one, or no C"),
+         "every state; give an [observer], or no C"),
         ({"C": [[1.0]]}, KALMAN,
          "plant.measurement.C = [[1.0]]: expected 1 x 2 (the model has 2 states and 1 inputs; "
          "one row per output), found 1 x 1"),
@@ -90,7 +90,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "observer.poles_per_s = [-5.0]: expected 2 poles (one per state, a pair counts twice), "
          "found 1"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, 1.0]},
-         "observer.poles_per_s = [-5.0, 1.0]: must have negative real parts, for the error to die"),
+         "observer.poles_per_s = [-5.0, 1.0]: need negative real parts, else the error grows"),
         (POSITION, {"kind": "luenberger", "poles_per_s": [[-5.0, -1.0]]},
          "observer.poles_per_s = [[-5.0, -1.0]]: a pair [re, im] needs im > 0; write a real pole "
          "as a number"),
@@ -99,7 +99,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "luenberger", "poles_per_s": [-5.0, -5.0]},
          "observer.poles_per_s: cannot be placed: "),
         ({"C": [[0.0, 1.0]]}, LUENBERGER,
-         "plant.measurement.C: no observer can follow: the mode e^(0"),
+         "plant.measurement.C: the model's mode e^(0"),
         (POSITION, {"kind": "kalman", "input_std": [0.1]},
          "observer.initial_std: missing (standard deviation of x − x̂ before the first measurement"),
         (POSITION, KALMAN | {"initial_std": [1.0]},
@@ -112,13 +112,13 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0], "Q": [[1.0, 2.0], [0.0, 1.0]]},
          "observer.Q = [[1.0, 2.0], [0.0, 1.0]]: must be symmetric"),
         ({"C": [[1.0, 0.0]]}, KALMAN,
-         "observer.noise_std: every output needs some noise, for the filter to weigh it; give "
-         "noise_std or R, or the measurement's own"),
+         "observer.noise_std: the filter needs a noise above 0 on every output; give noise_std "
+         "or R, or plant.measurement's noise"),
         (POSITION, {"kind": "kalman", "initial_std": [1.0, 1.0]},
-         "observer.process_std: without any process noise the filter stops listening; give "
+         "observer.process_std: without process noise the Kalman gain tends to 0; give "
          "process_std, input_std or Q, or random disturbances of the plant"),
         (POSITION, {"kind": "luenburger", "gain": [[1.0], [1.0]]},
-         'observer.kind = "luenburger": must be one of luenberger, kalman; '
+         'observer.kind = "luenburger": must be one of kalman, luenberger; '
          "did you mean luenberger?"),
     ],
 )  # fmt: skip
@@ -142,7 +142,7 @@ def test_what_a_datagram_cannot_carry(content: dict[str, Any]) -> None:
 def test_every_flow_has_its_length(content: dict[str, Any]) -> None:
     content["plant"] |= {"measurement": POSITION, "measure_every": 3}
     scenario = validate(content | {"observer": KALMAN}, "file")
-    lengths = [scenario.entries(flow) for flow in Flow]
+    lengths = [scenario.message_sizes.entries(flow) for flow in Flow]
     assert lengths == [1 + 3, 2, 1, 0]  # y and three inputs; x̂; u; nothing
 
 

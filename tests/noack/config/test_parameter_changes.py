@@ -15,6 +15,7 @@ from noack.config.parameter_changes import (
 from noack.config.resolution import resolve
 from noack.config.runtime_parameters import full_key, is_of_loss_alone, text_of
 from noack.config.scenario import Scenario
+from noack.config.scenario_changes import content_with_settings
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
@@ -76,7 +77,9 @@ def test_another_loss_model_begins_without_the_keys_of_the_one_before(scenario: 
 
 def test_a_change_is_valid_if_the_whole_scenario_is(scenario: Scenario) -> None:
     for settings in ({"network.loss.probability": 0.2}, {"controller.setpoint": [3.0, 0.0]}):
-        assert changed(scenario, settings) == validate(scenario.changed_content(settings), "x")
+        assert changed(scenario, settings) == validate(
+            content_with_settings(scenario, settings), "x"
+        )
 
 
 def test_nothing_changes_where_updates_are_acknowledged(content: dict[str, Any]) -> None:
@@ -104,7 +107,7 @@ def test_a_scenario_says_what_changes_and_is_read_back(
         ([{"at_s": 2.0, "set": {"network.mansd": 1}}], "changes.0.at_s.*the run ends at 1 s"),
         (
             [{"at_s": 0.5, "set": {"network.mansd": 1}}, {"at_s": 0.4, "set": {"trigger.beta": 1}}],
-            "changes.1.at_s.*before the change that it follows",
+            "changes.1.at_s.*earlier than the change before it",
         ),
         ([{"at_s": 0.5, "set": {"network.mansd": -1}}], "changes.0.set.*greater than or equal"),
         ([{"at_s": 0.5, "set": {"horizon_s": 1}}], "changes.0.set.*cannot be changed"),

@@ -38,7 +38,10 @@ def test_updates_are_felt_later_by_the_networks_delay(
     content["network"]["impairments"] = [{"kind": "delay", "delay_s": 0.02, "jitter_s": 0.01}]
     resolved = resolve(validate(content, "here"))
     delayed = nominal_conditions(resolved, late_periods)
-    step_s, tick_s = resolved.plant_period_ns * 1e-9, resolved.controller_period_ns * 1e-9
+    step_s, tick_s = (
+        resolved.timing.plant_period_ns * 1e-9,
+        resolved.timing.controller_period_ns * 1e-9,
+    )
     assert delayed.delay_s - at_once.delay_s == pytest.approx(0.03, abs=step_s + tick_s)
     assert delayed.delay_s >= 0.03 + late_periods * step_s
     # The input's way does not lead through this network.

@@ -10,10 +10,10 @@ from cosim.output.viewer.pictures.phase_picture import PhasePicture
 from cosim.output.viewer.pictures.picture import Picture, Reals
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
-from noack.config.plant_systems import CartPoleSettings
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Propagator
+from noack.plants.cart_pole import CartPoleSettings
 
 _LEVELS = ("level_1", "level_2", "level_3", "level_4")
 _SAMPLES = 400
@@ -25,7 +25,7 @@ def picture_of(scenario: Scenario) -> Picture:
     loop, system = loop_of(scenario), scenario.plant.system
     kind: str = system.kind
     own = system.internal_names
-    reach = reach_of(loop, scenario.horizon_ns)
+    reach = reach_of(loop, scenario.timing.horizon_ns)
     if isinstance(system, CartPoleSettings):
         return PendulumPicture(0, 2, reach_m=float(reach[0]), pole_m=2 * system.length_m)
     if kind == "quadrotor":

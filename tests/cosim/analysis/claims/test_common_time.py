@@ -5,7 +5,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
 from cosim.record.run_record import RunRecord

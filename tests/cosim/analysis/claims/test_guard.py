@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from controller_node.controller import controller_of
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.condition_reader import ConditionReader, read_conditions
 from cosim.analysis.claims.observed_conditions import (
     AssumptionViolation,
@@ -133,8 +134,8 @@ def test_batches_in_any_order_show_what_the_whole_record_shows(make: Make) -> No
         assert found.start_s == whole.start_s
         assert all(part.start_s <= whole.start_s for part in parts)
         guard, said = guarded(record, seed)
-        expected = whole.departures(allowed_conditions(resolved))
-        assert guard.left == whole.left(allowed_conditions(resolved))
+        expected = whole.violations(allowed_conditions(resolved))
+        assert guard.void_from == whole.first_violation(allowed_conditions(resolved))
         assert {one[:2] for one in said} == {one[:2] for one in expected}
         seen.update(one.cause for one in said)
 
@@ -239,24 +240,26 @@ def sensor_anew(make: Make) -> tuple[RunRecord, float]:
     resolved, at_ns = make(), 50_000_000
     successor = sensor_of(resolved, Start(1, at_ns))
     record = simulate_with(resolved, "sensor", lambda one: Reborn(one, successor, at_ns))
-    assert (np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == resolved.measurement_period_ns).all()
+    assert (
+        np.diff(record[SENSOR_MEASUREMENT]["t_ns"]) == resolved.timing.measurement_period_ns
+    ).all()
     return record, 0.05
 
 
 @pytest.mark.parametrize(
     ("leave", "why"),
     [
-        (lost_at_the_controller, "4 updates lost in a row, 2 allowed"),
-        (lost_before_the_network, "4 updates lost in a row, 2 allowed"),
-        (late_update, "an update was felt after 0.04 s, 0.01 s allowed"),
+        (lost_at_the_controller, "4 consecutive updates lost, 2 allowed"),
+        (lost_before_the_network, "4 consecutive updates lost, 2 allowed"),
+        (late_update, "an update took effect after 0.04 s, 0.01 s allowed"),
         (no_measurement, "no measurement for 0.04 s, 0.01 s allowed"),
         (slow_controller, "an input was 0.315 s old, 0.015 s allowed"),
-        (late_start, "the plant felt no input until "),
-        (zero_input, "the input was the watchdog's: the newest actuation was "),
-        (model_input, "the input was the watchdog's: the newest actuation was "),
-        (safe_input, "the input was the controller's safe one, up to 0.5: it knew no state"),
-        (started_anew, "the input was the controller's safe one, up to 0: it knew no state"),
-        (sensor_anew, "the sensor was started anew"),
+        (late_start, "the plant applied no input until "),
+        (zero_input, "the watchdog replaced the input: the newest actuation was "),
+        (model_input, "the watchdog replaced the input: the newest actuation was "),
+        (safe_input, "the controller had no state and sent its safe input, largest entry 0.5"),
+        (started_anew, "the controller had no state and sent its safe input, largest entry 0"),
+        (sensor_anew, "the sensor was restarted"),
     ],
 )
 def test_claims_are_void_from_the_moment_on_and_for_the_reason_that_the_guard_says(
@@ -272,7 +275,7 @@ def test_claims_are_void_from_the_moment_on_and_for_the_reason_that_the_guard_sa
         assert claim.since_s == pytest.approx(when_s)
         assert claim.why.startswith(why)
     guard, said = guarded(record)
-    assert guard.left == (pytest.approx(when_s), claims[0].why)
+    assert guard.void_from == (pytest.approx(when_s), claims[0].why)
     assert len({one.cause for one in said}) == len(said)
     first = min(said)
     assert first.t_s == pytest.approx(when_s)
@@ -292,7 +295,7 @@ def test_a_number_that_is_none_is_no_measurement(make: Make) -> None:
     assert ("sampling", pytest.approx(last_s)) in [(one.cause, one.t_s) for one in said]
     with np.errstate(all="ignore"):
         judged = [claim for claim in ClaimEvaluation(record).judge() if claim.source == "(I1)"]
-    assert guard.left is not None
+    assert guard.void_from is not None
     for claim in judged:
         assert claim.verdict is ClaimVerdict.VOID
         assert claim.since_s is not None
@@ -301,7 +304,7 @@ def test_a_number_that_is_none_is_no_measurement(make: Make) -> None:
 
 def test_a_run_that_keeps_to_its_conditions_is_not_talked_about(run: RunRecord) -> None:
     guard, said = guarded(run)
-    assert (said, guard.left, guard.blind) == ([], None, None)
+    assert (said, guard.void_from, guard.stopped) == ([], None, None)
 
 
 def test_nothing_is_said_of_what_is_claimed_nowhere(make: Make) -> None:
@@ -316,7 +319,7 @@ def test_nothing_is_said_of_what_is_claimed_nowhere(make: Make) -> None:
 
 
 def _absolute(make: Make) -> Scenario:
-    from noack.config.triggers import AbsoluteSettings
+    from noack.trigger.absolute import AbsoluteSettings
 
     return make().model_copy(update={"trigger": AbsoluteSettings(policy="absolute", delta=0.02)})
 
@@ -370,9 +373,9 @@ def test_a_guard_gives_up_rather_than_keep_everything(make: Make) -> None:
         rows["event"] += number * len(sensor)
         guard.take(SENSOR_MEASUREMENT, rows)
         guard.advance()
-        if guard.blind is not None:
+        if guard.stopped is not None:
             break
-    assert guard.blind == "a process has not been heard of for too long"
+    assert guard.stopped == "a process has sent no rows for too long"
     assert guard.end() == []
 
 
@@ -382,7 +385,7 @@ def test_what_was_violated_before_stays_violated(make: Make) -> None:
     rows["e_s_norm"][100] = 5.0
     judged = ClaimEvaluation(changed(record, **{SENSOR_MEASUREMENT: rows})).judge()
     claims = {c.what: c for c in judged if c.source == "certificate"}  # fmt: skip
-    violated = claims["the sensor's error follows its threshold"]
+    violated = claims["the sensor's error is bounded"]
     assert (violated.verdict, violated.since_s) == (ClaimVerdict.VIOLATED, pytest.approx(1.0))
     assert claims["the controller's error is bounded"].verdict is ClaimVerdict.VOID
     assert len(record[PLANT_STEP]) == 601

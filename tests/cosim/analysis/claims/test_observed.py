@@ -33,7 +33,7 @@ def allowed(record: RunRecord) -> NetworkConditions:
 
 
 def left(record: RunRecord) -> tuple[float, str]:
-    found = read_conditions(record).left(allowed(record))
+    found = read_conditions(record).first_violation(allowed(record))
     assert found is not None
     return found
 
@@ -66,7 +66,7 @@ def test_a_simulated_run_keeps_to_its_own_schedule_whatever_the_rates(make: Make
     def check(step_ns: int, tick_ns: int, every: int, phase: float, sync: str) -> None:
         resolved = busy(step_ns, tick_ns, every, phase, sync, 0.3, make)
         record = simulate(resolved)
-        assert read_conditions(record).left(nominal_conditions(resolved, 0)) is None
+        assert read_conditions(record).first_violation(nominal_conditions(resolved, 0)) is None
 
     check()
 
@@ -129,7 +129,7 @@ def test_too_many_losses_in_a_row_are_told_at_the_one_too_many(make: Make) -> No
     record = simulate(make(), network_of(lambda n: None if n in lost else 0))
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 10))
-    assert why == "4 updates lost in a row, 2 allowed"
+    assert why == "4 consecutive updates lost, 2 allowed"
     assert read_conditions(record).summary()["dropouts"] == 4
 
 
@@ -138,7 +138,7 @@ def test_losses_of_the_end_count_although_nothing_follows_them(make: Make) -> No
     assert record[SENSOR_MEASUREMENT]["event"].max() > 25
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 22))
-    assert "lost in a row" in why
+    assert "consecutive updates lost" in why
 
 
 def test_a_late_update_is_told_at_its_event(make: Make) -> None:
@@ -146,14 +146,14 @@ def test_a_late_update_is_told_at_its_event(make: Make) -> None:
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 7))
     # 33 ms later, at the tick after that, and the plant's step after the tick.
-    assert why == "an update was felt after 0.04 s, 0.01 s allowed"
+    assert why == "an update took effect after 0.04 s, 0.01 s allowed"
 
 
 def test_an_update_that_was_overtaken_is_lost(make: Make) -> None:
     record = simulate(make(), network_of(lambda n: 2000 if n in (7, 8, 9) else 0))
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 9))
-    assert why == "3 updates lost in a row, 2 allowed"
+    assert why == "3 consecutive updates lost, 2 allowed"
 
 
 def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
@@ -165,8 +165,8 @@ def test_an_update_that_is_overtaken_in_time_is_not_lost(make: Make) -> None:
     taken = set(record[CONTROLLER_DELIVERY]["sequence"].tolist())
     delivered_out_of_order = [n for n in range(len(observed.losses.t_s) - 2) if n not in taken]
     assert delivered_out_of_order
-    assert observed.losses.runs(0.0).largest() == 1
-    assert observed.losses.runs(allowance_s).largest() == 0
+    assert observed.losses.consecutive(0.0).largest() == 1
+    assert observed.losses.consecutive(allowance_s).largest() == 0
 
 
 def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None:
@@ -176,7 +176,7 @@ def test_an_update_that_never_came_is_late_from_its_event_on(make: Make) -> None
     record = changed(whole, **{CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})
     when_s, why = left(record)
     assert when_s == pytest.approx(event_s(record, 12))
-    assert "an update was felt after" in why
+    assert "an update took effect after" in why
 
 
 def test_missing_measurements_are_told_at_the_last_before_them(run: RunRecord) -> None:
@@ -208,7 +208,7 @@ def test_an_old_input_is_told_when_it_is_too_old(run: RunRecord) -> None:
 
 def test_an_input_of_the_future_is_too_far_from_now_as_well(run: RunRecord) -> None:
     """A plant that is late by 3.5 steps latches what the controller meant for later."""
-    assert read_conditions(held(run, 200, 203, -2)).left(allowed(run)) is None
+    assert read_conditions(held(run, 200, 203, -2)).first_violation(allowed(run)) is None
     assert left(held(run, 200, 203, -4)) == (
         pytest.approx(2.0), "an input was 0.035 s old, 0.015 s allowed",
     )  # fmt: skip
@@ -221,7 +221,7 @@ def test_an_update_that_the_model_had_late_is_late_even_if_the_plant_was_later(
     deliveries["model_t_ns"][5] += 30_000_000
     when_s, why = left(changed(run, **{CONTROLLER_DELIVERY: deliveries}))
     assert when_s == pytest.approx(deliveries["t_ns"][5] * 1e-9)
-    assert why == "an update was felt after 0.03 s, 0.01 s allowed"
+    assert why == "an update took effect after 0.03 s, 0.01 s allowed"
 
 
 def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
@@ -235,7 +235,7 @@ def test_a_late_start_leaves_the_conditions_at_once(make: Make) -> None:
         assert found.start_s > 0.01
         when_s, why = left(record)
         assert when_s == 0.0
-        assert why.startswith("the plant felt no input until")
+        assert why.startswith("the plant applied no input until")
 
 
 def test_what_the_start_brings_late_is_the_start_s(make: Make) -> None:
@@ -265,7 +265,7 @@ def test_without_the_network_s_word_the_losses_are_known_from_the_controller(
     run: RunRecord,
 ) -> None:
     whole, blind = read_conditions(run), read_conditions(without(run, "netem"))
-    assert blind.losses.runs(0.0).largest() == whole.losses.runs(0.0).largest() == 2
+    assert blind.losses.consecutive(0.0).largest() == whole.losses.consecutive(0.0).largest() == 2
     assert blind.hold.largest() == whole.hold.largest()
 
 
@@ -273,7 +273,7 @@ def test_an_empty_record_has_conditions_too(run: RunRecord) -> None:
     empty = without(run, "plant", "sensor", "netem", "controller")
     found = read_conditions(empty)
     assert set(found.summary().values()) == {None}
-    assert found.left(allowed(run)) is not None
+    assert found.first_violation(allowed(run)) is not None
 
 
 def until(run: RunRecord, end_s: float, *names: str) -> RunRecord:
@@ -323,7 +323,7 @@ def test_a_run_that_diverges_is_without_measurements_from_then_on(make: Make) ->
     )  # fmt: skip
     with np.errstate(all="ignore"):
         found: ObservedConditions = read_conditions(record)
-    when_s, _ = found.left(allowed(record)) or (np.nan, "")
+    when_s, _ = found.first_violation(allowed(record)) or (np.nan, "")
     assert when_s <= 0.4
     assert found.sampling.largest() == pytest.approx(0.65, abs=0.02)
 
@@ -334,7 +334,7 @@ def test_rows_of_every_table_may_be_none_at_all(make: Make) -> None:
     rows = {table: np.zeros(0, dtype) for table, dtype in tables(n, m).items()}
     found = read_conditions(RunRecord(resolved, rows, [], {}))
     assert found.start_s == np.inf
-    assert found.losses.runs(0.0).largest() is None
+    assert found.losses.consecutive(0.0).largest() is None
     one = rows | {PLANT_STEP: np.zeros(1, tables(n, m)[PLANT_STEP])}
     one[PLANT_STEP]["actuation"] = NO_SEQUENCE
     assert read_conditions(RunRecord(resolved, one, [], {})).start_s == np.inf
@@ -350,4 +350,4 @@ def test_what_is_overtaken_as_the_run_ends_is_not_lost(make: Make) -> None:
     record = simulate(busy, network_of(lambda n: 18 if n == late else 0))
     assert late not in record[CONTROLLER_DELIVERY]["sequence"]
     assert late + 1 in record[CONTROLLER_DELIVERY]["sequence"]
-    assert read_conditions(record).losses.runs(0.02).largest() == 0
+    assert read_conditions(record).losses.consecutive(0.02).largest() == 0

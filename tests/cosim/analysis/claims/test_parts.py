@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
-from cosim.analysis.claims.claim_evaluation import ClaimEvaluation, ClaimVerdict
+from cosim.analysis.claims.claim import ClaimVerdict
+from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.claims_by_part import RunClaims, _start_error
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -118,7 +119,7 @@ def test_a_process_that_never_heard_of_a_change_leaves_nothing_to_claim() -> Non
     rows[CONTROLLER_SETTING] = rows[CONTROLLER_SETTING][:0]
     deaf = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
     (last,) = [one for one in RunClaims(deaf).judge() if one.from_s > 0]
-    assert "not every process heard of it" in last.why
+    assert "not every process received the change" in last.why
 
 
 def test_an_input_too_far_from_kx_voids_the_certificate() -> None:

@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cosim.analysis.claims.theorem_one import _longest, theorem_one
+from cosim.analysis.claims.catalogue.theorem_1_controller_error import (
+    trajectory_delta,
+    undominated,
+)
 from cosim.record.align import AlignedRun, join_all
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -18,7 +21,7 @@ from tests.cosim.analysis.claims.conftest import MS, Make, network_of, of_scenar
 
 
 def delta_of(record: RunRecord) -> float | None:
-    return theorem_one(record, join_all(record))
+    return trajectory_delta(record, join_all(record))
 
 
 def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
@@ -54,7 +57,7 @@ def test_it_bounds_the_error_and_what_the_real_intervals_give(
     )  # fmt: skip
     record = simulate(fast)
     joined = join_all(record)
-    delta = theorem_one(record, joined)
+    delta = trajectory_delta(record, joined)
     assert delta is not None
     assert delta >= by_hand(record, joined) * (1 - 1e-6)
     trigger = record.scenario.trigger
@@ -72,7 +75,7 @@ def test_a_late_update_is_missing_until_it_comes_and_no_longer(make: Make) -> No
     joined = join_all(record)
     starts = np.flatnonzero(record[SENSOR_MEASUREMENT]["event"] != NO_SEQUENCE)
     assert (joined.received[starts[1:]] == np.arange(len(starts) - 1)).all()
-    delta, alone = theorem_one(record, joined), by_hand(record, joined)
+    delta, alone = trajectory_delta(record, joined), by_hand(record, joined)
     assert delta is not None
     # Each stretch is one event long; δ̄_j is some times the real interval.
     assert alone < 4
@@ -101,7 +104,7 @@ def test_the_stretches_that_are_left_out_are_exceeded_by_one_that_is_not(
         sums = list(itertools.accumulate(reversed(stretch)))[::-1]
         return sums + [0.0] * (4 - len(sums))
 
-    kept = _longest(stretches)
+    kept = undominated(stretches)
     for stretch in stretches:
         assert any(
             all(a >= b - 1e-9 for a, b in zip(reaches(one), reaches(stretch), strict=True))

@@ -167,7 +167,7 @@ def test_a_trail_goes_on_from_batch_to_batch() -> None:
 
 def test_what_a_picture_has_room_for_is_what_the_models_loop_goes_through() -> None:
     scenario = resolve(load(ROOT / "scenarios" / "lane_following.toml"))
-    reach = reach_of(loop_of(scenario), scenario.horizon_ns)
+    reach = reach_of(loop_of(scenario), scenario.timing.horizon_ns)
     assert (reach >= np.abs(loop_of(scenario).x0)).all()
     assert reach[3] < 10.0
 

@@ -114,7 +114,7 @@ def test_a_plant_that_is_not_linear_is_drawn_and_its_cost_is_a_sum() -> None:
     record = record_of(one, 0)
     steps = record["plant_step"]
     assert row["status"] == OK
-    assert not record.scenario.is_linear
+    assert not record.scenario.coverage.is_linear
     of_x = (steps["x"] ** 2).sum(axis=1)
     expected = np.trapezoid(of_x, dx=0.005) + 0.005 * (steps["u"][:-1] ** 2).sum()
     assert row["cost"] == pytest.approx(expected, rel=1e-12)

@@ -1,0 +1,23 @@
+"""A certificate's lower bound of the time between two events."""
+
+from cosim.analysis.claims.claim import Envelope
+from cosim.analysis.claims.claim_definition import Bound, CertifiedClaim
+from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.shared_bounds import inter_event_bound, inter_event_envelope
+from noack.theory.scenario_certificates import ScenarioCertificate
+
+
+def _bound(run: RunEvidence, certificate: ScenarioCertificate) -> Bound | None:
+    if certificate.inter_event_s is None:
+        return None
+    return inter_event_bound(run, certificate.inter_event_s, run.violation_of(certificate))
+
+
+def _envelope(run: RunEvidence, certificate: ScenarioCertificate) -> Envelope | None:
+    if certificate.inter_event_s is None:
+        return None
+    label = f"certified for {certificate.scope}"
+    return inter_event_envelope(run, label, certificate.inter_event_s)
+
+
+CLAIM = CertifiedClaim("minimum inter-event time", _bound, _envelope)

@@ -1,0 +1,25 @@
+"""(I1) with the triangle inequality: ‖e_c‖ ≤ ‖e_s‖ + Σ ‖e^{H(t−t_k)} e_s(t_k⁻)‖.
+
+For every plant, trigger and network. Where the sensor estimates x, the error is x_c − x̂.
+"""
+
+from cosim.analysis.claims.claim import Envelope
+from cosim.analysis.claims.claim_definition import Bound, ClaimDefinition
+from cosim.analysis.claims.run_evidence import RunEvidence
+from cosim.analysis.claims.shared_bounds import controller_error_bound
+
+
+def _bound(run: RunEvidence) -> Bound:
+    error = "e_c" if run.record.scenario.coverage.knows_state else "x_c − x̂"
+    formula = f"‖{error}‖ ≤ ‖e_s‖ + Σ ‖e^(H(t−t_k)) e_s(t_k)‖"
+    return controller_error_bound(run, formula, run.error_bounds[0])
+
+
+def _envelope(run: RunEvidence) -> Envelope:
+    return Envelope("bound from (I1)", "e_c", run.t_s, run.error_bounds[0], "identity")
+
+
+CLAIM = ClaimDefinition(
+    "the controller's error is at most the sensor's error plus the missed jumps",
+    "(I1)", "a complete record", _bound, _envelope,
+)  # fmt: skip

@@ -1,0 +1,219 @@
+"""The data that claims are checked against: signals, observed conditions, certificates."""
+
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.claims.claim import Reals
+from cosim.analysis.claims.condition_reader import read_conditions
+from cosim.analysis.claims.observed_conditions import (
+    ObservedConditions,
+    SampledSeries,
+    VoidFrom,
+    earliest,
+)
+from cosim.record.align import AlignedRun, in_common, join_all
+from cosim.record.run_record import RunRecord
+from noack.config.resolution import policy_of
+from noack.config.scenario import Scenario
+from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
+from noack.protocol.topology import LOOP_ROLES
+from noack.theory.certificate import NetworkConditions
+from noack.theory.error_bounds import ErrorMonitor
+from noack.theory.paper_bounds import Theorem2, theorem_2
+from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
+from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
+
+_LONG_S = 1e300  # finite, because an input that never came took an infinite time
+_ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)
+
+
+class RunPart(NamedTuple):
+    """A part of a run that is checked as a run of its own."""
+
+    whole: RunRecord
+    from_s: float = 0.0
+    """Start of the part, in the run's time."""
+    until_s: float = math.inf
+    """End of the claims, in the part's time; the record of the part continues."""
+    start_error: float | None = None
+    """‖u − Kx‖, scaled, until the plant applied the first input of this part; None if it applied
+    no input before."""
+    void: Mapping[str, str] = {}
+    """By scope: why there is no certificate."""
+
+
+@dataclass(frozen=True)
+class RunEvidence:
+    """What is known of a run; each property is computed once, when it is first used.
+
+    Args:
+        record: the record of the run, or of a part of it, as of a run of its own.
+        part: the part; None: the whole run.
+    """
+
+    record: RunRecord
+    part: RunPart | None = None
+
+    @cached_property
+    def joined(self) -> AlignedRun:
+        """The run's samples on the measurement grid."""
+        return join_all(self.record)
+
+    @cached_property
+    def t_s(self) -> Reals:
+        """Times of the measurements, (k,)."""
+        return np.asarray(self.joined.t_ns * 1e-9)
+
+    @cached_property
+    def in_common(self) -> NDArray[np.bool_]:
+        """Where sensor and controller share an update, so that ‖e_c‖ is bounded, (k,)."""
+        common = in_common(self.record.scenario, self.joined)
+        return np.asarray(np.isfinite(self.joined.e_c_norm) & common)
+
+    @property
+    def until_s(self) -> float:
+        """The claims end here; infinite: at the end of the run."""
+        return math.inf if self.part is None else self.part.until_s
+
+    @cached_property
+    def certificates(self) -> list[ScenarioCertificate]:
+        """The certificates of the run's scenario under its schedule."""
+        if self.part is None:
+            return scheduled_certificates(self.record.scenario)
+        found = scheduled_certificates(self.record.scenario, self.part.start_error)
+        return [
+            replace(one, constants=None, floor_constants=None, void=self.part.void[one.scope])
+            if one.scope in self.part.void
+            else one
+            for one in found
+        ]
+
+    @cached_property
+    def observed(self) -> ObservedConditions:
+        """The conditions under which the run took place."""
+        found = read_conditions(self.record)
+        if self.part is None or self.part.start_error is None:
+            return found
+        # The certificate covers the inputs before the part's first one by its start error.
+        safe, restarts = found.safe_input, found.restarts
+        kept, again = safe.t_s >= found.start_s, restarts.t_s > 0
+        return found._replace(
+            start_s=0.0 if np.isfinite(found.start_s) else found.start_s,
+            safe_input=SampledSeries(safe.t_s[kept], safe.value[kept]),
+            restarts=SampledSeries(restarts.t_s[again], restarts.value[again]),
+        )
+
+    @property
+    def conditions(self) -> dict[str, float | None]:
+        """Largest observed value of each condition."""
+        return self.observed.summary()
+
+    @property
+    def started_s(self) -> float:
+        """When the plant applied the first input of the controller; infinite if never."""
+        return read_conditions(self.record).start_s
+
+    @cached_property
+    def first_gap(self) -> VoidFrom | None:
+        """From when on the record is incomplete, so that no claim can be checked."""
+        limit = _ANY._replace(sampling_s=self._schedule.sampling_s)
+        found = [self.observed.first_violation(limit, ("sampling",))]
+        whole, from_s = self.record, 0.0
+        if self.part is not None:
+            whole, from_s = self.part.whole, self.part.from_s
+        for role in LOOP_ROLES:
+            gaps_ns = filter(None, (life.hole_ns() for life in whole.lives(role)))
+            why = f"rows of {role} are missing from the record"
+            found += [VoidFrom(t_s, why) for ns in gaps_ns if (t_s := ns * 1e-9 - from_s) >= 0]
+        first = np.argmax(self.in_common)
+        gaps = np.flatnonzero(~self.in_common[first:])
+        if len(gaps):
+            why = "the controller's error is not on record, or not finite"
+            found.append(VoidFrom(float(self.t_s[first + gaps[0]]), why))
+        return earliest(found)
+
+    @cached_property
+    def mansd_violation(self) -> VoidFrom | None:
+        """When more than M − 1 consecutive updates had been lost, for whatever reason."""
+        limit = _ANY._replace(dropouts=self._schedule.dropouts)
+        return self.observed.first_violation(limit, ("dropouts",))
+
+    @cached_property
+    def paper_violation(self) -> VoidFrom | None:
+        """When M − 1 was exceeded, or u was not K x_c: the paper's theorems assume both."""
+        limit = _ANY._replace(dropouts=self._schedule.dropouts)
+        causes = ("dropouts", "watchdog", "safe input", "restart")
+        return earliest([self.observed.first_violation(limit, causes), self.first_gap])
+
+    def violation_of(self, certificate: ScenarioCertificate) -> VoidFrom | None:
+        """When the run first violated the conditions of a certificate."""
+        return self.observed.first_violation(certificate.conditions)
+
+    @cached_property
+    def _schedule(self) -> NetworkConditions:
+        return nominal_conditions(self.record.scenario)
+
+    @cached_property
+    def error_bounds(self) -> tuple[Reals, Reals]:
+        """Bounds of ‖e_c‖_W from (I1) and from eq:LossEv3, (k,) each; NaN before the start."""
+        monitor = ErrorMonitor(self.record.loop.H, policy_of(self.record.scenario))
+        rows = self.record[SENSOR_MEASUREMENT]
+        found = np.array(
+            [
+                monitor.sample(int(t_ns), e_s, int(event), int(received))
+                for t_ns, e_s, event, received in zip(
+                    rows["t_ns"], rows["x_s"] - rows["x"], rows["event"], self.joined.received,
+                    strict=True,
+                )
+            ]
+        ).reshape(-1, 2)  # fmt: skip
+        found[~self.in_common] = np.nan
+        return found[:, 0], found[:, 1]
+
+    @cached_property
+    def theorem_2(self) -> Theorem2 | None:
+        """Theorem 2 with the uniform Δ of (I1) for the paper's conditions; None if it has none."""
+        scenario, loop = self.record.scenario, self.record.loop
+        if (
+            not scenario.coverage.is_certifiable
+            or loop.weight is not None
+            or scenario.decaying.floor > 0
+        ):
+            return None
+        ideal, trigger = certify(scenario, ideal_conditions(scenario)).constants, scenario.decaying
+        if ideal is None or ideal.rate_per_s != trigger.alpha_per_s:
+            return None
+        return theorem_2(loop, trigger.beta, trigger.alpha_per_s, ideal.delta)
+
+    @cached_property
+    def inter_event_s(self) -> tuple[Reals, Reals]:
+        """Times of the events from the second on, and the times since the event before."""
+        rows = self.record[SENSOR_MEASUREMENT]
+        event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
+        return event_ns[1:] * 1e-9, np.diff(event_ns) * 1e-9
+
+
+def scheduled_certificates(
+    scenario: Scenario, start_error: float | None = None
+) -> list[ScenarioCertificate]:
+    """The certificates of a resolved scenario under its schedule; none beyond the theory.
+
+    Args:
+        scenario: the scenario.
+        start_error: for a run that begins with an input of an earlier run; see
+            :class:`noack.theory.scenario_certificates.CertificateScope`.
+    """
+    if not scenario.coverage.is_certifiable:
+        return []
+    conditions, error = allowed_conditions(scenario), 0.0
+    if start_error is not None:
+        conditions, error = conditions._replace(start_s=0.0), start_error
+    found = [certify(scenario, conditions, error), certify_box(scenario, conditions, error)]
+    return [certificate for certificate in found if certificate is not None]

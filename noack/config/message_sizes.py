@@ -1,0 +1,56 @@
+"""How many numbers the messages of a run carry."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from noack.protocol.wire_format import Flow
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class MessageSizes:
+    """Numbers per message of a scenario, by flow."""
+
+    scenario: "Scenario"
+
+    @property
+    def outputs(self) -> int:
+        """The number p of measured outputs."""
+        return self.scenario.plant.measurement.outputs(self.scenario.model.dimensions[0])
+
+    @property
+    def inputs_reported(self) -> int:
+        """Numbers of a measurement that are applied inputs: m per plant step since the last one.
+
+        An observer needs them; without an observer there are none.
+        """
+        if self.scenario.observer is None:
+            return 0
+        return self.scenario.plant.measure_every * self.scenario.model.dimensions[1]
+
+    @property
+    def measurement_entries(self) -> int:
+        """Numbers of a measurement: y, or y and the applied inputs since the last one."""
+        return self.outputs + self.inputs_reported
+
+    @property
+    def is_predictive(self) -> bool:
+        """Whether actuations carry the controller's model state."""
+        return self.scenario.plant.watchdog.policy == "model"
+
+    @property
+    def actuation_entries(self) -> int:
+        """Numbers of an actuation: u, or u and x_c."""
+        n, m = self.scenario.model.dimensions
+        return n + m if self.is_predictive else m
+
+    def entries(self, flow: Flow) -> int:
+        """Numbers of a message of a flow."""
+        return {
+            Flow.MEASUREMENT: self.measurement_entries,
+            Flow.UPDATE: self.scenario.model.dimensions[0],
+            Flow.ACTUATION: self.actuation_entries,
+            Flow.ACKNOWLEDGEMENT: 0,
+        }[flow]

@@ -1,0 +1,130 @@
+"""A scenario with other values of the settings that may change during a run."""
+
+import json
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
+from noack.config.scenario_checks import check_setpoint, check_trigger
+from noack.config.sections.controller_section import ControllerSection
+from noack.config.sections.network_section import NetworkSection
+from noack.config.triggers import AnyTrigger
+from noack.impairments.link_settings import Mansd, require_scores
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.trace import TraceLoss
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
+
+_CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
+    LOSS: TypeAdapter(Loss),
+    MANSD: TypeAdapter(Mansd),
+    "trigger": TypeAdapter(AnyTrigger),
+    "controller": TypeAdapter(ControllerSection),
+}
+"""The parts of a scenario that may change during a run."""
+
+
+def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenario":
+    """Return a scenario with other values of its runtime parameters.
+
+    Only the parts that change are validated: the processes of a run do this in their loop.
+
+    Args:
+        scenario: the scenario.
+        settings: values by keys.
+
+    Raises:
+        ValueError: a key is not a runtime parameter, or the scenario would be invalid.
+    """
+    if scenario.is_acknowledged:
+        raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
+    require_runtime_parameters(settings, scenario.trigger)
+    sections = {key.split(".")[0] for key in settings} - {"network"}
+    changes_loss = any(key.startswith(LOSS) for key in settings)
+    loss = scenario.network.loss
+    content: dict[str, Any] = {
+        name: getattr(scenario, name).model_dump(mode="json", exclude_none=True)
+        for name in sections
+    }
+    content["network"] = {
+        "loss": loss.model_dump(mode="json", exclude_none=True) if changes_loss else {}
+    }
+    put_settings(content, settings)
+    update: dict[str, Any] = {name: _validated(name, content[name]) for name in sections}
+    update["changes"] = ()
+    update["network"] = _changed_network(scenario, content["network"], changes_loss)
+    changed = scenario.model_copy(update=update)
+    if "trigger" in sections:
+        check_trigger(changed)
+    if "controller" in sections:
+        check_setpoint(changed)
+    return changed
+
+
+def content_with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a scenario with other values of its runtime parameters, unchecked.
+
+    Args:
+        scenario: the scenario.
+        settings: values by keys.
+
+    Raises:
+        ValueError: a key is not a runtime parameter.
+    """
+    require_runtime_parameters(settings, scenario.trigger)
+    content = scenario.model_dump(mode="json", exclude_none=True, exclude={"changes"})
+    put_settings(content, settings)
+    return content
+
+
+def check_changes(scenario: "Scenario") -> None:
+    """Check the changes that a scenario schedules: their order, times and settings.
+
+    Raises:
+        ValueError: one is not possible.
+    """
+    for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
+        if other.at_s < one.at_s:
+            raise ValueError(f"changes.{place + 1}.at_s: earlier than the change before it")
+    changed = scenario
+    for place, change in enumerate(scenario.changes):
+        if change.at_ns >= scenario.timing.horizon_ns:
+            raise ValueError(f"changes.{place}.at_s: the run ends at {scenario.horizon_s:g} s")
+        try:
+            changed = with_settings(changed, change.set)
+        except ValidationError as error:
+            raise ValueError(f"changes.{place}.set: {_first_mistake(error)}") from None
+        except ValueError as error:
+            raise ValueError(f"changes.{place}.set: {error}") from None
+
+
+def _changed_network(
+    scenario: "Scenario", content: Mapping[str, Any], changes_loss: bool
+) -> NetworkSection:
+    """The network with another cap or loss model; nothing else of it may change."""
+    update: dict[str, Any] = {}
+    if "mansd" in content:
+        update["mansd"] = _validated(MANSD, content["mansd"])
+    if changes_loss:
+        update["loss"] = _validated(LOSS, content["loss"])
+        if isinstance(update["loss"], TraceLoss):
+            raise ValueError(
+                "network.loss.model: a trace is read before a run begins; give its losses as "
+                '{ model = "scripted", lost = [...] }'
+            )
+        require_scores(scenario.network.impairments, update["loss"])
+    return scenario.network.model_copy(update=update)
+
+
+def _validated(part: str, content: Any) -> Any:
+    return _CHANGEABLE[part].validate_json(json.dumps(content))
+
+
+def _first_mistake(error: ValidationError) -> str:
+    mistake = error.errors(include_url=False)[0]
+    place, message = ".".join(map(str, mistake["loc"])), mistake["msg"]
+    return f"{place}: {message}" if place else message.removeprefix("Value error, ")

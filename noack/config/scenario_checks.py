@@ -1,0 +1,119 @@
+"""Checks of a scenario that concern several of its sections."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from noack.config.disturbances import require_disturbances
+from noack.config.setpoint import input_at
+from noack.core.clock import NS_PER_S
+from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.matrices import require_length, require_shape
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
+
+
+def check_sections(scenario: "Scenario") -> None:
+    """Check the sections of a scenario against each other.
+
+    Raises:
+        ValueError: two do not fit together; the message begins with the key.
+    """
+    timing = scenario.timing
+    if timing.horizon_ns < timing.plant_period_ns:
+        raise ValueError(
+            f"horizon_s: shorter than one plant step ({timing.plant_period_ns / NS_PER_S} s)"
+        )
+    _check_plant(scenario)
+    m = scenario.model.dimensions[1]
+    require_length(scenario.controller.safe_input, "controller.safe_input", m, "one per input")
+    check_setpoint(scenario)
+    _check_observer(scenario)
+    _check_watchdog(scenario)
+    check_trigger(scenario)
+
+
+def check_trigger(scenario: "Scenario") -> None:
+    """Check the trigger against the model's dimensions and the measurement period.
+
+    Raises:
+        ValueError: they do not fit together.
+    """
+    scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
+    scenario.trigger.check_period(scenario.timing.measurement_period_ns)
+
+
+def check_setpoint(scenario: "Scenario") -> None:
+    """Check that an input exists that holds the model at the set point.
+
+    Raises:
+        ValueError: there is none, or another setting excludes a set point.
+    """
+    key, setpoint = "controller.setpoint", scenario.controller.setpoint
+    require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
+    if setpoint is None:
+        return
+    if scenario.is_acknowledged:
+        raise ValueError(f'{key}: not with network.protocol = "ack"')
+    if scenario.message_sizes.is_predictive:
+        raise ValueError(
+            f"{key}: the plant's watchdog does not have it; "
+            'use plant.watchdog.policy = "hold" or "zero"'
+        )
+    try:
+        input_at(*scenario.model.matrices, np.array(setpoint))
+    except ValueError as error:
+        raise ValueError(f"{key}: {error}") from None
+
+
+def _check_plant(scenario: "Scenario") -> None:
+    (n, m), plant, why = scenario.model.dimensions, scenario.plant, _dimensions(scenario)
+    require_shape(plant.uncertainty_A, "plant.uncertainty_A", (n, n), why)
+    require_shape(plant.uncertainty_B, "plant.uncertainty_B", (n, m), why)
+    require_shape(plant.A, "plant.A", (n, n), why)
+    require_shape(plant.B, "plant.B", (n, m), why)
+    for key in ("initial_state", "initial_state_halfwidth"):
+        require_length(getattr(plant, key), f"plant.{key}", n, "one per state")
+    plant.system.check(n, m)
+    linear = scenario.coverage.is_linear
+    require_disturbances(plant.disturbances, n, m, linear=linear)
+    plant.measurement.check(n, why)
+
+
+def _check_observer(scenario: "Scenario") -> None:
+    (n, m), plant, observer = scenario.model.dimensions, scenario.plant, scenario.observer
+    sizes = scenario.message_sizes
+    if observer is None:
+        if not plant.measurement.selects_all(n):
+            raise ValueError(
+                "plant.measurement.C: without an [observer] the sensor has to measure every "
+                "state; give an [observer], or no C"
+            )
+        return
+    observer.check(n, m, sizes.outputs, plant.noise_variances(n, m))
+    if sizes.measurement_entries > MAX_DIMENSION:
+        raise ValueError(
+            "plant.measure_every: with an observer a measurement carries y and the inputs of "
+            f"{plant.measure_every} steps, {sizes.outputs} + {sizes.inputs_reported} numbers; "
+            f"at most {MAX_DIMENSION} fit"
+        )
+
+
+def _check_watchdog(scenario: "Scenario") -> None:
+    timing, (n, m) = scenario.timing, scenario.model.dimensions
+    if timing.actuation_timeout_ns < timing.controller_period_ns:
+        raise ValueError(
+            "plant.watchdog.timeout_s: shorter than a period of the controller "
+            f"({timing.controller_period_ns / NS_PER_S} s)"
+        )
+    if scenario.message_sizes.actuation_entries > MAX_DIMENSION:
+        raise ValueError(
+            'plant.watchdog.policy: with "model" an actuation carries u and x_c, '
+            f"{m} + {n} numbers; at most {MAX_DIMENSION} fit"
+        )
+
+
+def _dimensions(scenario: "Scenario") -> str:
+    n, m = scenario.model.dimensions
+    return f"the model has {n} states and {m} inputs"

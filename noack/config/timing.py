@@ -1,0 +1,62 @@
+"""The times of a run that follow from its settings: periods, phases, timeouts."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from noack.config.sections.rates import period_ns
+from noack.core.clock import NS_PER_S
+
+if TYPE_CHECKING:
+    from noack.config.scenario import Scenario
+
+_TIMEOUT_PERIODS = 5
+_WATCHDOG_PERIODS = 50
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Periods, phases and timeouts of a scenario, in nanoseconds of simulated time."""
+
+    scenario: "Scenario"
+
+    @property
+    def horizon_ns(self) -> int:
+        """Length of the run."""
+        return round(self.scenario.horizon_s * NS_PER_S)
+
+    @property
+    def plant_period_ns(self) -> int:
+        """Period of the plant's steps."""
+        return period_ns(self.scenario.plant.rate_hz)
+
+    @property
+    def measurement_period_ns(self) -> int:
+        """Time between measurements."""
+        return self.plant_period_ns * self.scenario.plant.measure_every
+
+    @property
+    def controller_period_ns(self) -> int:
+        """Period of the controller's ticks."""
+        return period_ns(self.scenario.controller.rate_hz)
+
+    @property
+    def controller_phase_ns(self) -> int:
+        """Time of the controller's first tick."""
+        return round(self.scenario.controller.phase * self.controller_period_ns)
+
+    @property
+    def actuation_timeout_ns(self) -> int:
+        """Age of the newest actuation at which the plant's watchdog acts."""
+        timeout_s = self.scenario.plant.watchdog.timeout_s
+        if timeout_s is None:
+            return _WATCHDOG_PERIODS * self.controller_period_ns
+        return round(timeout_s * NS_PER_S)
+
+    @property
+    def acknowledgement_timeout_ns(self) -> int:
+        """How long the sensor waits for an acknowledgement before it transmits again."""
+        network = self.scenario.network
+        if network.reverse.timeout_s is not None:
+            return round(network.reverse.timeout_s * NS_PER_S)
+        round_trip_s = network.link.longest_delay_s + network.reverse.link.longest_delay_s
+        return _TIMEOUT_PERIODS * self.measurement_period_ns + round(round_trip_s * NS_PER_S)

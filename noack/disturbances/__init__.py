@@ -1,0 +1,1 @@
+"""Disturbances of a plant, one kind per file: its settings and its signal."""

@@ -1,0 +1,54 @@
+"""What every kind of disturbance has.
+
+A disturbance is a function of time, constant over each step of the plant. At the input it is added
+to u behind the actuator, where it is not measured. At the state it is w in ẋ = Ax + Bu + w.
+"""
+
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.settings.matrices import Row
+from noack.settings.section import ScenarioSection
+
+Place = Literal["input", "state"]
+
+
+class SignalSource(NamedTuple):
+    """What a signal is computed from, beside its settings."""
+
+    period_ns: int
+    """Step of the plant."""
+    seed: int
+    stream: tuple[str, ...]
+    """Name of the disturbance's own random stream."""
+
+
+class DisturbanceSettings(ScenarioSection):
+    """Settings of a disturbance."""
+
+    entries_key: ClassVar[str]
+    """The key that gives the disturbance's size, one entry per input or per state."""
+    example: ClassVar[dict[str, Any]]
+    """Settings of this kind with one entry, for property tests and benchmarks."""
+
+    kind: str
+    """What the disturbance is."""
+    at: Place = "input"
+    """Where it enters: added to the input, or to ẋ (of a linear plant)."""
+
+    @property
+    def entries(self) -> Row:
+        """The disturbance's size, one entry per input or per state."""
+        row: Row = getattr(self, self.entries_key)
+        return row
+
+    @property
+    def variance(self) -> Vector:
+        """Variance of the random part of each entry; zeros if the disturbance is not random."""
+        return np.zeros(len(self.entries))
+
+    def signal(self, steps: range, source: SignalSource) -> Matrix:
+        """Return the values that are added during some steps, shape (len(steps), entries)."""
+        raise NotImplementedError

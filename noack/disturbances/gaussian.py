@@ -1,0 +1,38 @@
+"""A random disturbance without a bound."""
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.random_streams import normals
+from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
+from noack.settings.matrices import Row, require_squares
+
+
+class GaussianDisturbance(DisturbanceSettings):
+    """A new value at every step, normally distributed around 0."""
+
+    entries_key: ClassVar = "std"
+    example: ClassVar = {"kind": "gaussian", "std": [0.2]}
+
+    kind: Literal["gaussian"]
+    """What the disturbance is."""
+    std: Row
+    """Standard deviation, entry by entry, of the value that a step holds."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_squares(self.std, "std", "standard deviations")
+        return self
+
+    @property
+    def variance(self) -> Vector:
+        """The standard deviation squared."""
+        return np.square(self.std)
+
+    def signal(self, steps: range, source: SignalSource) -> Matrix:
+        """Independent values with mean 0."""
+        unit = normals(source.seed, *source.stream, rows=steps, width=len(self.std))
+        return np.asarray(np.array(self.std) * unit)

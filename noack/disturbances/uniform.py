@@ -1,0 +1,38 @@
+"""A random disturbance with a bound."""
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.core.random_streams import uniforms
+from noack.disturbances.disturbance_settings import DisturbanceSettings, SignalSource
+from noack.settings.matrices import Row, require_squares
+
+
+class UniformDisturbance(DisturbanceSettings):
+    """A new value at every step, uniformly distributed within a bound."""
+
+    entries_key: ClassVar = "bound"
+    example: ClassVar = {"kind": "uniform", "bound": [0.3]}
+
+    kind: Literal["uniform"]
+    """What the disturbance is."""
+    bound: Row
+    """Largest absolute value, entry by entry."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_squares(self.bound, "bound", "bounds")
+        return self
+
+    @property
+    def variance(self) -> Vector:
+        """A third of the bound squared."""
+        return np.square(self.bound) / 3
+
+    def signal(self, steps: range, source: SignalSource) -> Matrix:
+        """Independent values, uniform in [-bound, bound]."""
+        unit = uniforms(source.seed, *source.stream, rows=steps, width=len(self.bound))
+        return np.asarray(np.array(self.bound) * (2.0 * unit - 1.0))

@@ -1,0 +1,1 @@
+"""State observers of the sensor, one kind per file: its settings, estimator and steady state."""

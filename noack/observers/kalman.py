@@ -1,0 +1,152 @@
+"""The Kalman filter (Kalman 1960), its covariance corrected in the form of Bucy and Joseph.
+
+At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At a measurement S = C P Cᵀ + R,
+L = P Cᵀ S⁻¹, x̂ ← x̂ + L (y − C x̂), P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ, which stays symmetric and
+positive semidefinite however L is rounded.
+"""
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.observers.estimation_model import EstimationModel, NoiseVariances
+from noack.observers.observer_settings import ObserverSettings
+from noack.settings.matrices import Row, Rows, require_length, require_shape, require_squares
+
+
+class KalmanSettings(ObserverSettings):
+    """The time-varying Kalman filter of the model, its covariance in Joseph's form."""
+
+    example: ClassVar = {
+        "kind": "kalman", "input_std": [0.2], "noise_std": [0.01], "initial_std": [1.0, 1.0],
+    }  # fmt: skip
+
+    kind: Literal["kalman"]
+    """What the observer is."""
+    process_std: Row | None = None
+    """Standard deviation of w in ẋ = Âx + B̂u + w, held over a step of the plant, n entries; by
+    default that of the random disturbances at = "state"."""
+    input_std: Row | None = None
+    """Standard deviation of what is added to u, held likewise, m entries; by default that of the
+    random disturbances at = "input"."""
+    Q: Rows | None = None
+    """Or: covariance of what is added to x in a step of the plant, n x n."""
+    noise_std: Row | None = None
+    """Standard deviation of v, p entries; by default that of the measurement."""
+    R: Rows | None = None
+    """Or: covariance of v, p x p."""
+    initial_std: Row
+    """Standard deviation of x − x̂ before the first measurement, n entries: P(0) = diag(·²)."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for key in ("process_std", "input_std", "noise_std", "initial_std"):
+            require_squares(getattr(self, key) or (), key, "standard deviations")
+        for key, others in (("Q", ("process_std", "input_std")), ("R", ("noise_std",))):
+            for other in others:
+                if getattr(self, key) is not None and getattr(self, other) is not None:
+                    raise ValueError(f"{key}: give either {key} or {other}")
+        return self
+
+    def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
+        """Require shapes that fit, covariances, and noise in every output and in the process."""
+        super().check(n, m, p, noise)
+        for key, expected, what in (
+            ("process_std", n, "state"), ("input_std", m, "input"), ("noise_std", p, "output"),
+            ("initial_std", n, "state"),
+        ):  # fmt: skip
+            require_length(getattr(self, key), f"observer.{key}", expected, f"one per {what}")
+        require_shape(self.Q, "observer.Q", (n, n), "a covariance of states")
+        require_shape(self.R, "observer.R", (p, p), "a covariance of outputs")
+        _require_covariance("Q", self.Q, definite=False)
+        _require_covariance("R", self.R, definite=True)
+        output = noise.output if self.noise_std is None else self.noise_std
+        if self.R is None and not all(np.array(output) > 0):
+            raise ValueError(
+                "observer.noise_std: the filter needs a noise above 0 on every output; "
+                "give noise_std or R, or plant.measurement's noise"
+            )
+        at_state = noise.at_state if self.process_std is None else self.process_std
+        at_input = noise.at_input if self.input_std is None else self.input_std
+        if not any(at_state) and not any(at_input) and not np.any(self.Q or 0):
+            raise ValueError(
+                "observer.process_std: without process noise the Kalman gain tends to 0; "
+                "give process_std, input_std or Q, or random disturbances of the plant"
+            )
+
+    def assumed_model(self, model: EstimationModel, noise: NoiseVariances) -> EstimationModel:
+        """Return the model with the filter's own covariances where they are given."""
+        Q, R = model.Q, model.R
+        if self.Q is not None:
+            Q = np.array(self.Q)
+        elif self.process_std is not None or self.input_std is not None:
+            at_state = noise.at_state if self.process_std is None else np.square(self.process_std)
+            at_input = noise.at_input if self.input_std is None else np.square(self.input_std)
+            Q = model.process_covariance(at_state, at_input)
+        if self.R is not None:
+            R = np.array(self.R)
+        elif self.noise_std is not None:
+            R = np.diag(np.square(self.noise_std))
+        return model._replace(Q=Q, R=R)
+
+    def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
+        """L of the discrete algebraic Riccati equation; None if its solver fails."""
+        # A large import for a sensor.
+        from scipy.linalg import solve_discrete_are
+
+        (A, Q), C, R = assumed.between_measurements(), assumed.C, assumed.R
+        try:
+            predicted = solve_discrete_are(A.T, C.T, Q, R)
+        except (np.linalg.LinAlgError, ValueError):  # entries of too different sizes
+            return None
+        return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
+
+    def estimator(self, assumed: EstimationModel, x: Vector) -> "KalmanObserver":
+        """Return the filter."""
+        return KalmanObserver(assumed, x, np.diag(np.square(self.initial_std)))
+
+
+def _require_covariance(key: str, rows: Rows | None, *, definite: bool) -> None:
+    if rows is None:
+        return
+    matrix = np.array(rows)
+    if not np.allclose(matrix, matrix.T, rtol=1e-12, atol=0.0):
+        raise ValueError(f"observer.{key}: must be symmetric")
+    smallest = np.linalg.eigvalsh(matrix)[0]
+    if definite and smallest < np.finfo(float).tiny:
+        raise ValueError(f"observer.{key}: must be positive definite")
+    # Rounding may leave a singular covariance with a small negative eigenvalue.
+    if smallest < -1e-12 * np.abs(matrix).max():
+        raise ValueError(f"observer.{key}: must be positive semidefinite")
+
+
+class KalmanObserver:
+    """The filter.
+
+    Args:
+        model: the model and the covariances that the filter assumes.
+        x: x̂ before the first measurement, shape (n,).
+        covariance: P before it, shape (n, n).
+    """
+
+    def __init__(self, model: EstimationModel, x: Vector, covariance: Matrix) -> None:
+        self._model = model
+        self.x = x
+        self.covariance = covariance
+
+    def predict(self, u: Vector) -> None:
+        """Advance x̂ and P by a step of the plant."""
+        Ad, Bd, Q = self._model.Ad, self._model.Bd, self._model.Q
+        self.x = Ad @ self.x + Bd @ u
+        self.covariance = Ad @ self.covariance @ Ad.T + Q
+
+    def correct(self, y: Vector) -> None:
+        """Correct x̂ and P by a measurement."""
+        C, R, P = self._model.C, self._model.R, self.covariance
+        L = np.linalg.solve(C @ P @ C.T + R, C @ P).T
+        rest = np.eye(len(P)) - L @ C
+        self.x = self.x + L @ (y - C @ self.x)
+        P = rest @ P @ rest.T + L @ R @ L.T
+        self.covariance = 0.5 * (P + P.T)

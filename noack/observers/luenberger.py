@@ -1,0 +1,112 @@
+"""The Luenberger observer: a constant gain, given or computed from poles.
+
+x̂(t_k) = x̂⁻ + L (y − C x̂⁻), where x̂⁻ ← Âd x̂ + B̂d u at every step of the plant. If the plant equals
+the model, the error follows e(t_k) = (I − L C) Â^(T) e(t_(k−1)).
+"""
+
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import FiniteFloat, model_validator
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.observers.estimation_model import EstimationModel, NoiseVariances
+from noack.observers.observability import observer_gain
+from noack.observers.observer_settings import ObserverSettings
+from noack.settings.matrices import Rows, require_shape
+
+Pole = FiniteFloat | tuple[FiniteFloat, ...]
+
+
+class LuenbergerSettings(ObserverSettings):
+    """x̂(t_k) = x̂⁻ + L (y − C x̂⁻); Â, B̂ and the inputs since t_(k−1) predict x̂⁻."""
+
+    example: ClassVar = {"kind": "luenberger", "poles_per_s": [-20.0, -25.0]}
+
+    kind: Literal["luenberger"]
+    """What the observer is."""
+    gain: Rows | None = None
+    """L by rows, n x p."""
+    poles_per_s: tuple[Pole, ...] | None = None
+    """Or: n poles of the error in continuous time, s; a pair [re, im] stands for re ± im·j. L gives
+    (I − LC)e^(ÂT) the eigenvalues e^(sT), where T is the time between measurements."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.gain is None) == (self.poles_per_s is None):
+            raise ValueError("gain: give either gain or poles_per_s")
+        for pole in self.poles_per_s or ():
+            if isinstance(pole, tuple) and len(pole) != 2:
+                raise ValueError("poles_per_s: each is a number, or a pair [re, im]")
+            if (pole[0] if isinstance(pole, tuple) else pole) >= 0:
+                raise ValueError("poles_per_s: need negative real parts, else the error grows")
+            if isinstance(pole, tuple) and pole[1] <= 0:
+                raise ValueError(
+                    "poles_per_s: a pair [re, im] needs im > 0; write a real pole as a number"
+                )
+        return self
+
+    def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
+        """Require a gain n x p, or n poles."""
+        super().check(n, m, p, noise)
+        require_shape(self.gain, "observer.gain", (n, p), "one row per state, a column per output")
+        if self.poles_per_s is not None and len(self.poles) != n:
+            raise ValueError(
+                f"observer.poles_per_s: expected {n} poles (one per state, a pair counts twice), "
+                f"found {len(self.poles)}"
+            )
+
+    @property
+    def poles(self) -> tuple[complex, ...]:
+        """The poles one by one."""
+        poles: list[complex] = []
+        for pole in self.poles_per_s or ():
+            if isinstance(pole, tuple):
+                poles += [complex(*pole), complex(*pole).conjugate()]
+            else:
+                poles.append(complex(pole))
+        return tuple(poles)
+
+    def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
+        """Return settings with the gain that places the poles."""
+        if self.poles_per_s is None:
+            return self
+        try:
+            z = tuple(complex(np.exp(pole * period_ns * 1e-9)) for pole in self.poles)
+            gain = observer_gain(A, C, z)
+        except ValueError as error:
+            raise CallerError(f"observer.poles_per_s: cannot be placed: {error}") from None
+        rows = tuple(tuple(row) for row in gain.tolist())
+        return self.model_copy(update={"gain": rows, "poles_per_s": None})
+
+    def steady_gain(self, assumed: EstimationModel) -> Matrix:
+        """L."""
+        return np.array(self.gain)
+
+    def estimator(self, assumed: EstimationModel, x: Vector) -> "LuenbergerObserver":
+        """Return the observer with the gain of resolved settings."""
+        return LuenbergerObserver(assumed, np.array(self.gain), x)
+
+
+class LuenbergerObserver:
+    """The observer.
+
+    Args:
+        model: the model that predicts x̂.
+        gain: L, shape (n, p).
+        x: x̂ before the first measurement, shape (n,).
+    """
+
+    def __init__(self, model: EstimationModel, gain: Matrix, x: Vector) -> None:
+        self._model = model
+        self._gain = gain
+        self.x = x
+
+    def predict(self, u: Vector) -> None:
+        """x̂ ← Âd x̂ + B̂d u."""
+        self.x = self._model.Ad @ self.x + self._model.Bd @ u
+
+    def correct(self, y: Vector) -> None:
+        """x̂ ← x̂ + L (y − C x̂)."""
+        self.x = self.x + self._gain @ (y - self._model.C @ self.x)

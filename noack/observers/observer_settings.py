@@ -1,0 +1,73 @@
+"""What every kind of observer has."""
+
+from typing import Any, ClassVar, Protocol, Self
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.observers.estimation_model import EstimationModel, NoiseVariances
+from noack.settings.matrices import Row, require_length
+from noack.settings.section import ScenarioSection
+
+
+class StateObserver(Protocol):
+    """Estimates a state from measurements."""
+
+    x: Vector
+    """x̂, shape (n,)."""
+
+    def predict(self, u: Vector) -> None:
+        """Advance x̂ by a step of the plant under an input, shape (m,)."""
+        ...
+
+    def correct(self, y: Vector) -> None:
+        """Correct x̂ by a measurement, shape (p,)."""
+        ...
+
+
+class ObserverSettings(ScenarioSection):
+    """Settings of an observer."""
+
+    example: ClassVar[dict[str, Any]]
+    """Settings of this kind for two states, one input and one output, for property tests."""
+
+    kind: str
+    """What the observer is."""
+    initial_estimate: Row | None = None
+    """x̂ before the first measurement, n entries; by default 0, or x(0) if the sensor knows it."""
+
+    def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
+        """Require settings that fit n states, m inputs, p outputs and the scenario's noise.
+
+        Raises:
+            ValueError: one does not; the message begins with the key.
+        """
+        require_length(self.initial_estimate, "observer.initial_estimate", n, "one per state")
+
+    def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
+        """Return settings that name the gain itself, where they gave what it is computed from.
+
+        Args:
+            A: Â^(T) between two measurements, shape (n, n).
+            C: shape (p, n).
+            period_ns: T.
+
+        Raises:
+            CallerError: there is no such gain.
+        """
+        return self
+
+    def assumed_model(self, model: EstimationModel, noise: NoiseVariances) -> EstimationModel:
+        """Return the model with the covariances that the observer assumes."""
+        return model
+
+    def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
+        """Return L in the steady state, (n, p); None if none is found."""
+        raise NotImplementedError
+
+    def estimator(self, assumed: EstimationModel, x: Vector) -> StateObserver:
+        """Return the observer.
+
+        Args:
+            assumed: the model with the covariances that the observer assumes.
+            x: x̂ before the first measurement, shape (n,).
+        """
+        raise NotImplementedError

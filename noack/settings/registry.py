@@ -1,0 +1,54 @@
+"""Kinds of settings, one file each: a kind is known because its file is in the folder."""
+
+from collections.abc import Mapping
+from functools import reduce
+from importlib import import_module
+from operator import or_
+from pkgutil import iter_modules
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import Discriminator, Tag
+
+from noack.settings.section import ScenarioSection
+
+Settings = TypeVar("Settings", bound=ScenarioSection)
+
+
+def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[str, type[Settings]]:
+    """Return the settings classes that the modules of a package define, by their kind.
+
+    Args:
+        package: its dotted name; subpackages are not searched.
+        base: the class from which all of them are derived.
+        key: the field that names the kind, a ``Literal`` of one value.
+    """
+    found: dict[str, type[Settings]] = {}
+    for entry in iter_modules(import_module(package).__path__, f"{package}."):
+        if entry.ispkg:
+            continue
+        for one in vars(import_module(entry.name)).values():
+            if isinstance(one, type) and issubclass(one, base) and one.__module__ == entry.name:
+                names = get_args(one.model_fields[key].annotation)  # empty for a base class
+                found |= dict.fromkeys(names, one)
+    return found
+
+
+def union_of(
+    kinds: Mapping[str, type[ScenarioSection]], key: str = "kind", default: str | None = None
+) -> Any:
+    """Return the type of a table that is one of these kinds, for pydantic.
+
+    Args:
+        kinds: settings classes by kind.
+        key: the field that names the kind.
+        default: the kind of a table that does not name one; None: the key is required.
+    """
+    if default is None:
+        return Annotated[reduce(or_, kinds.values()), Discriminator(key)]
+
+    def kind(given: object) -> str:
+        value = given.get(key, default) if isinstance(given, dict) else getattr(given, key, default)
+        return str(value)
+
+    tagged = [Annotated[settings, Tag(name)] for name, settings in kinds.items()]
+    return Annotated[reduce(or_, tagged), Discriminator(kind)]

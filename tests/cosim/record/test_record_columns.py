@@ -1,0 +1,25 @@
+"""The tables and columns of the record: docs/record.md describes them as the code declares them."""
+
+from pathlib import Path
+
+import pytest
+
+from noack.protocol.record_tables import COMMON, TABLES, Column, Table
+
+DOCS = Path(__file__).parents[3] / "docs" / "record.md"
+TEXT = DOCS.read_text(encoding="utf-8")
+
+
+def markdown(columns: tuple[Column, ...]) -> str:
+    lines = [f"| `{one.name}` | {one.unit} | {one.meaning} |" for one in columns]
+    return "\n".join(["| column | unit | meaning |", "|---|---|---|", *lines]) + "\n\n"
+
+
+def test_the_docs_describe_the_common_columns() -> None:
+    assert markdown(COMMON) in TEXT
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+def test_the_docs_describe_every_table(table: Table) -> None:
+    head = f"`{table.name}` ({table.owner}): one row per {table.row}.\n\n"
+    assert head + markdown(table.columns) in TEXT, head + markdown(table.columns)
