@@ -1,5 +1,6 @@
 """Which processes a launcher restarts, when it ends the run instead, and with which reason."""
 
+import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -155,6 +156,16 @@ def test_a_restart_that_fails_ends_the_run(case: Case) -> None:
     children.can_start = False
     reason = f"{KILLED}; sensor cannot be started: no more processes"
     assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
+
+
+def test_a_process_that_nobody_restarts_ends_the_run(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = case.run(case.children(-9), FakeCoordinator(0.5))._policy
+    assert policy.check() is None
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + 61.0)
+    assert policy.check() == (ExitStatus.FAILED, f"{KILLED}; not restarted within 60 s")
 
 
 def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Case) -> None:
