@@ -55,7 +55,7 @@ def rows_of(
     """
     note = f"{sum(s.size for s in ours)} updates, {sum(s.size for s in pings)} pings"
     if refused:
-        note += f"; not granted: {', '.join(refused)}"
+        note += f"; not permitted: {', '.join(refused)}"
     return [
         Row(
             f"event → update, {quantile}, {settings}",
@@ -70,7 +70,7 @@ def rows_of(
 
 
 def _refused(granted: Mapping[str, str]) -> set[str]:
-    return {setting for setting, verdict in granted.items() if verdict.startswith("refused")}
+    return {setting for setting, verdict in granted.items() if verdict.startswith("not permitted")}
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

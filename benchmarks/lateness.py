@@ -89,7 +89,7 @@ def rows_of(
     """
     ours = loops["run_loop", True]
     fifo = ours[0].granted["sched_fifo"]
-    unjudged = no_cyclictest if fifo == "granted" else f"SCHED_FIFO {fifo}"
+    unjudged = no_cyclictest if fifo == "applied" else f"SCHED_FIFO {fifo}"
     note = f"of all {len(ours)} rounds of {ROUND_S} s; the peer's is the machine's own"
     return [
         Row(f"tick lateness p50, {_ASKED[True]}", median(t.p50_us for t in ours), "µs",

@@ -62,7 +62,7 @@ def test_latency_compares_the_medians_over_rounds() -> None:
     p50, p99 = latency.rows_of("settings", ours, pings, ["sched_fifo"])
     assert (p50.value, p50.ratio, p50.holds) == (36.0, 3.0, True)
     assert (p99.value, p99.ratio, p99.holds) == (120.0, 2.4, None)
-    assert p50.note == "30 updates, 60 pings; not granted: sched_fifo"
+    assert p50.note == "30 updates, 60 pings; not permitted: sched_fifo"
 
 
 def test_quantiles_of_a_histogram_are_the_middle_of_the_bin_they_fall_in() -> None:
@@ -83,7 +83,7 @@ def rounds(fifo: str) -> dict[tuple[str, bool], list[Ticks]]:
 
 
 def test_lateness_is_judged_against_cyclictest() -> None:
-    rows = lateness.rows_of(rounds("granted"), [KERNEL] * 3, None)
+    rows = lateness.rows_of(rounds("applied"), [KERNEL] * 3, None)
     (judged,) = [row for row in rows if row.goal is not None]
     assert judged.peer is not None
     assert judged.peer.name == "cyclictest"
@@ -94,8 +94,8 @@ def test_lateness_is_judged_against_cyclictest() -> None:
 @pytest.mark.parametrize(
     ("fifo", "kernel", "missing", "why"),
     [
-        ("refused: Operation not permitted", [KERNEL], None, "Operation not permitted"),
-        ("granted", [], "cyclictest is not installed", "not installed"),
+        ("not permitted: Operation not permitted", [KERNEL], None, "Operation not permitted"),
+        ("applied", [], "cyclictest is not installed", "not installed"),
     ],
 )
 def test_lateness_is_not_judged_without_sched_fifo_or_cyclictest(

@@ -12,7 +12,7 @@ import cosim.live.finalize
 from cosim.live.finalize import finalize, reopen
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import write_environment
-from cosim.record.run_directory import REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
+from cosim.record.run_directory import ENDING_FILE, REPORTS_FILE, SCENARIO_FILE, SUMMARY_FILE
 from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, write_record
 from cosim.simulation.virtual_time import simulate
@@ -111,8 +111,12 @@ def test_a_run_whose_rows_are_missing_fails(run_dir: Path, cut: slice) -> None:
     lost = len(rows[PLANT_STEP][cut])
     rows[PLANT_STEP] = np.delete(rows[PLANT_STEP], cut)
     write_record(RunRecord(record.scenario, rows, [], record.reports), run_dir)
+    with EndingFile(run_dir) as file:
+        file.store(ExitStatus.OK, "horizon", 1.5)
     outcome = finalize(ended_well(run_dir), report=False)
     assert outcome.status == ExitStatus.FAILED
+    stored = json.loads((run_dir / ENDING_FILE).read_text())
+    assert stored["exit"] == {"status": 1, "reason": outcome.reason}
     assert outcome.reason == f"rows are missing from the record: {lost:,} of plant_step"
     stopped = RunEnding(run_dir, 0, ExitStatus.INTERRUPTED, "stopped by the user (SIGINT)")
     assert finalize(stopped, report=False).status == ExitStatus.INTERRUPTED

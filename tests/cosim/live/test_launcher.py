@@ -7,12 +7,12 @@ from typing import Any, cast
 import pytest
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.launcher import Watcher, _Run, longest_s
+from cosim.live.launcher import Watcher, _Run, launch, longest_s
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.core.errors import ExitStatus, MachineError
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES
-from noack.runtime.join_ticket import new_ticket
+from noack.runtime.join_ticket import new_ticket, published
 from noack.runtime.signals import Signals
 
 KILLED = "sensor died: killed by SIGKILL"
@@ -222,3 +222,14 @@ def test_a_progress_report_that_arrives_with_the_end_is_shown(case: Case) -> Non
     run = case.run(children, Ending(1.0), progress=shown.append)
     assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
     assert shown == [{"void": ["late"]}]
+
+
+def test_a_refused_session_leaves_no_run_directory(
+    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    scenario = validate(content | {"ports": {}}, "")
+    ticket = new_ticket(resolve(scenario), "tcp/127.0.0.1:1", tmp_path, launched=False)
+    with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
+        launch(scenario, tmp_path / "runs", spawn=(), session="lab")
+    assert list((tmp_path / "runs").iterdir()) == []
