@@ -13,8 +13,8 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
-from netem.rule_records import PacketDecision
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_records import PacketDecision
+from noack.impairments.link_settings import LinkSettings
 
 MAX_GAP_NS = 3_000_000
 
@@ -88,7 +88,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
         counts[arrival.flow] += 1
         leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
-        run.verdicts.append(PacketDecision(**asdict(link.verdict)))
+        run.verdicts.append(PacketDecision(**asdict(link.decision)))
         run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
     release(float("inf"))
     return run
