@@ -10,11 +10,11 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.output import report
-from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
 from cosim.studies.design.design_figure import trade_off
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
+from noack.core.number_format import plus_minus
 
 _CAPTION = (
     "Each candidate's mean number of transmissions and the quantile of its settling times, all on "

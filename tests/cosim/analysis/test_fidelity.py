@@ -113,7 +113,7 @@ def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
 
 
 def test_a_share_that_counts_against_the_others_is_called_so() -> None:
-    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "unexplained": 0.0}
+    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "residual": 0.0}
     numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
     told = dict(summary_rows(numbers | {"reason": None}))
     assert told["  share of sampling"] == "142.0 %"
@@ -277,7 +277,7 @@ def test_the_last_run_is_compared(simulated: Path) -> None:
     document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
     assert document["explained"] is True
     assert [stage["name"] for stage in document["stages"]] == [
-        "sampling", "delay", "held actuation", "unexplained"
+        "sampling", "delay", "held actuation", "residual"
     ]  # fmt: skip
 
 

@@ -164,8 +164,8 @@ def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
     )
     scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
     for sentence, one in zip(sentences, scheduled, strict=True):
-        assert "where what is presupposed above holds" in sentence
-        assert "at most 3 in a row" in sentence
+        assert "under the assumptions above" in sentence
+        assert "at most 3 consecutive losses" in sentence
         assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
         assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
 

@@ -1,4 +1,4 @@
-"""The loop as a diagram, in which every update is seen to travel, to arrive, or to be lost.
+"""The loop as a diagram that animates every update until it arrives or is lost.
 
 A real flight takes microseconds. It is drawn as if each leg took ``LEG_S`` of simulated time, so
 that it can be followed at the speed of the run: a dot leaves the sensor at the broadcast, and what
@@ -48,7 +48,7 @@ class Moving(NamedTuple):
 
 
 class _Flying(NamedTuple):
-    """Packets that are under way, in the drawing (p,)."""
+    """Packets that are in flight, in the drawing (p,)."""
 
     t_ns: Times
     out_ns: Times
@@ -118,7 +118,7 @@ class NetworkDiagram:
         found["input"] = lines([home, head], STILL, 0.03)
         found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
         found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
-        found["forced/word"] = label("forced through", (_NETWORK + _APART / 2, 1.55), FORCED)
+        found["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
             ("broadcast", SENSOR), ("delivered", CONTROLLER), ("acknowledgement", NETWORK),
         ):  # fmt: skip
@@ -161,7 +161,7 @@ class NetworkDiagram:
         )
 
     def advance(self, until_ns: int) -> Mapping[str, Moving]:
-        """What moves up to a time by which all packets are in; nothing if nothing is under way."""
+        """What moves up to a time by which all packets are in; nothing if nothing is in flight."""
         first, last = self._drawn_ns // _FRAME_NS + 1, until_ns // _FRAME_NS
         if last < first:
             return {}

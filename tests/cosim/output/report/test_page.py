@@ -138,8 +138,8 @@ def test_the_report_of_a_live_run_is_whole(record: RunRecord, tmp_path: Path) ->
         assert assumption["what"] in page.text
         assert assumption["why"] in page.text
     assert scenario_toml(record.scenario) in page.text
-    assert "1 of 4 claims void" in page.text
-    assert "1 of 4 claims violated" in page.text
+    assert "1 of 4 claims are void" in page.text
+    assert "1 of 4 claims are violated" in page.text
     assert "started 2020-01-02" in page.text
     assert "noack run" in page.text
     assert "plant lateness" in page.text
@@ -177,7 +177,7 @@ def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -
 
 def fidelity(**changed: Any) -> dict[str, Any]:
     """A run's difference to the ideal loop, as its summary has it."""
-    shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "unexplained": 0.0}
+    shares = {"sampling": 0.9, "delay": -0.42, "held_actuation": 0.52, "residual": 0.0}
     return {
         "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
         "rms_x_live": 2.0, "shares": shares, "events_ideal": 31, "events_live": 30,
@@ -196,23 +196,23 @@ def test_the_difference_to_the_ideal_loop_is_told_in_words(
     page, html, _ = written(record, tmp_path, fidelity=fidelity())
     check(page, html)
     for text in (
-        "by 0.25 (RMS), 12 % of x itself, and by 0.5 at most",
-        "The effects below explain it: 1e-07 % of the difference is left.",
-        "30 events, against 31 of the ideal loop; each at most 12.5 ms from the ideal one",
-        "one with a negative share takes away",
+        "by 0.25 (RMS), 12 % of x itself, and by at most 0.5",
+        "explain the difference: the residual is 1e-07 % of the difference.",
+        "30 events, the ideal loop 31; the times of an event differ by at most 12.5 ms",
+        "an effect with a negative share",
         "held actuation", "-42.0 %",
     ):  # fmt: skip
         assert text in page.text
     assert "held_actuation" not in page.text
     assert "Replay" not in page.text
-    shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "unexplained": 0.0}
+    shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "residual": 0.0}
     page, _, _ = written(
         record, tmp_path, fidelity=fidelity(explained=False, explained_relative=0.4,
                                             shares=shares, parted_event=7)
     )  # fmt: skip
-    assert "is not explained" in page.text
-    assert "40 % of the difference is left, which is too much" in page.text
-    assert "With event 7 they part" in page.text
+    assert "do not explain the difference" in page.text
+    assert "the residual is 40 % of the difference, which is too large" in page.text
+    assert "They agree up to event 7" in page.text
     assert "negative share" not in page.text
     nothing = dict.fromkeys(fidelity()) | {"reason": "the run diverged"}
     page, html, _ = written(record, tmp_path, fidelity=nothing)
@@ -223,7 +223,7 @@ def test_the_difference_to_the_ideal_loop_is_told_in_words(
 def test_the_replay_is_told_in_words(record: RunRecord, tmp_path: Path) -> None:
     page, html, _ = written(record, tmp_path, replay=replayed())
     check(page, html)
-    assert "their 10,001 recorded inputs again" in page.text
+    assert "The 10,001 recorded inputs were replayed" in page.text
     assert "bit for bit" in page.text
     assert "gaps" not in page.text
     assert "Fidelity" not in page.text
@@ -295,7 +295,7 @@ def test_every_run_gets_a_report(case: str, content: dict[str, Any], tmp_path: P
 @pytest.mark.parametrize(
     ("exit_", "said"),
     [
-        ({"status": 0, "reason": "horizon"}, "The run reached its horizon of 1 s."),
+        ({"status": 0, "reason": "horizon"}, "The run completed its 1 s."),
         ({"status": 1, "reason": "plant died"}, "The run failed (exit status 1): plant died."),
         ({"status": 130, "reason": "stopped by SIGINT"}, "(exit status 130): stopped by SIGINT."),
     ],
