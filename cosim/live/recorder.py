@@ -16,7 +16,8 @@ from zenoh.handlers import FifoChannel, RingChannel
 from cosim.analysis.claims.assumption_monitor import AssumptionMonitor
 from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.recording import RunView, ViewError
+from cosim.output.viewer.recording import RunView
+from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.run_view import open_view, write_view
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import SPOOL, in_flight

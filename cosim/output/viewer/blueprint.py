@@ -147,24 +147,56 @@ def layout(
 
     Plots have no legends, which would cover data: a panel names the colours.
     """
-    intervals = rrb.Horizontal(
-        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
-        _plot(
-            "Receiving intervals [s]",
-            "reception",
-            [RECEPTION_STEM, RECEPTION, FORCED, DROP],
-        ),
+    texts = _texts(input_names, lateness=bool(processes))
+    drawings = [] if picture is None else [panel(picture)]
+    drawings += [] if diagram is None else [diagram.panel()]
+    if drawings:
+        left = rrb.Vertical(*drawings, texts, row_shares=[*[4, 3][: len(drawings)], 3.6])
+        curves = rrb.Vertical(
+            _states(state_names),
+            rrb.Horizontal(_norms(), _inputs()),
+            _intervals(),
+            row_shares=[2, 1, 1],
+        )
+        whole = rrb.Horizontal(left, curves, column_shares=[1, 1])
+    else:
+        whole = rrb.Horizontal(
+            rrb.Vertical(_states(state_names), _intervals(), row_shares=[2, 1]),
+            rrb.Vertical(_norms(), _inputs(), texts),
+            column_shares=[2, 1],
+        )
+    return rrb.Blueprint(
+        rrb.Horizontal(whole, _common_time_axis(horizon_s)),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
+        collapse_panels=True,
     )
-    norms = rrb.Tabs(
-        _plot("log10 ‖e‖", ERROR_LOG10),
-        _plot("‖e‖", ERROR),
-        _plot("log10 ‖x‖", SIZE_LOG10),
+
+
+def _intervals() -> rrb.Container:
+    sent = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
+    received = [RECEPTION_STEM, RECEPTION, FORCED, DROP]
+    return rrb.Horizontal(
+        _plot("Broadcasting intervals [s]", "event", sent),
+        _plot("Receiving intervals [s]", "reception", received),
     )
-    inputs = _plot("Control input u = K x_c", INPUT)
-    words = rrb.Tabs(
+
+
+def _norms() -> rrb.Container:
+    return rrb.Tabs(
+        _plot("log10 ‖e‖", ERROR_LOG10), _plot("‖e‖", ERROR), _plot("log10 ‖x‖", SIZE_LOG10)
+    )
+
+
+def _inputs() -> rrb.View:
+    return _plot("Control input u = K x_c", INPUT)
+
+
+def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
+    """Tabs: the colour key, the text about the run, lateness, the log."""
+    return rrb.Tabs(
         ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
+        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
         rrb.TextLogView(
             origin=LOG,
             name="Log",
@@ -175,30 +207,6 @@ def layout(
             ),
             format_options=rrb.TextLogFormat(monospace_body=True),
         ),
-    )
-    states = _states(state_names)
-    drawings = [
-        *([] if picture is None else [panel(picture)]),
-        *([] if diagram is None else [diagram.panel()]),
-    ]
-    if drawings:
-        shares = [4, 3, 3][: len(drawings)]
-        curves = rrb.Vertical(
-            states, rrb.Horizontal(norms, inputs), intervals, row_shares=[2, 1, 1]
-        )
-        whole = rrb.Horizontal(
-            rrb.Vertical(*drawings, words, row_shares=[*shares, 3.6]), curves, column_shares=[1, 1]
-        )
-    else:
-        whole = rrb.Horizontal(
-            rrb.Vertical(states, intervals, row_shares=[2, 1]),
-            rrb.Vertical(norms, inputs, words),
-            column_shares=[2, 1],
-        )
-    return rrb.Blueprint(
-        rrb.Horizontal(whole, _common_time_axis(horizon_s)),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        collapse_panels=True,
     )
 
 
