@@ -157,7 +157,7 @@ def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
     said = " ".join(result.stdout.split())
     sentences = said.split("In words: ")[1:]
     assert [one.partition(",")[0] for one in sentences] == [
-        "of the scenario's plant", "of every plant of the box"
+        "for the scenario's plant", "for every plant of the box"
     ]  # fmt: skip
     document = json.loads(
         CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json"]).stdout
