@@ -112,20 +112,19 @@ def _cores(machine: MachineFacts) -> MachineFinding:
 
 
 def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
-    applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "granted"]
+    applied = [name for key, name in _SETTINGS.items() if machine.granted.get(key) == "applied"]
     what = "real-time settings"
     if applied:
         yield MachineFinding(what, GOOD, f"applied: {', '.join(applied)}")
     for key, name in _SETTINGS.items():
         answer = machine.granted.get(key, "not known")
-        if not answer.startswith("refused"):
+        if not answer.startswith("not permitted"):
             continue
         if wanted.realtime:
             means, verdict = "runs work without it, and report it", LIMITED
         else:
             means, verdict = f"{wanted.name} does not use it", GOOD
-        why = answer.replace("refused", "not permitted", 1)
-        yield MachineFinding(what, verdict, f"{name}: {why}", means, _REMEDIES.get(key, ""))
+        yield MachineFinding(what, verdict, f"{name}: {answer}", means, _REMEDIES.get(key, ""))
 
 
 def _timer(machine: MachineFacts) -> MachineFinding:

@@ -9,7 +9,7 @@ from typing import Protocol
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     REPORTS_FILE,
-    in_flight,
+    active_run,
     new_run_dir,
     point_to_latest,
     write_scenario,
@@ -20,7 +20,7 @@ from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 
 class Simulator(Protocol):
@@ -58,7 +58,7 @@ def simulate_run(
     run_dir = new_run_dir(runs, resolved.name)
     run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
     try:
-        with in_flight(run_dir), EndingFile(run_dir) as ending:
+        with active_run(run_dir), EndingFile(run_dir) as ending:
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)

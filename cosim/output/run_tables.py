@@ -296,17 +296,13 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
     roles_by_settings: dict[str, list[str]] = {}
     for role in sorted(realtime):
         verdicts = realtime[role]
-        text = ", ".join(f"{name} {_applied(verdict)}" for name, verdict in verdicts.items())
-        if set(verdicts.values()) == {"granted"}:
+        text = ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
+        if set(verdicts.values()) == {"applied"}:
             text = "all applied"
         roles_by_settings.setdefault(text, []).append(role)
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"
         console.print(f"real-time settings{whose}: {text}", highlight=False, markup=False)
-
-
-def _applied(verdict: str) -> str:
-    return verdict.replace("granted", "applied").replace("refused", "not permitted")
 
 
 def _mode(summary: Summary) -> str:

@@ -159,19 +159,18 @@ def _taps(
 @contextmanager
 def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
     try:
-        from netem.capture.capture_tap import CaptureTap, interfaces_of
         from netem.capture.capture_writer import CaptureWriter
     except ModuleNotFoundError as error:  # the plain engine runs without numba
         raise CallerError(f"--capture: needs {error.name}, which is not installed") from None
-    writer = CaptureWriter(path, interfaces_of(specs))
+    writer = CaptureWriter(path, specs)
     try:
-        yield CaptureTap(writer, len(specs))
+        yield writer
     finally:
         writer.close()
         if writer.error is not None:
             say(writer.error)
-        elif writer.missing:
-            say(f"the capture lacks {writer.missing} events")
+        elif writer.missing_events:
+            say(f"the capture lacks {writer.missing_events} events")
 
 
 def _say_ready(opened: Relay) -> None:

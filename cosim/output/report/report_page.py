@@ -14,7 +14,6 @@ from cosim.output.report.report_findings import findings
 from cosim.output.run_tables import interval_of, key_numbers
 from noack.config.scenario import Scenario
 from noack.core.number_format import whole
-from noack.trigger.policy_description import trigger_text
 
 _NONE = "–"
 _TONES = {
@@ -78,10 +77,10 @@ def page(
 
 
 @cache
-def templates() -> Environment:
-    """The templates of the pages; all text is escaped."""
+def templates(folder: Path = Path(__file__).parent) -> Environment:
+    """The templates of the report and of a folder; all text is escaped."""
     found = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader([folder, Path(__file__).parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -117,7 +116,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     model = loss.pop("model").replace("_", "-")
     details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
     yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
-    yield "trigger", trigger_text(trigger)
+    yield "trigger", trigger.description
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model

@@ -25,7 +25,6 @@ from cosim.record.run_directory import (
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
-    SPOOL,
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import RunEnding
@@ -33,7 +32,7 @@ from cosim.record.run_record import finish_record, load_record, write_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
-from noack.runtime.spool import SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.runtime.telemetry import notices_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
@@ -77,7 +76,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     folder.mkdir()
     (folder / SCENARIO_FILE).write_text(dumps(resolved))
     reports = {
-        role: {**report, "pid": 1, "realtime": {"sched_fifo": "granted"}} if live else report
+        role: {**report, "pid": 1, "realtime": {"sched_fifo": "applied"}} if live else report
         for role, report in record.reports.items()
     }
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
@@ -163,11 +162,11 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 def _show(run_dir: Path) -> None:
     """What `noack summary` does with a summary that is there."""
 
-    def conclude(ending: RunEnding) -> Outcome:
+    def finalize(ending: RunEnding) -> Outcome:
         assert isinstance(ending.reason, str)
         return Outcome(run_dir, ending.status, ending.reason, {})
 
-    with patch("cosim.live.finalize.conclude", conclude):
+    with patch("cosim.live.finalize.finalize", finalize):
         outcome = reopen(run_dir)
     changed_since(run_dir)
     if outcome.summary:

@@ -173,7 +173,7 @@ def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
         ),
         (
             [*ADDRESSES, "--record-fates", __file__],
-            f"noack netem: --record-fates {__file__}: is there already, and no Parquet file",
+            f"noack netem: --record-fates {__file__}: exists and is not a Parquet file",
         ),
         (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session joins a run"),
         (

@@ -199,6 +199,4 @@ def test_a_trace_of_other_links_is_refused(
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == ExitStatus.CALLER
-    assert done.stderr == (
-        f"noack netem: {trace}: has no fates of a link 'up'; it has those of relay\n"
-    )
+    assert done.stderr == (f"noack netem: {trace}: has no link 'up'; its links: relay\n")
