@@ -198,6 +198,10 @@ def _why_failed(
     """Why a run failed that ended at its horizon; None if it did not fail."""
     if diverged is not None:
         return diverged.text
+    for notice in record.notices:
+        if notice["level"] == FAILED:
+            at_s = notice["t_ns"] * 1e-9
+            return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
     # What a process that was killed had not handed over is not among these; others took its place.
     lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None

@@ -45,7 +45,7 @@ class Record(NamedTuple):
 RESTART = "restart"
 """Level of the notice of a process that takes another's place."""
 FAILED = "failed"
-"""Level of the notice of a plant that cannot go on."""
+"""Level of the notice of a plant or controller that cannot continue."""
 
 
 class Notice(NamedTuple):
