@@ -11,7 +11,6 @@ import argparse
 import json
 import math
 import os
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from cosim.cli import find_scenario
 from cosim.simulation.batch.batch_interface import (
     Population,
@@ -295,6 +294,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("batch", "Exact runs of a batch, one core", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -7,7 +7,6 @@ Figures are the thread's CPU time: what others take on a busy machine is not the
 
 import argparse
 import os
-import sys
 import time
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._report import Benchmark, Goal, Peer, Row, run, say
+from benchmarks._report import Benchmark, Goal, Peer, Row, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
@@ -44,7 +43,7 @@ class Case(NamedTuple):
 
     name: str
     scenario: str
-    settings: tuple[str, ...] = ()
+    settings: tuple[str, ...]
     goal: Goal
 
 
@@ -136,6 +135,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("plants", "Cost per step of the plants", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -74,7 +74,7 @@ def text_of(name: str) -> str:
             path = _path_of(name, folder)
             lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
             text = "".join(line for line in lines if not line.startswith(_SCHEMA))
-            return _FILE.sub(lambda found: f'file = "{path.absolute().parent / found[1]}"', text)
+            return _FILE.sub(rf'file = "{path.absolute().parent}/\1"', text)
     names = [known for folder in KINDS for known in shipped_names(folder)]
     raise CallerError(f"{name}: nothing of that name is shipped; {_hint(name, names)}")
 

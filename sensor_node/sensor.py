@@ -125,17 +125,17 @@ def sensor_of(
 
     One that is started anew transmits its first measurement.
     """
-    observer = observer_of(resolved, restarted=start.again)
+    observer = observer_of(resolved, restarted=start.is_restart)
     sensor = _triggering(resolved, start)
     if observer is None:
         return sensor
-    return ObservingSensor(observer, sensor, restarted=start.again)
+    return ObservingSensor(observer, sensor, restarted=start.is_restart)
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
     """What is behind the observer, if there is one: models, and the trigger."""
     loop, policy = loop_of(resolved), policy_of(resolved)
-    known = resolved.network.initial_sync == "known_state" and not start.again
+    known = resolved.network.initial_sync == "known_state" and not start.is_restart
     x0 = loop.x0 if known else None
     period_ns, first = resolved.timing.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:

@@ -16,12 +16,12 @@ from benchmarks.soak.invariants import Invariants
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
 from cosim.output.report.figure_files import save_figure
-from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.clock import NS_PER_S
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.spool import SpoolTail
+from noack.runtime.spool import SPOOL, SpoolTail
 
 RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
 FREE_PORTS = ("--set", "ports={}")

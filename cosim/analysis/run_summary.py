@@ -34,7 +34,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import Flow
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 from noack.theory.assumptions import assumptions
 from plant_server.watchdog import too_old
 

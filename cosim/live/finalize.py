@@ -21,7 +21,6 @@ from cosim.record.run_directory import (
     RECORD,
     REPORT_FILE,
     SCENARIO_FILE,
-    SPOOL,
     SUMMARY_FILE,
     concluded,
     read_object,
@@ -29,6 +28,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
+from noack.runtime.spool import SPOOL
 
 
 @np.errstate(all="ignore")

@@ -74,7 +74,7 @@ def _print_plant(console: Console, resolved: Scenario) -> None:
 
 def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
     """Yield the keys without a value whose default depends on other keys."""
-    from cosim.live.launcher import REJOIN_BY_HAND_S
+    from cosim.live.restart_policy import RESTART_BY_HAND_S
     from cosim.live.start_limit import DEFAULT_S
 
     watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
@@ -87,7 +87,7 @@ def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
     if resolved.recovery.rejoin_within_s is None:
         yield (
             "recovery.rejoin_within_s: 0: a process that dies ends the run; with `noack record` "
-            f"{REJOIN_BY_HAND_S:g}: it may be restarted within {REJOIN_BY_HAND_S:g} s"
+            f"{RESTART_BY_HAND_S:g}: it may be restarted within {RESTART_BY_HAND_S:g} s"
         )
     if resolved.start_within_s is None:
         yield (

@@ -48,10 +48,10 @@ def set_(
     json: JsonOption = False,
 ) -> int:
     """Change a live run: losses, M, trigger, set-point."""
-    from noack.runtime.run_registry import ask, find
+    from noack.runtime.run_registry import find, request_change
 
     wanted = parsed(settings or ())
-    answer = ask(find(session, run), wanted)
+    answer = request_change(find(session, run), wanted)
     if json:
         print_json(answer)
     elif wanted:

@@ -64,7 +64,7 @@ def test_mistaken_words_are_told(words: list[str], why: str) -> None:
 def test_without_a_run_that_is_said(ticket: Ticket) -> None:
     done = CliRunner().invoke(app, ["set", "loss.p", "0.5"])
     assert done.exit_code == 2
-    assert "no run goes on" in done.stderr
+    assert "no run is active" in done.stderr
 
 
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ticket) -> None:
@@ -80,7 +80,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ti
         assert run_registry.find().run_dir == ticket.run_dir
         assert run_registry.find(session="lab").run_dir == "elsewhere"
         assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
-        with pytest.raises(CallerError, match="no run goes on in session 'none'; there is "):
+        with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
             run_registry.find(session="none")
     assert list(path.parent.iterdir()) == []
 
