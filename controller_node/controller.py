@@ -88,17 +88,10 @@ class Controller:
         self._knows_state = x0 is not None
         self._inputs = self._first_number = start.first_number
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
-<<<<<<< HEAD
         # After a restart the updates before it are unknown.
-        self._newest: int | None = None if start.again else -1
-        # A model without a state starts at the first tick, which is recorded; its start is not.
-        self._model_ns = phase_ns + self._step * period_ns if start.again else 0
-=======
-        # What went by before a restart, nobody knows.
         self._newest: int | None = None if start.is_restart else -1
-        # A model without a state waits for the first tick, which is on record, as its start is not.
+        # A model without a state starts at the first tick, which is recorded; its start is not.
         self._model_ns = phase_ns + self._step * period_ns if start.is_restart else 0
->>>>>>> 9fb2e72bdbf75bbac03aed371c2f6725ee54b9e1
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
 
     def next_deadline_ns(self) -> int | None:
