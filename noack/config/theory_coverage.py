@@ -97,9 +97,7 @@ class TheoryCoverage:
             )
 
     def require_exact(self) -> None:
-        """Check that plant and controller are linear, and that the sensor measures the state.
-
-        Nothing may disturb the plant.
+        """Check that exact simulation covers the plant, controller, measurement and trigger.
 
         Raises:
             CallerError: one of these is not so.
@@ -126,3 +124,5 @@ class TheoryCoverage:
                 "plant.measurement: needs a sensor without noise; "
                 "this scenario has noise_std or noise_bound"
             )
+        if (why := scenario.trigger.beyond_exact) is not None:
+            raise CallerError(why)
