@@ -1,7 +1,7 @@
-"""The conclusion of a run: its record made whole, its summary written."""
+"""The end of a run: its record completed, its summary and report written."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,10 @@ from cosim.record.run_directory import (
     REPORT_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
-    concluded,
+    finished_run,
     read_object,
 )
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
 from noack.runtime.spool import SPOOL
@@ -33,9 +33,18 @@ from noack.runtime.spool import SPOOL
 
 @np.errstate(all="ignore")
 def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
-    """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
+    """Complete the record of a run; write its summary and report.
+
+    Args:
+        ending: how the run ended.
+        report: whether to write the report.
+
+    Raises:
+        CallerError: the run is still under way.
+        MachineError: record or summary cannot be written.
+    """
     run_dir = ending.run_dir
-    with _told_with(ending), concluded(run_dir):
+    with _with_reason(ending), finished_run(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
             record = finish_record(run_dir)
             from cosim.output.viewer.run_view import write_view
@@ -47,24 +56,32 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
         summary["judged_until_s"] = None
         _write_summary(run_dir, summary)
-        # Written once more, so that nothing that is found out afterwards can cost a summary.
+        # Written before and after: a failure in the analysis must not cost the summary.
         claims = RunClaims(record)
-        summary |= _found_out(record, claims, summary)
-        summary["exit"] = _end(summary)
+        summary |= _analysis(record, claims, summary)
+        summary["exit"] = end = _end(summary)
         _write_summary(run_dir, summary)
+        if (int(ending.status), ending.reason) != (end["status"], end["reason"]):
+            _correct_ending(run_dir, end, ending.startup_s)
         try:
             if report:
                 _report(record, summary, run_dir, claims)
-        except Exception as error:  # whatever it is: a run is none the worse for it
+        except Exception as error:  # whatever it is, the run itself is not affected
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
-    end = summary["exit"]
     return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
 
 
+def _correct_ending(run_dir: Path, end: Mapping[str, Any], startup_s: float | None) -> None:
+    """Let the launcher's file agree with the summary."""
+    if (run_dir / ENDING_FILE).is_file():
+        with suppress(MachineError), EndingFile(run_dir) as file:
+            file.store(ExitStatus(end["status"]), end["reason"], startup_s)
+
+
 @contextmanager
-def _told_with(ending: RunEnding) -> Iterator[None]:
-    """Let an error that keeps the record from being finished say how the run ended, too."""
+def _with_reason(ending: RunEnding) -> Iterator[None]:
+    """Add the reason of a failed run to an error that prevents the completion of its record."""
     try:
         yield
     except MachineError as error:
@@ -83,17 +100,17 @@ def _write_summary(run_dir: Path, summary: Summary) -> None:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
         raise MachineError(
-            f"{path}: cannot be written: {why(error)}; `noack summary {run_dir}` does it later"
+            f"{path}: cannot be written: {why(error)}; try `noack summary {run_dir}` later"
         ) from None
 
 
-def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
-    """What needs more than the record's own numbers; a failure of it is a line in the summary."""
+def _analysis(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
+    """Replay, fidelity, linearisation and claims; a failure of one is a line in the summary."""
     found: Summary = {}
     if record.kind == "live":
         try:
             found["replay"] = replay(record).verdict()
-        except Exception as error:  # whatever it is, the run itself went as it went
+        except Exception as error:  # whatever it is, the run itself is not affected
             found["replay"] = {"bit_exact": None, "error": repr(error)}
     found["fidelity"] = fidelity_for_summary(record)
     try:
@@ -104,14 +121,14 @@ def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summar
     try:
         found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
         found["judged_until_s"] = claims.judged_until_s
-        found |= _lost_by_others(claims, summary)
+        found |= _unseen_losses(claims, summary)
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
     return found
 
 
 def _end(summary: Summary) -> dict[str, Any]:
-    """How the run ended, whose replay is known: one that cannot be replayed failed."""
+    """How the run ended; a run that cannot be replayed has failed."""
     end: dict[str, Any] = summary["exit"]
     verdict = summary["replay"]
     if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
@@ -120,8 +137,8 @@ def _end(summary: Summary) -> dict[str, Any]:
     return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
 
 
-def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
-    """Runs of losses that neither the network nor the controller knows of, as somebody was away."""
+def _unseen_losses(claims: RunClaims, summary: Summary) -> Summary:
+    """Loss bursts while a process was away, which emulator and controller did not count."""
     longest = int(claims.conditions["dropouts"] or 0)
     if not summary["lost_outside_netem"] or longest <= summary["longest_loss_burst"]:
         return {}
@@ -135,7 +152,7 @@ def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
 
 
 def reopen(run_dir: Path) -> Outcome:
-    """Return the outcome of an earlier run; finish its record if nobody did.
+    """Return the outcome of an earlier run; complete its record and summary if necessary.
 
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
@@ -144,25 +161,25 @@ def reopen(run_dir: Path) -> Outcome:
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     summary = read_object(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
-    # It is of an earlier version or damaged; or a process woke up after the end.
+    # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
         return finalize(ending)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
 
 def _ending(run_dir: Path, summary: Summary) -> RunEnding:
-    """How a run ended, as its summary has it, or else as its launcher stored it."""
-    for said in (summary, read_object(run_dir / ENDING_FILE)):
+    """How a run ended, from its summary or else from its launcher's file."""
+    for found in (summary, read_object(run_dir / ENDING_FILE)):
         with suppress(LookupError, TypeError, ValueError):
-            status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
-            return RunEnding(run_dir, 0, status, reason, said["startup_s"])
-        summary.clear()  # without an end, nothing of it can be trusted
+            status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
+            return RunEnding(run_dir, 0, status, reason, found["startup_s"])
+        summary.clear()  # a summary without an exit cannot be trusted
     return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 @np.errstate(all="ignore")
 def rewrite_report(run_dir: Path) -> Path:
-    """Write the report of an earlier run anew, and return its path.
+    """Write the report of an earlier run again, and return its path.
 
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
@@ -175,11 +192,11 @@ def rewrite_report(run_dir: Path) -> Path:
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
     from cosim.output.report.report_file import (
-        write_report,  # imports matplotlib, which no process needs sooner
+        write_report,  # imports matplotlib
     )
 
     try:
         envelopes = claims.envelopes()
-    except Exception:  # the page is worth having without them
+    except Exception:  # the report is useful without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)
