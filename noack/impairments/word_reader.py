@@ -1,0 +1,121 @@
+"""Reads words one after the other; a message names the word that is wrong."""
+
+import difflib
+import shlex
+from collections import deque
+from collections.abc import Collection, Sequence
+from typing import NoReturn, TypeVar
+
+from noack.core.errors import CallerError, printable
+from noack.impairments.quantities import Quantity
+
+T = TypeVar("T")
+
+_SPACES = " \t\r\n"
+
+
+class WordReader:
+    """A sequence of words.
+
+    Args:
+        words: one string of words, as on a shell's line, or the words; of these one may be a string
+            of several again.
+    """
+
+    def __init__(self, words: str | Sequence[str]) -> None:
+        self._words = deque(_split(words) if isinstance(words, str) else words)
+        self._clause: list[str] = []
+
+    def begin(self) -> str | None:
+        """Take the first word of a clause; None at the end."""
+        self._clause = []
+        return self._take()
+
+    @property
+    def clause(self) -> str:
+        """What has been taken of this clause, for messages."""
+        text = printable(shlex.join(self._clause))
+        return text if len(text) <= 80 else text[:77] + "..."
+
+    def wrong(self, expected: str) -> NoReturn:
+        """Raise a CallerError about the last word."""
+        raise CallerError(f"{self.clause}: {expected}")
+
+    def word(self, expected: str) -> str:
+        """Take a word."""
+        word = self._take()
+        if word is None:
+            self.wrong(f"expected after it: {expected}")
+        return word
+
+    def file(self, expected: str) -> str:
+        """Take the name of a file, which may contain spaces."""
+        if not self._words:
+            self.wrong(f"expected after it: {expected}")
+        name = self._words.popleft()
+        self._clause.append(name)
+        if not name:
+            self.wrong(f"expected {expected}")
+        return name
+
+    def value(self, quantity: Quantity[T]) -> T:
+        """Take a quantity."""
+        word = self.word(quantity.expected)
+        return self.read(word, quantity)
+
+    def values(self, quantity: Quantity[T], expected: str) -> list[T]:
+        """Take a list of quantities, divided by commas."""
+        try:
+            return [quantity.read(part) for part in self.word(expected).split(",")]
+        except ValueError:
+            self.wrong(f"expected {expected}")
+
+    def read(self, word: str, quantity: Quantity[T]) -> T:
+        """Read a word, or a part of one, that has been taken."""
+        try:
+            return quantity.read(word)
+        except ValueError:
+            self.wrong(f"expected {quantity.expected}")
+
+    def number_follows(self, signs: str = "") -> bool:
+        """Whether the next word begins like a number."""
+        word = self._peek()
+        return word is not None and word[0] in "0123456789." + signs
+
+    def accept(self, *words: str) -> bool:
+        """Take the next word if it is one of these."""
+        if self._peek() not in words:
+            return False
+        self._take()
+        return True
+
+    def unknown(self, word: str, known: Collection[str]) -> NoReturn:
+        """Raise a CallerError: there is no such word; name the nearest."""
+        longer = sorted(one for one in known if one.startswith(word))
+        if longer:
+            self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")
+        close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
+        self.wrong(f"no such word; {hint}")
+
+    def _peek(self) -> str | None:
+        while self._words:
+            word = self._words[0]
+            if word and not any(space in word for space in _SPACES):
+                return word
+            self._words.popleft()
+            self._words.extendleft(reversed(_split(word)))
+        return None
+
+    def _take(self) -> str | None:
+        word = self._peek()
+        if word is not None:
+            self._clause.append(self._words.popleft())
+        return word
+
+
+def _split(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError:
+        raise CallerError(f"{printable(text)}: a quotation is not closed") from None
