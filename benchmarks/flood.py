@@ -22,7 +22,8 @@ import psutil
 
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, MeasurementError, Peer, Row, median, run, say
-from cosim.analysis.run_summary import lateness_us, summarise
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.timing_statistics import lateness_us
 from cosim.cli import find_scenario
 from cosim.live.launcher import Watcher, launch
 from cosim.record.run_record import RunRecord, load_record
@@ -152,12 +153,12 @@ def flooded(case: Case, *, shielded: bool) -> Measured:
         if ending.status != ExitStatus.OK or ending.startup_s is None or not output:
             raise MeasurementError(f"{case.name}: the run ended: {ending.reason}")
         record = load_record(ending.run_dir)
-        summary = summarise(record, ending.status, ending.reason)
+        summary = summarise(record, ending.status, ending.reason).to_json()
     shields = {report["channel"]["shielded"] for report in record.reports.values()}
     if shields != {shielded}:
         raise MeasurementError(f"{case.name}: shielded {shields}, expected {shielded}")
     flood = Flood(**json.loads(output))
-    return measured(record, summary["lost_outside_netem"], flood, begun_s + ending.startup_s)
+    return measured(record, summary["unintended_losses"], flood, begun_s + ending.startup_s)
 
 
 @contextmanager

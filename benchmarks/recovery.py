@@ -20,7 +20,7 @@ import psutil
 
 from benchmarks._report import Benchmark, MeasurementError, Peer, Row, median, run, say
 from benchmarks._runs import execute
-from cosim.analysis.run_summary import lateness_us
+from cosim.analysis.timing_statistics import lateness_us
 from cosim.cli import find_scenario
 from cosim.live.launcher import Watcher, launch
 from cosim.record.run_record import RunRecord, load_record

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 from cosim.analysis.claims.claim import as_json
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
+from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import Summary, dumps, summarise
-from cosim.analysis.summary_check import can_be_shown
+from cosim.analysis.run_summary import Summary, summarise
+from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -26,7 +28,7 @@ from cosim.record.run_directory import (
     concluded,
     read_object,
 )
-from cosim.record.run_ending import RunEnding
+from cosim.record.run_ending import RunEnding, store_ending
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
 
@@ -44,22 +46,21 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         else:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
-        summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
-        summary["judged_until_s"] = None
         _write_summary(run_dir, summary)
-        # Written once more, so that nothing that is found out afterwards can cost a summary.
+        # Written again with the results below, so that none of them can cost the summary.
         claims = RunClaims(record)
-        summary |= _found_out(record, claims, summary)
-        summary["exit"] = _end(summary)
+        summary = _with_results(record, claims, summary)
         _write_summary(run_dir, summary)
+        status, reason = ExitStatus(summary.exit.status), summary.exit.reason
+        store_ending(replace(ending, status=status, reason=reason))
+        content = summary.to_json()
         try:
             if report:
-                _report(record, summary, run_dir, claims)
+                _report(record, content, run_dir, claims)
         except Exception as error:  # whatever it is: a run is none the worse for it
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
-    end = summary["exit"]
-    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+    return Outcome(run_dir, status, reason, content)
 
 
 @contextmanager
@@ -73,11 +74,11 @@ def _told_with(ending: RunEnding) -> Iterator[None]:
         raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
 
 
-def _write_summary(run_dir: Path, summary: Summary) -> None:
+def _write_summary(run_dir: Path, summary: RunSummary) -> None:
     path = run_dir / SUMMARY_FILE
     scratch = path.with_suffix(".partial")
     try:
-        scratch.write_text(dumps(summary), encoding="utf-8")
+        scratch.write_text(summary.model_dump_json(indent=2), encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
         with suppress(OSError):
@@ -87,51 +88,42 @@ def _write_summary(run_dir: Path, summary: Summary) -> None:
         ) from None
 
 
-def _found_out(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
-    """What needs more than the record's own numbers; a failure of it is a line in the summary."""
-    found: Summary = {}
+def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> RunSummary:
+    """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
+    found: dict[str, Any] = {"fidelity": fidelity_for_summary(record)}
     if record.kind == "live":
         try:
             found["replay"] = replay(record).verdict()
-        except Exception as error:  # whatever it is, the run itself went as it went
+        except Exception as error:  # the run itself did not fail
             found["replay"] = {"bit_exact": None, "error": repr(error)}
-    found["fidelity"] = fidelity_for_summary(record)
+        found["exit"] = _exit(summary.exit, found["replay"])
     try:
-        if (near := linearisation(record.scenario)) is not None:
-            found["linearisation"] = near
+        found["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # likewise
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
-        found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
-        found["judged_until_s"] = claims.judged_until_s
-        found |= _lost_by_others(claims, summary)
+        violations = list_violations(summary.assumption_violations, claims.violations())
+        longest = summary.longest_loss_burst
+        if summary.unintended_losses:
+            longest = max(longest, int(claims.conditions["dropouts"] or 0))
+        found |= {
+            "conditions": claims.conditions,
+            "claims": as_json(claims.judge()),
+            "judged_until_s": claims.judged_until_s,
+            "assumption_violations": violations,
+            "longest_loss_burst": longest,
+        }
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
-    return found
+    return summary.with_results(**found)
 
 
-def _end(summary: Summary) -> dict[str, Any]:
-    """How the run ended, whose replay is known: one that cannot be replayed failed."""
-    end: dict[str, Any] = summary["exit"]
-    verdict = summary["replay"]
-    if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
+def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:
+    """How the run ended, given its replay: a run that cannot be replayed failed."""
+    if end.status != ExitStatus.OK or replayed["bit_exact"] is not None:
         return end
-    why = verdict.get("error", "the record has no inputs")
-    return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
-
-
-def _lost_by_others(claims: RunClaims, summary: Summary) -> Summary:
-    """Runs of losses that neither the network nor the controller knows of, as somebody was away."""
-    longest = int(claims.conditions["dropouts"] or 0)
-    if not summary["lost_outside_netem"] or longest <= summary["longest_loss_burst"]:
-        return {}
-    found: Summary = {"longest_loss_burst": longest}
-    if (beyond := claims.mansd_violation) is not None and not summary["assumption_violations"]:
-        at_s, what = beyond
-        found["assumption_violations"] = [
-            {"t_s": at_s, "process": "recorder", "what": f"MANSD violated: {what}"}
-        ]
-    return found
+    why = replayed.get("error", "the record has no inputs")
+    return ExitPart(status=ExitStatus.FAILED, reason=f"the run cannot be replayed: {why}")
 
 
 def reopen(run_dir: Path) -> Outcome:

@@ -62,7 +62,7 @@ def _fidelity(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _events(found: Mapping[str, Any]) -> str:
     counts = f"{found['events_live']} events, against {found['events_ideal']} of the ideal loop"
-    if (parted := found["parted_event"]) is not None:
+    if (parted := found["first_different_event"]) is not None:
         return (
             f"The run had {counts}. With event {parted} they part: from there on the same fates "
             "meet other events."
