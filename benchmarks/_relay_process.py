@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple, TypeVar
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +20,7 @@ import numpy.typing as npt
 from benchmarks._relay_cores import RELAY_CORE, on_core
 from benchmarks._relay_load import LOOPBACK, Built, Burst, Ends
 from benchmarks._relay_ours import READY, Ours, Totals, command_of, totals_of
-from benchmarks._report import MeasurementError
-
-Figures = TypeVar("Figures")
+from benchmarks._report import Figures, MeasurementError, Rounds
 
 BURST = 8000
 """Datagrams in a burst, where the relay's receive buffer holds as many."""
@@ -85,24 +83,15 @@ def our_relay(name: str, ours: Ours, *, lossy: bool = True) -> Kind:
     return Kind(name, lambda to, _: command_of(ours, to), ("stderr", READY), lossy)
 
 
-class Sample(NamedTuple):
-    """What a burst cost a relay."""
-
-    per_s: float
-    """Datagrams taken in and decided per second of wall time."""
-    cpu_us: float
-    """CPU time of the relay per datagram taken in."""
-
-
-def sample_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> Sample:
-    """Rate and cost of a burst that came through.
+def figures_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> Figures:
+    """Return ``per_s``, datagrams received and decided, and ``cpu_us``, CPU time for each.
 
     Raises:
         MeasurementError: more is missing than the relay can have dropped.
     """
     if burst.decided < sent - slack or (slack == 0 and burst.received != sent):
         raise MeasurementError(f"{name}: of a burst of {sent} only {burst.received} arrived")
-    return Sample(burst.decided / burst.wall_s, cpu_s / sent * 1e6)
+    return {"per_s": burst.decided / burst.wall_s, "cpu_us": cpu_s / sent * 1e6}
 
 
 class Relay:
@@ -128,7 +117,7 @@ class Relay:
         tasks = Path(f"/proc/{self.pid}/task").glob("*/schedstat")
         return sum(int(task.read_text().split()[field]) for task in tasks) * 1e-9
 
-    def burst(self, addresses: npt.NDArray[np.uint32] | None = None) -> Sample:
+    def burst(self, addresses: npt.NDArray[np.uint32] | None = None) -> Figures:
         """Let it work off one burst; the first time also find out how many its buffer holds.
 
         Args:
@@ -141,7 +130,7 @@ class Relay:
                 raise MeasurementError(f"{self.name} forwards nothing")
         before_s = self.cpu_s()
         found = self.ends.burst(self.pid, self._burst, self._slack, addresses)
-        return sample_of(self.name, found, self._burst, self._slack, self.cpu_s() - before_s)
+        return figures_of(self.name, found, self._burst, self._slack, self.cpu_s() - before_s)
 
     def totals(self) -> Totals:
         """End our relay as Ctrl-C does; what it counted."""
@@ -177,40 +166,39 @@ def running(kind: Kind, built: Built) -> Iterator[Relay]:
 
 
 def start_all(
-    kinds: Mapping[str, Kind | str], built: Built, stack: ExitStack
-) -> tuple[list[Relay], dict[str, str]]:
-    """Run relays until the stack ends; return them, and by name why others do not run.
+    kinds: Mapping[str, Kind | str], built: Built, stack: ExitStack, rounds: Rounds
+) -> list[Relay]:
+    """Run relays until the stack ends, and return them; others are missing in the rounds.
 
     Args:
-        kinds: by name a kind of relay, or why there is none.
+        kinds: by name a kind of relay, or the reason why there is none.
         built: the compiled load.
         stack: ends the relays.
+        rounds: gets the reasons.
     """
     relays: list[Relay] = []
-    missing: dict[str, str] = {}
     for name, kind in kinds.items():
         if isinstance(kind, str):
-            missing[name] = kind
+            rounds.add(name, kind)
             continue
         try:
             relays.append(stack.enter_context(running(kind, built)))
         except MeasurementError as error:
-            missing[name] = str(error)
-    return relays, missing
+            rounds.add(name, str(error))
+    return relays
 
 
 def in_turn(
-    relays: list[Relay],
-    missing: dict[str, str],
-    rounds: dict[str, list[Figures]],
-    measure: Callable[[Relay], Figures],
+    relays: list[Relay], rounds: Rounds, measure: Callable[[Relay], Figures | None]
 ) -> None:
-    """Measure a round of each relay. What fails is said in ``missing`` and measured no more."""
+    """Measure a round of each relay; one that fails is missing in the rounds from then on."""
     for relay in list(relays):
         try:
-            rounds.setdefault(relay.name, []).append(measure(relay))
+            figures = measure(relay)
+            if figures is not None:
+                rounds.add(relay.name, figures)
         except MeasurementError as error:
-            missing[relay.name] = str(error)
+            rounds.add(relay.name, str(error))
             relays.remove(relay)
 
 

@@ -1,4 +1,4 @@
-"""Rows, tables and JSON of the benchmarks, and how busy the machine was meanwhile."""
+"""Rounds, rows, tables and JSON of the benchmarks, and the load of the machine meanwhile."""
 
 import argparse
 import json
@@ -7,7 +7,7 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,7 @@ _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
 
 
 class MeasurementError(Exception):
-    """A benchmark could not be carried out; says why in one line."""
+    """A benchmark could not be measured, for the reason given in one line."""
 
 
 class Peer(NamedTuple):
@@ -184,6 +184,59 @@ def median(values: Iterable[float]) -> float:
     return statistics.median(values)
 
 
+Figures = Mapping[str, float]
+"""The figures of one side in one round, by quantity."""
+
+
+class Rounds:
+    """Figures of several sides that are measured in turn, each once per round."""
+
+    def __init__(self) -> None:
+        self.missing: dict[str, str] = {}
+        """By side without (valid) figures, the reason."""
+        self._figures: dict[str, list[Figures]] = {}
+
+    def add(self, side: str, figures: Figures | str) -> None:
+        """Add a side's figures of a round, or the reason why there are none."""
+        if isinstance(figures, str):
+            self.missing[side] = figures
+        else:
+            self._figures.setdefault(side, []).append(figures)
+
+    def of(self, side: str, quantity: str) -> list[float]:
+        """Return the rounds of a quantity; empty if the side was not measured."""
+        return [figures[quantity] for figures in self._figures.get(side, ())]
+
+    def row(
+        self, name: str, unit: str, quantity: str, ours: str, peer: str | None = None,
+        goal: Goal | None = None, *, note: str | None = None, paired: bool = False,
+    ) -> Row:  # fmt: skip
+        """Return the row of a quantity: the medians of both sides.
+
+        Args:
+            name: what was measured.
+            unit: its unit.
+            quantity: key of the figures.
+            ours: our side.
+            peer: the alternative's side.
+            goal: see :class:`Row`.
+            note: for the reader.
+            paired: take the median of the rounds' ratios, as a disturbance affects both sides of
+                a round; False: the ratio of the medians.
+        """
+        sides = [side for side in (ours, peer) if side is not None]
+        reasons = [f"{side}: {self.missing[side]}" for side in sides if side in self.missing]
+        value, alternative = self.of(ours, quantity), self.of(peer or "", quantity)
+        ratios = []
+        if paired and not reasons:
+            ratios = [one / other for one, other in zip(value, alternative, strict=True)]
+        return Row(
+            name, median(value) if value else None, unit,
+            None if peer is None else Peer(peer, median(alternative) if alternative else None),
+            goal, note, "; ".join(reasons) or None, median(ratios) if ratios else None,
+        )  # fmt: skip
+
+
 def say(text: str) -> None:
     """Tell a waiting person what is being measured."""
     print(f"  {text} ...", file=sys.stderr, flush=True)
@@ -215,20 +268,19 @@ def _number(value: float | None) -> str:
 
 
 def run(benchmarks: Sequence[Benchmark], arguments: Sequence[str] | None = None) -> int:
-    """Command line of one or more benchmarks; 0 if all of them could be carried out."""
+    """Run the command line of some benchmarks; return 0 if all of them could be measured."""
     parser = argparse.ArgumentParser(
         description="Measure " + ", ".join(benchmark.title for benchmark in benchmarks) + "."
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE")
     names = [benchmark.name for benchmark in benchmarks]
-    if len(benchmarks) > 1:
-        parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(names)}")
     for benchmark in benchmarks:
         benchmark.add_arguments(parser)
     options = parser.parse_args(arguments)
-    chosen = getattr(options, "names", ()) or names
+    chosen = options.names or names
     if unknown := [name for name in chosen if name not in names]:
-        parser.error(f"no benchmark is called {unknown[0]!r}; there are {', '.join(names)}")
+        parser.error(f"no benchmark {unknown[0]!r}; benchmarks: {', '.join(names)}")
     benchmarks = [benchmark for benchmark in benchmarks if benchmark.name in chosen]
     console = Console()
     if not console.is_terminal:

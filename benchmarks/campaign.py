@@ -19,7 +19,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import psutil
 
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from cosim.shipped_files import find_shipped
 from cosim.studies.campaign.campaign_file import load
 from cosim.studies.campaign.campaign_grid import grid
@@ -124,6 +124,3 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 
 BENCHMARK = Benchmark("campaign", "A million runs", measure, _arguments)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

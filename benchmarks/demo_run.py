@@ -4,11 +4,10 @@ A plant step is late that is made more than one period after its time.
 """
 
 import argparse
-import sys
 from collections.abc import Mapping
 from typing import Any
 
-from benchmarks._report import Benchmark, Goal, Row, run, say
+from benchmarks._report import Benchmark, Goal, Row, say
 from benchmarks._runs import noack
 
 
@@ -32,6 +31,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("demo_run", "The demo's completeness and punctuality", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

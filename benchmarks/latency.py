@@ -1,25 +1,24 @@
 """One-way latency from the sensor's event to the controller's update, through netem.
 
 Compared with a bare Python UDP ping through a bare two-socket relay (:mod:`benchmarks._ping`) at
-the same rhythm, with the same datagram size and the same real-time settings. Ours includes what the
+the same period, with the same datagram size and the same real-time settings. Ours includes what the
 ping lacks: the sensor's trigger test, tagging and checking the datagram, the loss model, the MANSD
-cap and the record, on a machine that also runs the plant, the control plane and the recorder. The
-scenario makes an event of every measurement, so that each run gives thousands of updates.
+cap and the record, on a machine that also runs the plant, the control plane and the recorder. In
+this scenario every measurement is an event, so that each run gives thousands of updates.
 """
 
 import argparse
-import sys
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping
 
 from benchmarks._ping import ping
-from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 from benchmarks._runs import noack
 
 ROUNDS = 5
 ROUND_S = 5.0
 PERIOD_S = 0.002
-GOAL = Goal("<=", 3)
+GOALS = {"p50": Goal("<=", 3), "p99": None}
+OURS, PING = "noack", "ping through a bare relay"
 
 _EVERY_MEASUREMENT = (
     "run", "lane_following",
@@ -27,46 +26,20 @@ _EVERY_MEASUREMENT = (
     "--set", "trigger.beta=1e-9",
     "--set", 'network.loss={model="lossless"}',
 )  # fmt: skip
-_ASKED = {True: "real-time settings", False: "no settings"}
-_PLAIN = ("--set", "realtime.enabled=false")
+_SETTINGS = {"real-time settings": (), "no settings": ("--set", "realtime.enabled=false")}
 
 
-class Sample(NamedTuple):
-    """One round's latencies, µs."""
-
-    p50_us: float
-    p99_us: float
-    size: int
-
-
-def rows_of(
-    settings: str,
-    ours: Sequence[Sample],
-    pings: Sequence[Sample],
-    refused: Sequence[str] = (),
-) -> list[Row]:
-    """Return the rows for one choice of real-time settings from the rounds of both sides.
-
-    Args:
-        settings: name of the choice.
-        ours: our rounds.
-        pings: the ping's rounds.
-        refused: real-time settings that were asked for and refused.
-    """
-    note = f"{sum(s.size for s in ours)} updates, {sum(s.size for s in pings)} pings"
-    if refused:
-        note += f"; not granted: {', '.join(refused)}"
+def rows_of(settings: str, rounds: Rounds, refused: str) -> list[Row]:
+    """Return the rows for one choice of real-time settings; ``refused`` are those not applied."""
+    updates, pings = (sum(rounds.of(side, "count")) for side in (OURS, PING))
+    note = f"{updates:.0f} updates, {pings:.0f} pings" + (refused and f"; not applied: {refused}")
     return [
-        Row(
-            f"event → update, {quantile}, {settings}",
-            median(getattr(sample, f"{quantile}_us") for sample in ours),
-            "µs",
-            Peer("ping through a bare relay", median(getattr(s, f"{quantile}_us") for s in pings)),
-            goal,
-            note if quantile == "p50" else None,
+        rounds.row(
+            f"event → update, {quantile}, {settings}", "µs", quantile, OURS, PING, goal,
+            note=note if quantile == "p50" else None,
         )
-        for quantile, goal in (("p50", GOAL), ("p99", None))
-    ]
+        for quantile, goal in GOALS.items()
+    ]  # fmt: skip
 
 
 def _refused(granted: Mapping[str, str]) -> set[str]:
@@ -75,27 +48,26 @@ def _refused(granted: Mapping[str, str]) -> set[str]:
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Measure both sides in turn, with and without real-time settings."""
-    ours: dict[bool, list[Sample]] = {asked: [] for asked in _ASKED}
-    pings: dict[bool, list[Sample]] = {asked: [] for asked in _ASKED}
-    refused: set[str] = set()
+    rounds = {settings: Rounds() for settings in _SETTINGS}
+    refused: dict[str, set[str]] = {settings: set() for settings in _SETTINGS}
     for number in range(ROUNDS):
-        for asked, settings in _ASKED.items():
+        for settings, arguments in _SETTINGS.items():
             say(f"round {number + 1} of {ROUNDS}, {settings}")
-            bare = ping(round(ROUND_S / PERIOD_S), PERIOD_S, asked=asked)
-            pings[asked].append(Sample(bare.p50_us, bare.p99_us, bare.received))
-            summary = noack(*_EVERY_MEASUREMENT, *(() if asked else _PLAIN)).summary
+            bare = ping(round(ROUND_S / PERIOD_S), PERIOD_S, asked=not arguments)
+            rounds[settings].add(
+                PING, {"p50": bare.p50_us, "p99": bare.p99_us, "count": bare.received}
+            )
+            summary = noack(*_EVERY_MEASUREMENT, *arguments).summary
             found = summary["latency_us"]
-            ours[asked].append(Sample(found["p50"], found["p99"], found["updates"]))
+            figures = {"p50": found["p50"], "p99": found["p99"], "count": found["updates"]}
+            rounds[settings].add(OURS, figures)
             for granted in (bare.granted, *summary["realtime"].values()):
-                refused |= _refused(granted)
+                refused[settings] |= set() if arguments else _refused(granted)
     return [
         row
-        for asked, settings in _ASKED.items()
-        for row in rows_of(settings, ours[asked], pings[asked], sorted(refused) if asked else ())
+        for settings, found in rounds.items()
+        for row in rows_of(settings, found, ", ".join(sorted(refused[settings])))
     ]
 
 
 BENCHMARK = Benchmark("latency", "One-way latency", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -10,7 +10,6 @@ import hashlib
 import hmac
 import json
 import pickle
-import sys
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -20,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from benchmarks._report import Benchmark, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Peer, Row, median, say
 from controller_node.controller import controller_of
 from cosim.cli import find_scenario
 from netem.link_machine import Datagram, update_link_of
@@ -220,6 +219,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("machines", "Cost per call", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -7,7 +7,6 @@ Figures are the thread's CPU time: what others take on a busy machine is not the
 
 import argparse
 import os
-import sys
 import time
 from typing import NamedTuple
 
@@ -17,10 +16,11 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks._report import Benchmark, Goal, Peer, Row, run, say
+from benchmarks._report import Benchmark, Goal, Peer, Row, say
 from benchmarks._ticks import FIFO_PRIORITY
 from cosim.cli import find_scenario
 from cosim.simulation.virtual_time import simulate
+from noack.config.plants import PLANTS
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
@@ -43,19 +43,22 @@ class Case(NamedTuple):
 
     name: str
     scenario: str
-    settings: tuple[str, ...] = ()
-    goal: Goal | None = None
+    settings: tuple[str, ...]
+    goal: Goal
 
 
-CASES = (
-    Case("cart_pole", "cart_pole"),
-    Case("four_tank", "four_tank"),
-    Case("quadrotor", "quadrotor_hover"),
-    *(
-        Case(f"vehicle, {model}", "lane_vehicle", (f"plant.system.model={model}",), SHARE)
-        for model in ("kinematic", "single_track", "drift", "multi_body")
-    ),
+CASES = tuple(
+    Case(
+        ", ".join((kind, *map(str, variant.values()))),
+        settings.scenario,
+        tuple(f"plant.system.{key}={value}" for key, value in variant.items()),
+        SHARE,
+    )
+    for kind, settings in PLANTS.items()
+    if settings.scenario not in (None, LINEAR)
+    for variant in settings.variants
 )
+"""Every kind of plant that has a scenario, the linear one aside."""
 
 
 class Steps:
@@ -132,6 +135,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("plants", "Cost per step of the plants", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

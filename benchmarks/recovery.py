@@ -8,193 +8,143 @@ Python that does no more than import what that process imports: no restart can b
 import argparse
 import signal
 import sys
-import tempfile
-import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import psutil
 
-from benchmarks._report import Benchmark, MeasurementError, Peer, Row, median, run, say
+from benchmarks._faulted_run import FaultedRun, Processes, faulted_run, run_recovery_s
+from benchmarks._report import Benchmark, Figures, MeasurementError, Peer, Rounds, Row, median, say
 from benchmarks._runs import execute
-from cosim.analysis.timing_statistics import lateness_us
-from cosim.cli import find_scenario
-from cosim.live.launcher import Watcher, launch
-from cosim.record.run_record import RunRecord, load_record
-from noack.config.scenario_file import load
-from noack.core.errors import ExitStatus
+from benchmarks.soak.watch import MODULES
 from noack.protocol.machine_interface import GENERATION
-from noack.protocol.record_tables import (
-    CONTROLLER_DELIVERY,
-    CONTROLLER_STEP,
-    PLANT_STEP,
-    SENSOR_MEASUREMENT,
-)
+from noack.protocol.record_tables import CONTROLLER_DELIVERY, PLANT_STEP
 
 ROUNDS = 3
 HORIZON_S = 9.0
 FAULT_S = 2.5
-STILL_S = 0.7
-_QUIET_S = 0.25
-_MODULES = {
-    "sensor": "sensor_node", "controller": "controller_node", "netem": "netem",
-    "recorder": "cosim.live.recorder", "plant": "plant_server",
-}  # fmt: skip
-_STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
+STOPPED_S = 0.7
+IMPORT = "Python that imports as much"
 
 
-class Fault(NamedTuple):
-    """What befell a run, and what is left of it."""
-
-    record: RunRecord
-    at_s: float
-    """In the run's time: when the process was killed, or continued."""
-    back_s: float | None
-    """When the launcher said that it is back."""
-
-
-def suffer(role: str, befall: Callable[[psutil.Process], float]) -> Fault:
-    """Let something befall a process of a run.
+def suffer(role: str, fault: Callable[[psutil.Process], float]) -> tuple[FaultedRun[float], float]:
+    """Run with a fault of a process; return the run, and when the fault was over, in its time.
 
     Args:
         role: the process.
-        befall: does it, and returns when it was over, on the monotonic clock.
+        fault: returns the time when it was over, on the monotonic clock.
 
     Raises:
         MeasurementError: the run failed.
     """
-    settings = [f"horizon_s={HORIZON_S}", "ports={}", "recovery.rejoin_within_s=30"]
-    scenario = load(find_scenario("lane_following"), settings)
-    done: list[threading.Thread] = []
-    ends_s, backs_s = list[float](), list[float]()
 
-    def progress(account: Mapping[str, Any]) -> None:
-        if account["t_s"] >= FAULT_S and not done:
-            (process,) = (
-                child for child in psutil.Process().children() if _MODULES[role] in child.cmdline()
-            )
-            done.append(threading.Thread(target=lambda: ends_s.append(befall(process))))
-            done[0].start()
+    def of_role(processes: Processes) -> float:
+        return fault(processes[role])
 
-    watcher = Watcher(progress=progress, back=lambda _, t_s: backs_s.append(t_s))
-    with tempfile.TemporaryDirectory(prefix="noack-bench-") as runs:
-        begun_s = time.monotonic()
-        ending = launch(scenario, Path(runs), watcher=watcher)
-        for thread in done:
-            thread.join()
-        if ending.status != ExitStatus.OK or ending.startup_s is None or not ends_s:
-            raise MeasurementError(f"{role}: the run ended: {ending.reason}")
-        record = load_record(ending.run_dir)
-    epoch_s = begun_s + ending.startup_s
-    return Fault(record, ends_s[0] - epoch_s, backs_s[0] if backs_s else None)
+    settings = [f"horizon_s={HORIZON_S}", "recovery.rejoin_within_s=30"]
+    run = faulted_run(role, settings, FAULT_S, of_role)
+    return run, run.outcome - run.epoch_s
 
 
 def kill(process: psutil.Process) -> float:
-    """Kill it."""
+    """Kill a process."""
     process.kill()
     return time.monotonic()
 
 
 def stop(process: psutil.Process) -> float:
-    """Let it stand still for a while."""
+    """Stop a process, and continue it after a while."""
     process.send_signal(signal.SIGSTOP)
-    time.sleep(STILL_S)
+    time.sleep(STOPPED_S)
     process.send_signal(signal.SIGCONT)
     return time.monotonic()
 
 
-def killed(role: str) -> tuple[float, float, float]:
+def killed(role: str) -> Figures:
     """Kill a process of the loop.
 
     Returns:
-        Wall seconds until another acted in its place, until the controller had an update again, and
-        by how much the dead one's last row on record came before its death.
+        ``acted_s``: wall time until the restarted process acted; ``updated_s``: until the
+        controller had an update again; ``unwritten_ms``: age of the last recorded row of the
+        killed process at its death.
     """
-    fault = suffer(role, kill)
-    before, after = fault.record.lives(role)
+    run, at_s = suffer(role, kill)
+    before, after = run.record.lives(role)
     acted_s = np.concatenate([rows["now_ns"] for rows in after.rows.values()]).min() * 1e-9
     wrote_s = np.concatenate([rows["now_ns"] for rows in before.rows.values()]).max() * 1e-9
-    deliveries = fault.record[CONTROLLER_DELIVERY]
+    deliveries = run.record[CONTROLLER_DELIVERY]
     fresh = deliveries["now_ns"] * 1e-9 >= acted_s
     if role == "sensor":
         fresh &= deliveries["sequence"] >= GENERATION
     if not fresh.any():
         raise MeasurementError(f"{role}: no update was delivered afterwards")
     updated_s = float(deliveries["now_ns"][fresh][0]) * 1e-9
-    return acted_s - fault.at_s, updated_s - fault.at_s, fault.at_s - wrote_s
+    return {
+        "acted_s": acted_s - at_s,
+        "updated_s": updated_s - at_s,
+        "unwritten_ms": 1e3 * (at_s - wrote_s),
+    }
 
 
-def stopped(role: str) -> float:
-    """Let a process stand still; return wall seconds from its end to the last late step of all."""
-    fault = suffer(role, stop)
-    period_us = fault.record.scenario.timing.plant_period_ns * 1e-3
-    last_s = fault.at_s
-    for process, table in _STEPS.items():
-        now_s = fault.record[table]["now_ns"] * 1e-9
-        late = (lateness_us(fault.record, process) > period_us) & (now_s > fault.at_s)
-        end_s = fault.at_s
-        for at_s in now_s[late].tolist():
-            if at_s > end_s + _QUIET_S:
-                break
-            end_s = at_s
-        last_s = max(last_s, end_s)
-    return last_s - fault.at_s
+def stopped_ms(role: str) -> float:
+    """Stop a process for a while; return wall time from then to the last late step of all."""
+    run, at_s = suffer(role, stop)
+    return 1e3 * run_recovery_s(run.record, at_s)
 
 
 def imported_s(role: str) -> float:
-    """Wall seconds from the start of a Python until it has imported what a process imports."""
-    module = _MODULES[role] + (".__main__" if role != "recorder" else "")
+    """Wall seconds from the start of a Python until it has imported the modules of a process."""
+    module = MODULES[role] + (".__main__" if role != "recorder" else "")
     command = [sys.executable, "-c", f"import {module}, sys; print('ready', file=sys.stderr)"]
     finished = execute(command)
     return finished.lines[-1].at_s - finished.begun_s
 
 
-def measure(options: argparse.Namespace) -> list[Row]:
-    """Kill and stop each process, several times."""
-    rows: list[Row] = []
-    for role in ("sensor", "controller", "netem"):
-        found, imports_s = [], []
-        for number in range(ROUNDS):
-            say(f"{role} killed, round {number + 1} of {ROUNDS}")
-            found.append(killed(role))
-            imports_s.append(imported_s(role))
-        rows += rows_of(role, found, imports_s)
-    say("recorder killed")
-    fault = suffer("recorder", kill)
-    steps = fault.record[PLANT_STEP]["sequence"]
-    if fault.back_s is None or len(steps) != steps[-1] + 1:
-        raise MeasurementError("recorder: it did not come back, or rows are missing")
-    rows.append(
-        Row("recorder killed: until another records", fault.back_s - fault.at_s, "s",
-            Peer("Python that imports as much", imported_s("recorder")),
-            note="nothing is missing from the record")
-    )  # fmt: skip
-    for role in ("plant", "sensor", "netem", "controller", "recorder"):
-        say(f"{role} stands still")
-        late_s = median([stopped(role) for _ in range(ROUNDS)])
-        name = f"{role} stood still for {STILL_S:g} s: last late step after that"
-        rows.append(Row(name, 1e3 * late_s, "ms"))
-    return rows
-
-
-def rows_of(
-    role: str, found: Sequence[tuple[float, float, float]], imports_s: Sequence[float]
-) -> list[Row]:
-    """Return the rows of a process that was killed, from the rounds."""
-    acted_s, updated_s, unwritten_s = (median([one[i] for one in found]) for i in range(3))
-    peer = Peer("Python that imports as much", median(imports_s))
+def killed_rows(role: str) -> list[Row]:
+    """Kill a process several times; return the rows."""
+    rounds = Rounds()
+    for number in range(ROUNDS):
+        say(f"{role} killed, round {number + 1} of {ROUNDS}")
+        rounds.add(role, killed(role))
+        rounds.add(IMPORT, dict.fromkeys(("acted_s", "updated_s"), imported_s(role)))
+    row = partial(rounds.row, ours=role)
     return [
-        Row(f"{role} killed: until another acts in its place", acted_s, "s", peer),
-        Row(f"{role} killed: until the controller has an update again", updated_s, "s", peer),
-        Row(f"{role} killed: its last row on record is older by", 1e3 * unwritten_s, "ms",
+        row(f"{role} killed: until another acts in its place", "s", "acted_s", peer=IMPORT),
+        row(f"{role} killed: until the controller has an update again", "s", "updated_s",
+            peer=IMPORT),
+        row(f"{role} killed: age of its last recorded row", "ms", "unwritten_ms",
             note="rows are handed over every 50 ms"),
     ]  # fmt: skip
 
 
-BENCHMARK = Benchmark("recovery", "A run whose processes die or stand still", measure)
+def recorder_row() -> Row:
+    """Kill the recorder; return the row.
 
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))
+    Raises:
+        MeasurementError: it was not restarted, or rows are missing.
+    """
+    say("recorder killed")
+    run, at_s = suffer("recorder", kill)
+    steps = run.record[PLANT_STEP]["sequence"]
+    if run.back_s is None or len(steps) != steps[-1] + 1:
+        raise MeasurementError("recorder: it was not restarted, or rows are missing")
+    return Row(
+        "recorder killed: until another records", run.back_s - at_s, "s",
+        Peer(IMPORT, imported_s("recorder")), note="nothing is missing from the record",
+    )  # fmt: skip
+
+
+def measure(options: argparse.Namespace) -> list[Row]:
+    """Kill and stop each process, several times."""
+    rows = [row for role in ("sensor", "controller", "netem") for row in killed_rows(role)]
+    rows.append(recorder_row())
+    for role in ("plant", "sensor", "netem", "controller", "recorder"):
+        say(f"{role} stopped")
+        late_ms = median([stopped_ms(role) for _ in range(ROUNDS)])
+        rows.append(Row(f"{role} stopped for {STOPPED_S:g} s: last late step", late_ms, "ms"))
+    return rows
+
+
+BENCHMARK = Benchmark("recovery", "A run whose processes die or stop", measure)

@@ -12,10 +12,7 @@ so that the sink's wake-up has no part in it. Compared with cyclictest on the re
 import argparse
 import functools
 import os
-import sys
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from typing import NamedTuple
 
 import numpy as np
 
@@ -31,9 +28,8 @@ from benchmarks._relay_process import (
     socat,
     start_all,
 )
-from benchmarks._report import Benchmark, Goal, MeasurementError, Row, median, run, say
-from benchmarks._rounds import Comparison, paired
-from benchmarks.lateness import cyclictest
+from benchmarks._report import Benchmark, Figures, Goal, MeasurementError, Rounds, Row, say
+from benchmarks.lateness import KERNEL, cyclictest
 
 PING_ROUNDS = 60
 PINGS = 500
@@ -46,24 +42,13 @@ DELAY_MS = 10
 FIFO_PRIORITY = 80
 """The usual one for cyclictest."""
 _LATENCY = "/dev/cpu_dma_latency"
-OURS, DIRECT, KERNEL = "ours", "direct, no relay", "cyclictest"
-ADDED = (
-    Comparison(OURS, "socat", Goal("<=", 0.75)),
-    Comparison(OURS, "C relay"),
-    Comparison(OURS, "asyncio relay"),
-)
-LATENESS = (Comparison(OURS, KERNEL, Goal("<=", 2)), Comparison(OURS, "asyncio relay"))
+OURS, DIRECT = "ours", "direct, no relay"
+ADDED_GOALS = {("socat", "p50"): Goal("<=", 0.75)}
+LATENESS_GOALS = {(KERNEL, "p99"): Goal("<=", 2)}
 
 
-class Quantiles(NamedTuple):
-    """Of a round, µs."""
-
-    p50_us: float
-    p99_us: float
-
-
-def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Quantiles:
-    """Quantiles of the delays beyond ``base_us``.
+def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Figures:
+    """Quantiles of the delays beyond ``base_us``, in µs.
 
     Raises:
         MeasurementError: a datagram is missing.
@@ -71,76 +56,56 @@ def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Qua
     if lost := int((delays_ns < 0).sum()):
         raise MeasurementError(f"{name}: {lost} of {len(delays_ns)} datagrams did not arrive")
     p50_us, p99_us = np.quantile(delays_ns, [0.5, 0.99]) / 1e3 - base_us
-    return Quantiles(float(p50_us), float(p99_us))
+    return {"p50": float(p50_us), "p99": float(p99_us)}
 
 
-Rounds = Mapping[str, Sequence[Quantiles]]
-
-
-def added_rows(rounds: Rounds, missing: Mapping[str, str]) -> list[Row]:
-    """Return the rows of the added delay; only its median has a goal.
-
-    Args:
-        rounds: by relay, its rounds; without a relay the one-way delay itself.
-        missing: by relay that was not measured, why.
-    """
-    direct = Row(f"{DIRECT}: one way, p50", median(q.p50_us for q in rounds[DIRECT]), "µs")
-    return [direct, *_rows("added one way", ADDED, "p50_us", rounds, missing)]
-
-
-def lateness_rows(rounds: Rounds, missing: Mapping[str, str], refused: str | None) -> list[Row]:
-    """Return the rows of the lateness; only its 99th percentile has a goal.
-
-    Args:
-        rounds: by relay, and for cyclictest, their rounds.
-        missing: by name of who was not measured, why.
-        refused: why the real-time settings cannot be had; then there is nothing to judge.
-    """
-    if refused is not None:
-        missing = {KERNEL: refused, **missing}
-    return _rows(f"lateness behind {DELAY_MS} ms", LATENESS, "p99_us", rounds, missing)
-
-
-def _rows(
-    figure: str,
-    comparisons: Sequence[Comparison],
-    judged: str,
-    rounds: Rounds,
-    missing: Mapping[str, str],
-) -> list[Row]:
+def added_rows(rounds: Rounds) -> list[Row]:
+    """Return the rows of the added delay; only its median has a goal."""
     return [
-        paired(
-            f"{figure}, {quantile.removesuffix('_us')}", "µs",
-            comparison if quantile == judged else comparison._replace(goal=None),
-            {name: [getattr(found, quantile) for found in of] for name, of in rounds.items()},
-            missing,
+        rounds.row(f"{DIRECT}: one way, p50", "µs", "p50", DIRECT),
+        *(
+            rounds.row(
+                f"{OURS}: added one way, {quantile}", "µs", quantile, OURS, peer,
+                ADDED_GOALS.get((peer, quantile)), paired=True,
+            )
+            for peer in ("socat", "C relay", "asyncio relay") for quantile in ("p50", "p99")
+        ),
+    ]  # fmt: skip
+
+
+def lateness_rows(rounds: Rounds) -> list[Row]:
+    """Return the rows of the lateness; only its 99th percentile has a goal."""
+    return [
+        rounds.row(
+            f"{OURS}: lateness behind {DELAY_MS} ms, {quantile}", "µs", quantile, OURS, peer,
+            LATENESS_GOALS.get((peer, quantile)), paired=True,
         )
-        for comparison in comparisons for quantile in ("p50_us", "p99_us")
+        for peer in (KERNEL, "asyncio relay") for quantile in ("p50", "p99")
     ]  # fmt: skip
 
 
 def refusal(fifo: bool) -> str | None:
-    """Why the relay does not get the settings that cyclictest takes, if it does not.
+    """Return why the relay lacks the settings that cyclictest applies, or None.
 
     Args:
-        fifo: whether the sender got SCHED_FIFO.
+        fifo: whether SCHED_FIFO was applied to the sender.
     """
     if not fifo:
         return "SCHED_FIFO is refused"
     return None if os.access(_LATENCY, os.W_OK) else f"{_LATENCY} cannot be written"
 
 
-def _added(relay: Relay, base_us: float) -> Quantiles:
+def _added(relay: Relay, base_us: float) -> Figures:
     return quantiles_of(relay.name, relay.ends.ping(PINGS), base_us)
 
 
-def _late(relay: Relay) -> Quantiles:
+def _late(relay: Relay) -> Figures:
     delays_ns = relay.ends.pace(LINE_ROUND_S * 1_000_000_000 // PERIOD_NS, PERIOD_NS)
     return quantiles_of(relay.name, delays_ns, DELAY_MS * 1e3)
 
 
 def _measure_added(tools: Built) -> list[Row]:
-    rounds: dict[str, list[Quantiles]] = {}
+    rounds = Rounds()
     with scheduled(BEFORE_OTHERS), on_core(RELAY_CORE), ExitStack() as stack:
         kinds = {
             "socat": socat(),
@@ -148,37 +113,34 @@ def _measure_added(tools: Built) -> list[Row]:
             "asyncio relay": asyncio_relay(),
             OURS: our_relay(OURS, Ours("loss 5% mansd 0 seed 7"), lossy=False),
         }
-        relays, missing = start_all(kinds, tools, stack)
+        relays = start_all(kinds, tools, stack, rounds)
         direct = Ends(tools.load)
         stack.callback(direct.close)
         direct.connect(direct.sink_port)
         say(f"added delay, {PING_ROUNDS} rounds")
         for _ in range(PING_ROUNDS):
             base = quantiles_of(DIRECT, direct.ping(PINGS))
-            rounds.setdefault(DIRECT, []).append(base)
-            in_turn(relays, missing, rounds, functools.partial(_added, base_us=base.p50_us))
-    return added_rows(rounds, missing)
+            rounds.add(DIRECT, base)
+            in_turn(relays, rounds, functools.partial(_added, base_us=base["p50"]))
+    return added_rows(rounds)
 
 
 def _measure_lateness(tools: Built) -> list[Row]:
-    rounds: dict[str, list[Quantiles]] = {}
+    rounds = Rounds()
     with on_core(LOAD_CORE), ExitStack() as stack:
         kinds = {
             OURS: our_relay(OURS, Ours(f"delay {DELAY_MS}ms", realtime=True), lossy=False),
             "asyncio relay": asyncio_relay(DELAY_MS),
         }
-        relays, missing = start_all(kinds, tools, stack)
+        relays = start_all(kinds, tools, stack, rounds)
         for number in range(LINE_ROUNDS):
             say(f"lateness, round {number + 1} of {LINE_ROUNDS}")
-            kernel = cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE)
-            if isinstance(kernel, str):
-                missing[KERNEL] = kernel
-            else:
-                rounds.setdefault(KERNEL, []).append(Quantiles(kernel.p50_us, kernel.p99_us))
+            rounds.add(KERNEL, cyclictest(LINE_ROUND_S, FIFO_PRIORITY, RELAY_CORE))
             with scheduled(FIFO_PRIORITY) as granted:
-                refused = refusal(granted)
-                in_turn(relays, missing, rounds, _late)
-    return lateness_rows(rounds, missing, refused)
+                if refused := refusal(granted):
+                    rounds.add(KERNEL, refused)
+                in_turn(relays, rounds, _late)
+    return lateness_rows(rounds)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -188,6 +150,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("relay_delay", "Relays: delay", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -3,14 +3,14 @@
 Flows differ in the sender's address (127.1.0.0 and on), datagrams come from them in turn. Cost is
 the relay's CPU time per datagram while it works off a full receive buffer, as in
 :mod:`benchmarks.relays`; the C relay, which looks at no address, shows what of it is the kernel's.
-The decisions' runs of losses are counted from the fates alone.
+The decisions' loss bursts are counted from the fates alone.
 """
 
 import argparse
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import NamedTuple
 
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, on_core, scheduled
@@ -26,8 +26,7 @@ from benchmarks._relay_decisions import (
 from benchmarks._relay_load import built, sources
 from benchmarks._relay_ours import Ours
 from benchmarks._relay_process import Relay, c_relay, in_turn, our_relay, start_all
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, run, say
-from benchmarks._rounds import Comparison, paired
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Rounds, Row, say
 
 ROUNDS = 30
 FLOWS = 10_000
@@ -35,34 +34,22 @@ WORDS = "loss 5% mansd 4 seed 7"
 COST_GOAL = Goal("<=", 1.3)
 KINDS = {
     "ours": Ours(WORDS),
-    "ours, with a way back": Ours(WORDS, reverse=True),
+    "ours, with the reverse direction": Ours(WORDS, reverse=True),
 }
 _PACKETS = 10
 """Of each flow in a call."""
 
 
-class Costs(NamedTuple):
-    """CPU time per datagram in a round, µs."""
-
-    one_us: float
-    many_us: float
-
-
-def flow_rows(rounds: Mapping[str, Sequence[Costs]], missing: Mapping[str, str]) -> list[Row]:
-    """Return the rows of the relays.
-
-    Args:
-        rounds: by relay, its rounds.
-        missing: by relay that was not measured, why.
-    """
+def flow_rows(rounds: Rounds) -> list[Row]:
+    """Return the rows of the relays: the cost of many flows beside the cost of one."""
     rows = []
     for name in (*KINDS, "C relay"):
         many, one = f"{name}, {FLOWS:,} flows", f"{name}, one flow"
-        found = rounds.get(name, ())
-        figures = {many: [f.many_us for f in found], one: [f.one_us for f in found]}
-        reasons = {many: missing[name]} if name in missing else {}
+        if name in rounds.missing:
+            rounds.add(many, rounds.missing[name])
         goal = COST_GOAL if name in KINDS else None
-        rows.append(paired("cost", "µs CPU each", Comparison(many, one, goal), figures, reasons))
+        row = rounds.row(f"{many}: cost", "µs CPU each", "cpu_us", many, one, goal, paired=True)
+        rows.append(row)
     return rows
 
 
@@ -94,7 +81,7 @@ def decision_rows(name: str, found: Decided | str) -> list[Row]:
     note = f"{runs.decisions:,} decisions, loss {LOSS:.0%}, mansd {MANSD}, {FLOWS:,} flows"
     return [
         Row(f"{name}: decisions", found.per_s, "/s", note=note),
-        Row(f"{name}: longest run of losses", runs.longest, "", goal=Goal("<=", MANSD)),
+        Row(f"{name}: longest loss burst", runs.longest, "", goal=Goal("<=", MANSD)),
         Row(f"{name}: loss", 100 * runs.lost / runs.decisions, "%",
             Peer("predicted", 100 * predicted_loss(LOSS, MANSD))),
     ]  # fmt: skip
@@ -109,22 +96,25 @@ def _decisions(name: str, make: Callable[[int], Decide], count: int) -> list[Row
 
 
 def _measure_flows() -> list[Row]:
-    rounds: dict[str, list[Costs]] = {}
+    rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {"C relay": c_relay(tools)} | {
             name: our_relay(name, ours) for name, ours in KINDS.items()
         }
-        relays, missing = start_all(kinds, tools, stack)
+        relays = start_all(kinds, tools, stack, rounds)
         one, many = sources(1), sources(FLOWS)
 
-        def costs(relay: Relay) -> Costs:
-            return Costs(relay.burst(one).cpu_us, relay.burst(many).cpu_us)
+        def costs(relay: Relay, counted: bool) -> None:
+            figures = relay.burst(one), relay.burst(many)
+            if counted:
+                rounds.add(f"{relay.name}, one flow", figures[0])
+                rounds.add(f"{relay.name}, {FLOWS:,} flows", figures[1])
 
         for number in range(-1, ROUNDS):  # the first makes the flows' states and does not count
             if number % 10 == 0:
                 say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
-            in_turn(relays, missing, rounds if number >= 0 else {}, costs)
-    return flow_rows(rounds, missing)
+            in_turn(relays, rounds, partial(costs, counted=number >= 0))
+    return flow_rows(rounds)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
@@ -137,6 +127,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("relay_flows", "Relays: flows and decisions", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -1,13 +1,12 @@
 """A steady load through our relay at half of what it can take: nothing lost, memory flat.
 
-Loss is counted from both sides: what was sent must be what the relay counts as arrived, what it
-counts as forwarded must have come to the sink, and at the sink no more datagrams in a row may be
-missing than MANSD allows. ``--soak-s 600`` is the real thing.
+Loss is counted at both sides: the relay must have received all that was sent, all that it forwarded
+must have arrived at the sink, and at most MANSD consecutive datagrams may be missing there.
+``--soak-s 600`` is the real test.
 """
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, on_core, scheduled
 from benchmarks._relay_load import Built, Soak, built
 from benchmarks._relay_ours import Ours, Totals
 from benchmarks._relay_process import Relay, our_relay, running
-from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 
 MANSD = 4
 KIND = our_relay("ours", Ours(f"loss 5% mansd {MANSD} seed 7"))
@@ -70,7 +69,7 @@ def rows_of(found: Found) -> list[Row]:
         Row("sent but not counted as arrived", soak.sent - totals.arrived, "datagrams", goal=none),
         Row("forwarded but not received", totals.forwarded - soak.received, "datagrams", goal=none),
         Row("lost in the relay's receive buffer", totals.lost_in_kernel, "datagrams", goal=none),
-        Row("longest run not received", soak.longest_gap, "datagrams", goal=Goal("<=", MANSD)),
+        Row("longest loss burst", soak.longest_gap, "datagrams", goal=Goal("<=", MANSD)),
         Row("received out of order", soak.disordered, "datagrams", goal=none),
         Row("memory, last quarter beyond second", growth_kib(found.resident_kib), "KiB",
             goal=MEMORY_GOAL, note=f"of {found.resident_kib[-1] / 1024:.0f} MiB"),
@@ -104,7 +103,7 @@ def _soak(tools: Built, seconds: int, maximum_per_s: float) -> Found:
             resident_kib.append(_resident_kib(relay))
         elapsed_s, cpu_s = time.monotonic() - begun_s, relay.cpu_s() - begun_cpu_s
         waited_s = relay.waited_s() - begun_waited_s
-        # Empty groups: takes what is still under way.
+        # Empty groups: receives what is still in flight.
         relay.ends.soak(state, round(_LAST_S / _GROUP_S), 0, period_ns)
         return Found(maximum_per_s, elapsed_s, state, relay.totals(), resident_kib, cpu_s, waited_s)
 
@@ -113,7 +112,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
     """Find the maximum rate, then put half of it on a new relay."""
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
         with running(KIND, tools) as relay:
-            maximum_per_s = median([relay.burst().per_s for _ in range(_BURSTS)])
+            maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
         return rows_of(_soak(tools, options.soak_s, maximum_per_s))
 
 
@@ -136,6 +135,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 BENCHMARK = Benchmark("relay_soak", "Our relay under a steady load", measure, add_arguments)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

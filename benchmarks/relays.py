@@ -10,9 +10,6 @@ are the median over rounds of the ratio within a round.
 """
 
 import argparse
-import operator
-import sys
-from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 
 from benchmarks._relay_cores import BEFORE_OTHERS, LOAD_CORE, RELAY_CORE, on_core, scheduled
@@ -21,17 +18,15 @@ from benchmarks._relay_ours import Ours
 from benchmarks._relay_process import (
     BURST,
     Relay,
-    Sample,
     asyncio_relay,
     c_relay,
+    figures_of,
     in_turn,
     our_relay,
-    sample_of,
     socat,
     start_all,
 )
-from benchmarks._report import Benchmark, Goal, Row, run, say
-from benchmarks._rounds import Comparison, paired
+from benchmarks._report import Benchmark, Goal, Rounds, Row, say
 
 ROUNDS = 40
 WORDS = "loss 5% mansd 4 seed 7"
@@ -42,51 +37,42 @@ OURS = {
     SOCKETS: Ours(WORDS, engine="plain"),
 }
 DIRECT = "direct, no relay"
-
-
 RATES = (
-    Comparison(PLAIN, "socat", Goal(">=", 2)),
-    Comparison(PLAIN, "C relay", Goal(">=", 0.8)),
-    Comparison(SEGMENTS, "socat", Goal(">=", 5)),
-    Comparison(PLAIN, "socat, connected"),
-    Comparison(PLAIN, "asyncio relay"),
-    Comparison(PLAIN, DIRECT),
-    Comparison(SEGMENTS, "C relay, segments"),
-    Comparison(SOCKETS, "socat"),
+    (PLAIN, "socat", Goal(">=", 2)),
+    (PLAIN, "C relay", Goal(">=", 0.8)),
+    (SEGMENTS, "socat", Goal(">=", 5)),
+    (PLAIN, "socat, connected", None),
+    (PLAIN, "asyncio relay", None),
+    (PLAIN, DIRECT, None),
+    (SEGMENTS, "C relay, segments", None),
+    (SOCKETS, "socat", None),
 )
 COSTS = (
-    Comparison(PLAIN, "socat"),
-    Comparison(PLAIN, "C relay"),
-    Comparison(PLAIN, DIRECT),
-    Comparison(SEGMENTS, "C relay, segments"),
-    Comparison(SOCKETS, "asyncio relay"),
+    (PLAIN, "socat"),
+    (PLAIN, "C relay"),
+    (PLAIN, DIRECT),
+    (SEGMENTS, "C relay, segments"),
+    (SOCKETS, "asyncio relay"),
 )
 
 
-def rows_of(samples: Mapping[str, Sequence[Sample]], missing: Mapping[str, str]) -> list[Row]:
-    """Return the rows.
-
-    Args:
-        samples: by relay, its bursts, one per round.
-        missing: by relay that was not measured, why.
-    """
-    figures = (
-        ("drained", "datagrams/s", RATES, operator.attrgetter("per_s")),
-        ("cost", "µs CPU each", COSTS, operator.attrgetter("cpu_us")),
-    )
+def rows_of(rounds: Rounds) -> list[Row]:
+    """Return the rows of rates and costs."""
     return [
-        paired(
-            figure, unit, comparison,
-            {name: [value_of(sample) for sample in found] for name, found in samples.items()},
-            missing,
-        )
-        for figure, unit, comparisons, value_of in figures for comparison in comparisons
-    ]  # fmt: skip
+        *(
+            rounds.row(f"{ours}: drained", "datagrams/s", "per_s", ours, peer, goal, paired=True)
+            for ours, peer, goal in RATES
+        ),
+        *(
+            rounds.row(f"{ours}: cost", "µs CPU each", "cpu_us", ours, peer, paired=True)
+            for ours, peer in COSTS
+        ),
+    ]
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
     """Put one burst after the other on each relay in turn."""
-    samples: dict[str, list[Sample]] = {}
+    rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {
             "socat": socat(),
@@ -96,7 +82,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
             "asyncio relay": asyncio_relay(),
             **{name: our_relay(name, ours) for name, ours in OURS.items()},
         }
-        relays, missing = start_all(kinds, tools, stack)
+        relays = start_all(kinds, tools, stack, rounds)
         direct = Ends(tools.load)
         stack.callback(direct.close)
         direct.connect(direct.sink_port)
@@ -104,14 +90,11 @@ def measure(options: argparse.Namespace) -> list[Row]:
         for number in range(ROUNDS):
             if number % 10 == 0:
                 say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
-            in_turn(relays, missing, samples, Relay.burst)
+            in_turn(relays, rounds, Relay.burst)
             with on_core(RELAY_CORE):
                 found, cpu_s = direct.direct(count)
-            samples.setdefault(DIRECT, []).append(sample_of(DIRECT, found, count, 0, cpu_s))
-    return rows_of(samples, missing)
+            rounds.add(DIRECT, figures_of(DIRECT, found, count, 0, cpu_s))
+    return rows_of(rounds)
 
 
 BENCHMARK = Benchmark("relays", "Relays: drained datagrams", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

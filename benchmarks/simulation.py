@@ -6,7 +6,6 @@ asked for the accuracy at which its event times agree to 1e-8 s.
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 
@@ -16,7 +15,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from benchmarks._report import Benchmark, Goal, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, Peer, Row, median, say
 from cosim.cli import find_scenario
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import simulate_continuous
@@ -119,6 +118,3 @@ def measure(options: argparse.Namespace) -> list[Row]:
 
 
 BENCHMARK = Benchmark("simulation", "Simulation and certificates", measure)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, run, say
+from benchmarks._report import Benchmark, Goal, MeasurementError, Peer, Row, median, say
 from benchmarks._runs import FREE_PORTS, execute, first_step_s, noack
 
 ROUNDS = 5
@@ -127,6 +127,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 BENCHMARK = Benchmark("startup", "Time to the first control step", measure, add_arguments)
-
-if __name__ == "__main__":
-    sys.exit(run([BENCHMARK]))

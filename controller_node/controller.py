@@ -76,9 +76,9 @@ class Controller:
         self._inputs = self._first_number = start.first_number
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
         # What went by before a restart, nobody knows.
-        self._newest: int | None = None if start.again else -1
+        self._newest: int | None = None if start.is_restart else -1
         # A model without a state waits for the first tick, which is on record, as its start is not.
-        self._model_ns = phase_ns + self._step * period_ns if start.again else 0
+        self._model_ns = phase_ns + self._step * period_ns if start.is_restart else 0
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
 
     def next_deadline_ns(self) -> int | None:
@@ -193,7 +193,7 @@ def _between(newest: int, sequence: int) -> int:
 def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
     """Return the controller of a resolved scenario; of the plant it learns x(0) at the most."""
     loop = loop_of(resolved)
-    known = resolved.network.initial_sync == "known_state" and not start.again
+    known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input = resolved.controller.safe_input
     return Controller(
         loop.H,

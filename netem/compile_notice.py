@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from netem.standard_error import say
-from noack.runtime.code_cache import while_compiling
+from noack.core.code_cache import while_compiling
 
 
 @contextmanager

@@ -323,7 +323,7 @@ def _at_the_start(
     One that is started anew knows nothing of how many it dropped in a row: the first passes, and
     what follows is drawn from other streams than before.
     """
-    if not start.again:
+    if not start.is_restart:
         return settings, (name,)
     again = f"again-{start.generation}"
     return settings.model_copy(update={"first_delivered": True}), (name, again)

@@ -16,14 +16,14 @@ import numpy as np
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
-from noack.core.linear_systems import Vector
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.plant_settings import PlantStart
+from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
 from noack.protocol.machine_interface import FAILED, Notice, Output, Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP
 from noack.protocol.wire_format import Flow, Message
 from plant_server.disturbance_signal import Disturbance, disturbance_of
 from plant_server.measurement import MeasurementModel, measurement_model_of
-from plant_server.system import PlantSystem, SystemFailedError
-from plant_server.systems.system_from_settings import system_of
 from plant_server.watchdog import Fallback, PredictedInput, Watchdog, hold, zero
 
 
@@ -150,6 +150,22 @@ def plant_of(resolved: Scenario) -> Plant:
         measuring=measurement_model_of(resolved),
         reports_inputs=resolved.observer is not None,
     )
+
+
+def system_of(resolved: Scenario) -> PlantSystem:
+    """Return the system of a resolved scenario's plant, at x(0).
+
+    A disturbed state is a further input of a linear plant: ẋ = Ax + [B I][u; w].
+
+    Raises:
+        CallerError: what the system needs is missing, or differs from the settings.
+    """
+    loop, plant = loop_of(resolved), resolved.plant
+    B: Matrix = loop.B
+    if any(one.at == "state" for one in plant.disturbances):
+        B = np.hstack([B, np.eye(loop.n)])
+    start = PlantStart(np.array(plant.initial_state), loop.A, B, resolved.timing.plant_period_ns)
+    return plant.system.system(start)
 
 
 def _watchdog_of(resolved: Scenario) -> Watchdog:

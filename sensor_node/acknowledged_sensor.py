@@ -104,7 +104,7 @@ class AcknowledgedSensor(FixedMachine):
         x = self._sent.get(message.sequence)
         if x is not None:
             self.x_s = self._propagate(x, self._model_ns - event_ns)
-            self._trigger.renew(event_ns, x)
+            self._trigger.restart(event_ns, x)
             self._sent = {k: sent for k, sent in self._sent.items() if k > message.sequence}
             if not self._sent:
                 self._wait_until_ns = None

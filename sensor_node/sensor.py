@@ -7,7 +7,7 @@ whether or not the update survives the network: nothing is acknowledged.
 from collections.abc import Sequence
 
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
-from noack.config.resolution import loop_of, setpoint_of
+from noack.config.resolution import loop_of, policy_of, setpoint_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector, norm
@@ -15,7 +15,6 @@ from noack.core.model_flow import ModelFlow
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy, Trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
 from sensor_node.observing_sensor import ObservingSensor, observer_of
@@ -126,17 +125,17 @@ def sensor_of(
 
     One that is started anew transmits its first measurement.
     """
-    observer = observer_of(resolved, restarted=start.again)
+    observer = observer_of(resolved, restarted=start.is_restart)
     sensor = _triggering(resolved, start)
     if observer is None:
         return sensor
-    return ObservingSensor(observer, sensor, restarted=start.again)
+    return ObservingSensor(observer, sensor, restarted=start.is_restart)
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
     """What is behind the observer, if there is one: models, and the trigger."""
     loop, policy = loop_of(resolved), policy_of(resolved)
-    known = resolved.network.initial_sync == "known_state" and not start.again
+    known = resolved.network.initial_sync == "known_state" and not start.is_restart
     x0 = loop.x0 if known else None
     period_ns, first = resolved.timing.measurement_period_ns, start.first_number
     if resolved.is_acknowledged:

@@ -19,6 +19,7 @@ from cosim.simulation.virtual_time import DecidedLink, Network, Shuttle, simulat
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix, Vector
+from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -32,7 +33,6 @@ from noack.protocol.topology import ROUTES
 from noack.protocol.wire_format import Decoder, Encoder, Flow, Message, Rejection
 from noack.trigger.decaying import DecayingTrigger
 from plant_server.plant import Plant
-from plant_server.systems.linear_plant import LinearSystem
 from plant_server.watchdog import Watchdog
 from sensor_node.sensor import Sensor
 

@@ -11,7 +11,7 @@ from benchmarks.soak.legs import InTurn, Leg
 from benchmarks.soak.machines import ControllerTicks, Network, PlantSteps, SensorSteps
 from cosim.record.align import IdentityResidual, controller_track, initial_track, join
 from cosim.record.run_record import Rows
-from noack.config.resolution import loop_of, tables_of
+from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
 from noack.protocol.record_tables import (
     CONTROLLER_DELIVERY,
@@ -26,7 +26,6 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.theory.error_bounds import ErrorMonitor
-from noack.trigger.policy_from_settings import policy_of
 
 _IDENTITY = 1e-9
 """Of (I1), relative to the largest entry of x_s: the margin that a run's claims have."""

@@ -162,7 +162,8 @@ def _lines(result: Result) -> list[str]:
     peaks = ", ".join(f"{role} {kib / 1024:,.0f}" for role, kib in result.end_peak_kib.items())
     return [
         f"checked on the way: {sum(rows.values()):,} rows, {account['events']:,} events, "
-        f"{account['deliveries']:,} deliveries; longest drop run {account['longest_loss_burst']}; "
+        f"{account['deliveries']:,} deliveries; "
+        f"longest loss burst {account['longest_loss_burst']}; "
         f"(I1) to {account['identity_residual_relative']:.1e} of ‖x_s‖; at most "
         f"{account['most_held']:,} rows held; {account['broken']} broken",
         f"replayed at the end: {replay.get('inputs') or 0:,} inputs, bit exact: "

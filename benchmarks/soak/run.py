@@ -15,13 +15,13 @@ from benchmarks.soak.figure import memory_figure
 from benchmarks.soak.invariants import Invariants
 from benchmarks.soak.result import Result, Watched
 from benchmarks.soak.watch import LAUNCHER, Processes, Sample, size_bytes
-from cosim.output.report.figure_files import save
-from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SPOOL, SUMMARY_FILE
+from cosim.output.report.figure_files import save_figure
+from cosim.record.run_directory import LATEST, RECORD, SCENARIO_FILE, SUMMARY_FILE
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.clock import NS_PER_S
 from noack.protocol.topology import LOOP_ROLES, RECORDER
-from noack.runtime.spool import SpoolTail
+from noack.runtime.spool import SPOOL, SpoolTail
 
 RESULT_FILE, PICTURE_FILE = "soak.json", "soak.png"
 FREE_PORTS = ("--set", "ports={}")
@@ -121,7 +121,7 @@ class _Soak:
         )  # fmt: skip
         (self._run_dir / RESULT_FILE).write_text(result.dumps(), encoding="utf-8")
         if watched:
-            save(memory_figure(result), self._run_dir / PICTURE_FILE)
+            save_figure(memory_figure(result), self._run_dir / PICTURE_FILE)
         return result
 
     def _watched(self, began_s: float, length_s: float) -> dict[str, Watched]:

@@ -14,6 +14,7 @@ depend on its seed alone), and the median of the recorded delays.
 """
 
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,10 @@ class Fidelity:
     first_different_event: int | None
     """First event that is more than ten measurements apart, or that one of the two lacks: from
     there on the same packet fates meet different events."""
+    t_s: Vector
+    """(samples,) times of the measurements."""
+    stage_norms: Matrix
+    """(stages, samples) Euclidean norm of what each stage adds to x."""
 
     @property
     def explained(self) -> bool:
@@ -125,7 +130,8 @@ class Fidelity:
 
     def as_json(self) -> dict[str, Any]:
         """All figures, for ``noack fidelity --json``."""
-        return {**asdict(self), "explained": self.explained, "verdict": self.verdict}
+        figures = {k: v for k, v in asdict(self).items() if k not in ("t_s", "stage_norms")}
+        return {**figures, "explained": self.explained, "verdict": self.verdict}
 
     def summary(self) -> FidelityPart:
         """The part of the run's summary; ``docs/record.md`` explains the keys."""
@@ -196,6 +202,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
                 f"{_NUDGE:g} of itself; a shorter run can be compared"
             )
     part_s = _PARTED_PERIODS * scenario.plant.measure_every * period_s
+    effects = [after - before for before, after in pairwise(states)]
     return Fidelity(
         scenario=scenario.name,
         mode=scenario.mode,
@@ -207,8 +214,8 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         stages=tuple(
             FidelityStage(
                 name,
-                _difference(states[i + 1] - states[i]),
-                _share(states[i + 1] - states[i], whole),
+                _difference(effects[i]),
+                _share(effects[i], whole),
                 len(events_s[i + 1]),
                 _largest(_apart(events_s[i], events_s[i + 1])),
                 _parted(events_s[i], events_s[i + 1], part_s),
@@ -220,6 +227,8 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         events_live=len(live.event_s),
         max_event_difference_s=_largest(_apart(ideal.event_s, live.event_s)),
         first_different_event=_parted(ideal.event_s, live.event_s, part_s),
+        t_s=t_s,
+        stage_norms=np.array([np.linalg.norm(effect, axis=1) for effect in effects]),
     )
 
 

@@ -24,7 +24,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import LOOP_ROLES
 from noack.protocol.wire_format import Flow
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 VIOLATION = "violation"
 """Level of a notice: a process saw that an assumption was violated."""

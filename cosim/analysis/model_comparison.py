@@ -9,9 +9,9 @@ from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
-from plant_server.plant_linearisation import linearise
-from plant_server.system import PlantSystem
-from plant_server.systems.system_from_settings import system_of
+from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.systems.plant_system import PlantSystem
+from plant_server.plant import system_of
 
 Linearisation = dict[str, Any]
 
@@ -34,7 +34,9 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     n, m = loop.n, loop.m
     try:
         with np.errstate(all="ignore"):
-            A, B = linearise(system_at, n, m, settling_s=plant.system.settling_s)
+            A, B = plant.system.linearisation() or linearise(
+                system_at, n, m, settling_s=plant.system.settling_s
+            )
     except NoackError:  # of the user's own: it fails, or begins only where it wants
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):

@@ -1,35 +1,21 @@
-"""The command line ``noack``, by the panels of its help."""
+"""The command line ``noack``: one file per command in :mod:`cosim.cli.commands`."""
 
-from noack.runtime.interrupt import quiet_interrupt
+import os
+import signal
 
-with quiet_interrupt():
-    # isort: off, in the order of the help
-    from cosim.cli import (
-        campaign_commands,
-        compare_commands,
-        design_command,
-        doctor_command,
-        file_commands,
-        process_commands,
-        run_commands,
-        set_command,
-        theory_commands,
-    )
+_usual = signal.getsignal(signal.SIGINT)
+_replaced = _usual is signal.default_int_handler
+if _replaced:
+    try:
+        # Ctrl-C during the imports: exit status 130, no traceback.
+        signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    except ValueError:  # imported by another thread than the main one
+        _replaced = False
 
-    # isort: on
-    from cosim.cli.command import app, find_scenario, main
+from cosim.cli.command import app, find_scenario, main, register_commands  # noqa: E402
 
-__all__ = [
-    "app",
-    "campaign_commands",
-    "compare_commands",
-    "design_command",
-    "doctor_command",
-    "file_commands",
-    "find_scenario",
-    "main",
-    "process_commands",
-    "run_commands",
-    "set_command",
-    "theory_commands",
-]
+register_commands()
+if _replaced:
+    signal.signal(signal.SIGINT, _usual)
+
+__all__ = ["app", "find_scenario", "main"]

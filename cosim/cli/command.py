@@ -2,9 +2,11 @@
 
 import math
 import os
+import pkgutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
+from importlib import import_module
 from importlib.metadata import version
 from json import dumps
 from pathlib import Path
@@ -13,29 +15,39 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from cosim.cli import completion
+from cosim.cli import commands, completion
 from cosim.cli.program import NAME, Program, be_patient
 from cosim.shipped_files import find_shipped
 from noack.core.errors import ExitStatus, NoackError, why
 from noack.runtime.command_line import failed
 
-_STORY = (
-    ("noack doctor", "what this machine grants to a run"),
-    ("noack run lane_following", "the loop live, as five processes, recorded"),
-    ("noack view", "the last run, drawn"),
-    ("noack simulate lane_following", "the same in virtual time, in a second"),
-    ("noack certify lane_following", "what is guaranteed, on which conditions"),
-    ("noack fidelity", "how far the last run is from the ideal loop"),
-    ("noack compare A B", "two or more runs, side by side"),
-    ("noack campaign mb_vs_zoh", "many runs over a grid of settings"),
-    ("noack netem --explain loss 5%", "the network emulator, for any UDP program"),
+_TOUR = (
+    ("noack doctor", "check this machine"),
+    ("noack run lane_following", "run the paper's example live"),
+    ("noack view", "view the last run"),
+    ("noack simulate lane_following", "run it in virtual time, in a second"),
+    ("noack certify lane_following", "compute guaranteed bounds"),
+    ("noack fidelity", "compare the last run with the ideal loop"),
+    ("noack compare A B", "compare two or more runs"),
+    ("noack campaign mb_vs_zoh", "run a grid of settings many times"),
+    ("noack netem --explain loss 5%", "use the network emulator alone"),
 )
-"""The commands in the order in which somebody meets them."""
+"""A first session: commands, and what each does."""
 _MOST_COLUMNS = 78
 
+RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
+FILES = "Scenario files and this machine"
+PROCESSES = "One terminal per process"
+PANELS = (RUNS, THEORY, CAMPAIGNS, FILES, PROCESSES)
+"""The panels of the help, in order."""
 
-def _columns(rows: Sequence[tuple[str, str]]) -> list[str]:
-    """Commands and what they are for, as lines of rich's markup that no terminal need wrap."""
+_order: dict[Any, tuple[int, int]] = {}
+"""By command function: panel, and place in the panel."""
+
+
+def _columns(rows: Iterable[tuple[str, str]]) -> list[str]:
+    """Return commands and their descriptions as lines of rich markup, at most 78 columns wide."""
+    rows = list(rows)
     width = max(len(command) for command, _ in rows)
     wide = width + max(len(what) for _, what in rows) + len("     ") > _MOST_COLUMNS
     lines: list[str] = []
@@ -51,25 +63,19 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    # The first character has the lines left as they are; an empty one would end the paragraph.
+    # \b keeps the lines as they are; an empty line would end the paragraph that it applies to.
     help="\n".join([
         "\b",
-        "A laboratory for event-triggered control over lossy networks, without acknowledgements: "
-        "real processes, real UDP sockets, at most M − 1 packets lost in a row.",
+        "A laboratory for event-triggered control over lossy networks without acknowledgements. "
+        "The loop runs as real processes over UDP; the network loses at most M − 1 consecutive "
+        "packets.",
         " ",
-        *_columns(_STORY),
+        *_columns(_TOUR),
         " ",
-        "Each command has --help, which ends with examples. Scenarios are files (TOML), or names "
-        "of those that come with noack. `noack --install-completion` lets your shell complete "
-        "commands, names and keys.",
+        "Each command has --help, with examples at the end. A scenario is a TOML file, or the name "
+        "of a shipped one. `noack --install-completion` installs shell completion.",
     ]),
 )  # fmt: skip
-
-RUNS = "Runs"
-THEORY = "Theory"
-CAMPAIGNS = "Campaigns"
-PROCESSES = "One process each, for a person with five terminals"
-FILES = "Scenario files, and this machine"
 
 ScenarioArgument = Annotated[
     str,
@@ -81,7 +87,7 @@ ScenarioArgument = Annotated[
 RunArgument = Annotated[
     Path | None,
     typer.Argument(
-        help="A run directory; by default the last run.", autocompletion=completion.run_directories
+        help="Run directory; the last run by default.", autocompletion=completion.run_directories
     ),
 ]
 SetOption = Annotated[
@@ -93,27 +99,27 @@ SetOption = Annotated[
         autocompletion=completion.settings,
     ),
 ]
-RunsOption = Annotated[Path, typer.Option("--runs", help="Where run directories are made.")]
+RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the run directories.")]
 LiveOption = Annotated[bool, typer.Option("--live", help="Show the run in the rerun viewer.")]
 ReportOption = Annotated[
     bool,
     typer.Option(
         "--report/--no-report",
-        help="Draw report.html, which takes some seconds; `noack report` does it later.",
+        help="Write report.html, which takes some seconds; `noack report` writes it later.",
     ),
 ]
 VerboseOption = Annotated[
-    bool, typer.Option("--verbose", help="Show all tables: timing, assumptions, each claim.")
+    bool, typer.Option("--verbose", help="Print all tables: timing, assumptions, each claim.")
 ]
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON document, and nothing else, on stdout.")
+    bool, typer.Option("--json", help="Print one JSON document on stdout, and nothing else.")
 ]
-SESSION = typer.Option("--session", help="Name of the session that the processes meet in.")
+SESSION = typer.Option("--session", help="Session name that the processes of a run share.")
 SessionOption = Annotated[str, SESSION]
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(requested: bool) -> None:
+    if requested:
         print(f"noack {version('noack')}")
         raise typer.Exit
 
@@ -128,13 +134,14 @@ def options(
 
 
 def command(
-    panel: str, examples: Sequence[tuple[str, str]] = (), **settings: Any
+    panel: str, place: int, examples: Sequence[tuple[str, str]] = (), **settings: Any
 ) -> Callable[[Callable[..., int]], Callable[..., None]]:
-    """Register a command; its result is the exit status, and a mistake becomes one line.
+    """Register a command. Its result is the exit status; a mistake becomes one line.
 
     Args:
-        panel: of the help.
-        examples: commands, and what they are for; the command's own help ends with them.
+        panel: of the help, one of :data:`PANELS`.
+        place: in the panel; commands are listed by it, in ascending order.
+        examples: commands and their descriptions, shown at the end of the command's help.
         settings: of :meth:`typer.Typer.command`.
     """
 
@@ -144,17 +151,18 @@ def command(
             as_json = bool(options.get("json"))
             try:
                 status = function(*arguments, **options)
-                if sys.stdout is not None:  # a shell's >&- gives a program none
+                if sys.stdout is not None:  # closed by the shell: >&-
                     sys.stdout.flush()
             except NoackError as error:
                 status = failed(str(error), error.exit_status, who=NAME, as_json=as_json)
-            except OSError as error:  # standard output is a full disk
+            except OSError as error:  # standard output is on a full disk
                 what = f"cannot write: {why(error)}"
                 status = failed(what, ExitStatus.FAILED, who=NAME, as_json=as_json)
             raise typer.Exit(int(status))
 
-        # The first line is there to be left alone: a later one says how far all are indented.
+        # The empty first line keeps the indentation of the lines that follow.
         epilog = "\n".join(["", "[bold]Examples[/]", *_columns(examples)]) if examples else None
+        _order[reported] = PANELS.index(panel), place
         registered: Callable[..., None] = app.command(
             rich_help_panel=panel, epilog=epilog, **settings
         )(reported)
@@ -163,18 +171,25 @@ def command(
     return register
 
 
+def register_commands() -> None:
+    """Import every module of :mod:`cosim.cli.commands`, and sort the commands for the help."""
+    for module in pkgutil.iter_modules(commands.__path__):
+        import_module(f"{commands.__name__}.{module.name}")
+    app.registered_commands.sort(key=lambda one: _order[one.callback])
+
+
 def find_scenario(name: str) -> Path:
     """Return the path of a scenario given by path, or by the name of a shipped one."""
     return find_shipped(name, "scenarios")
 
 
 def cores() -> int:
-    """How many processors this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def print_json(document: object) -> None:
-    """Print the one document of ``--json``; a number that is not finite becomes null."""
+    """Print the document of ``--json``; a number that is not finite becomes null."""
     print(dumps(_finite(document), indent=2, allow_nan=False))
 
 
@@ -188,7 +203,7 @@ def _finite(value: Any) -> Any:
 
 def main() -> None:
     """Entry point."""
-    if sys.argv[1:2] != ["netem"]:  # which ends when nobody reads any more
+    if sys.argv[1:2] != ["netem"]:  # the emulator ends when its output is closed
         be_patient()
     try:
         app(prog_name=NAME)

@@ -1,4 +1,4 @@
-"""What a shell may complete: names of shipped files, run directories, keys of a scenario."""
+"""Shell completion: names of shipped files, run directories, keys of a scenario."""
 
 from collections.abc import Iterator
 
@@ -12,39 +12,39 @@ from noack.config.validation_messages import sections_of
 
 
 def scenarios(incomplete: str) -> list[str]:
-    """Names of shipped scenarios; files are the shell's own to complete."""
-    return _beginning(incomplete, shipped_names("scenarios"))
+    """Return matching names of shipped scenarios; the shell completes file names itself."""
+    return _matching(incomplete, shipped_names("scenarios"))
 
 
 def campaigns(incomplete: str) -> list[str]:
-    """Names of shipped campaigns."""
-    return _beginning(incomplete, shipped_names("campaigns"))
+    """Return matching names of shipped campaigns."""
+    return _matching(incomplete, shipped_names("campaigns"))
 
 
 def shipped(incomplete: str) -> list[str]:
-    """Names of both."""
+    """Return matching names of shipped scenarios and campaigns."""
     return scenarios(incomplete) + campaigns(incomplete)
 
 
 def run_directories(incomplete: str) -> list[str]:
-    """Run directories below ``runs``, the newest first."""
+    """Return matching run directories below ``runs``, the newest first."""
     found = [path.parent for path in DEFAULT_RUNS.glob(f"*/{SCENARIO_FILE}")]
     by_name = sorted(found, key=lambda path: (path.name == LATEST, path.name), reverse=True)
-    return _beginning(incomplete, [str(path) for path in by_name])
+    return _matching(incomplete, [str(path) for path in by_name])
 
 
 def settings(incomplete: str) -> list[str]:
-    """Keys for ``--set``, each with its =."""
-    return _beginning(incomplete, [f"{key}=" for key in keys(Scenario)])
+    """Return matching keys for ``--set``, each with its =."""
+    return _matching(incomplete, [f"{key}=" for key in keys(Scenario)])
 
 
 def runtime_parameters(incomplete: str) -> list[str]:
-    """Short names of what can be changed while a run goes on."""
-    return _beginning(incomplete, list(SHORT))
+    """Return matching short names of the runtime parameters."""
+    return _matching(incomplete, list(SHORT))
 
 
 def keys(section: type[BaseModel], prefix: str = "") -> list[str]:
-    """Keys of a settings file, those of whatever its tables may be among them, each once."""
+    """Return the keys of a settings file, each once; of a union of tables, the keys of all."""
     return list(dict.fromkeys(_keys(section, prefix, ())))
 
 
@@ -53,11 +53,11 @@ def _keys(
 ) -> Iterator[str]:
     for name, field in section.model_fields.items():
         inner = [one for one in sections_of(field.annotation) if one not in within]
-        for one in inner:  # a trigger may hold another
+        for one in inner:  # a trigger may contain another
             yield from _keys(one, f"{prefix}{name}.", (*within, *inner))
         if not inner:
             yield f"{prefix}{name}"
 
 
-def _beginning(incomplete: str, words: list[str]) -> list[str]:
+def _matching(incomplete: str, words: list[str]) -> list[str]:
     return [word for word in words if word.startswith(incomplete)]

@@ -34,10 +34,10 @@ from cosim.output.viewer.live_viewer import has_display
 from cosim.record.environment import environment
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
+from noack.core.code_cache import cache_folder
 from noack.core.errors import CallerError, MachineError, NoackError, one_line, why
 from noack.core.python_process import python_command
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.code_cache import cache_folder
 from noack.runtime.private_folder import open_private
 from noack.runtime.udp_sockets import LOOPBACK, bind, free_tcp_port, require_free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open_session

@@ -23,7 +23,6 @@ from cosim.record.run_directory import (
     RECORD,
     REPORT_FILE,
     SCENARIO_FILE,
-    SPOOL,
     SUMMARY_FILE,
     concluded,
     read_object,
@@ -31,6 +30,7 @@ from cosim.record.run_directory import (
 from cosim.record.run_ending import RunEnding, store_ending
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
+from noack.runtime.spool import SPOOL
 
 
 @np.errstate(all="ignore")

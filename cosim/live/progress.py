@@ -1,4 +1,4 @@
-"""The progress line that a person sees during a run."""
+"""Progress of runs and computations on the terminal."""
 
 import math
 import time
@@ -17,132 +17,152 @@ from noack.core.clock import NS_PER_S
 from noack.runtime.join_ticket import DEFAULT_SESSION
 
 _PLAIN_LINES = 10
-"""Progress lines of a run whose terminal cannot redraw one."""
+"""Progress lines of a run on a terminal that cannot redraw a line."""
 
 
 class PatientConsole(Console):
-    """A console whose reader may leave: rich would end the program, and with it the run."""
+    """A console that survives a closed pipe; rich would end the program, and with it the run."""
 
     def on_broken_pipe(self) -> None:
-        """Go on in silence."""
+        """Ignore it."""
 
 
 @contextmanager
 def progress_line(
     console: Console, scenario: Scenario, session: str | None = None
 ) -> Iterator[Watcher]:
-    """Show a run's progress while the context lasts."""
+    """Show the progress of a run while the context lasts.
+
+    Args:
+        console: where to show it.
+        scenario: the run's.
+        session: its session name, for processes started by hand.
+    """
     live = console.is_terminal and not console.is_dumb_terminal
-    there = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
     columns = (BarColumn(bar_width=12), TextColumn("{task.description}"))
-    shown = 0
-    live_told, void_told, changes_told = False, 0, 0
     with Progress(*columns, console=console, disable=not live, transient=False) as progress:
-        task: TaskID | None = None
+        shown = _RunProgress(console, progress, scenario, session)
+        yield Watcher(shown.waiting, shown.started, shown.failed, shown.restarted, shown.update)
 
-        def waiting(roles: Sequence[str]) -> None:
-            if roles:
-                console.print(f"waiting for {', '.join(roles)}")
 
-        def started(run_dir: Path) -> None:
-            nonlocal task
-            task = progress.add_task(scenario.name, total=scenario.horizon_s)
+class _RunProgress:
+    """What has been shown of a run."""
 
-        def lost(why: str, t_s: float, by_hand: str | None) -> None:
-            remedy = (
-                "another is started"
-                if by_hand is None
-                else f"start it again: noack {by_hand}{there}"
-            )
-            console.print(
-                f"{why} at {t_s:.1f} s; the run goes on, {remedy}", highlight=False, soft_wrap=True
-            )
+    def __init__(
+        self, console: Console, progress: Progress, scenario: Scenario, session: str | None
+    ) -> None:
+        self._console, self._progress, self._scenario = console, progress, scenario
+        self._options = "" if session in (None, DEFAULT_SESSION) else f" --session {session}"
+        self._task: TaskID | None = None
+        self._plain_lines = 0
+        self._lines: dict[str, int] = {}
+        """How many lines of a list have been shown, by field."""
 
-        def back(role: str, t_s: float) -> None:
-            console.print(f"{role} is back at {t_s:.1f} s", highlight=False)
+    def waiting(self, roles: Sequence[str]) -> None:
+        """Name the processes that the start barrier waits for."""
+        if roles:
+            self._print(f"waiting for {', '.join(roles)}")
 
-        def account(account: dict[str, Any]) -> None:
-            nonlocal shown, live_told, void_told, changes_told
-            if account["live"] and not live_told:
-                live_told = True
-                console.print(account["live"], highlight=False, soft_wrap=True)
-            why = account.get("void", [])
-            for text in why[void_told:]:
-                console.print(f"[yellow]{escape(text)}[/]", highlight=False, soft_wrap=True)
-            void_told = max(void_told, len(why))
-            changes = account.get("changes", [])
-            for text in changes[changes_told:]:
-                console.print(f"changed: {text}", markup=False, highlight=False, soft_wrap=True)
-            changes_told = max(changes_told, len(changes))
-            text = account_line(account, scenario.horizon_s)
-            if task is not None:
-                progress.update(task, completed=account["t_s"], description=text)
-            due = math.floor(account["t_s"] / scenario.horizon_s * _PLAIN_LINES)
-            if console.is_dumb_terminal and due > shown:
-                shown = due
-                console.print(text, highlight=False, soft_wrap=True)
+    def started(self, run_dir: Path) -> None:
+        """Begin the bar."""
+        self._task = self._progress.add_task(self._scenario.name, total=self._scenario.horizon_s)
 
-        yield Watcher(waiting, started, lost, back, account)
+    def failed(self, why: str, t_s: float, by_hand: str | None) -> None:
+        """Name a process that failed and may be restarted."""
+        remedy = (
+            "the process is restarted"
+            if by_hand is None
+            else f"restart it with: noack {by_hand}{self._options}"
+        )
+        self._print(f"{escape(why)} at {t_s:.1f} s; the run goes on, {remedy}")
+
+    def restarted(self, role: str, t_s: float) -> None:
+        """Name a process that runs again."""
+        self._print(f"{role} runs again at {t_s:.1f} s")
+
+    def update(self, report: dict[str, Any]) -> None:
+        """Show the recorder's progress report."""
+        self._print_new("live", [report["live"]] if report["live"] else [], "{}")
+        self._print_new("void", report.get("void", []), "[yellow]{}[/]")
+        self._print_new("changes", report.get("changes", []), "changed: {}")
+        text = progress_text(report, self._scenario.horizon_s)
+        if self._task is not None:
+            self._progress.update(self._task, completed=report["t_s"], description=text)
+        due = math.floor(report["t_s"] / self._scenario.horizon_s * _PLAIN_LINES)
+        if self._console.is_dumb_terminal and due > self._plain_lines:
+            self._plain_lines = due
+            self._print(text)
+
+    def _print_new(self, field: str, texts: Sequence[str], form: str) -> None:
+        for text in texts[self._lines.get(field, 0) :]:
+            self._print(form.format(escape(text)))
+        self._lines[field] = max(self._lines.get(field, 0), len(texts))
+
+    def _print(self, line: str) -> None:
+        self._console.print(line, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def _bar(
+    console: Console, total: float, *columns: TextColumn | TimeRemainingColumn, what: str = ""
+) -> Iterator[Callable[..., None]]:
+    """Show a bar while the context lasts, on a terminal only; yields what updates it."""
+    head = (TextColumn("{task.description}"),) if what else ()
+    disabled = not console.is_terminal
+    with Progress(
+        *head, BarColumn(), *columns, console=console, disable=disabled, transient=True
+    ) as progress:
+        task = progress.add_task(what, total=total, rate="")
+        yield lambda **fields: progress.update(task, **fields)
 
 
 @contextmanager
 def work_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Show which share of some work is done while the context lasts, on a terminal only."""
-    console = PatientConsole(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn())
-    disabled = not console.is_terminal
-    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
-        task = progress.add_task(what, total=1.0)
-        yield lambda share: progress.update(task, completed=share)
+    """Show the completed share of some work."""
+    with _bar(PatientConsole(stderr=True), 1.0, what=what) as update:
+        yield lambda share: update(completed=share)
 
 
 @contextmanager
 def simulation_bar(console: Console, horizon_s: float) -> Iterator[Callable[[int], None]]:
-    """Show how far a simulation is while the context lasts, on a terminal only."""
-    columns = (BarColumn(), TextColumn("{task.completed:.1f}/{task.total:g} s simulated"))
-    disabled = not console.is_terminal
-    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
-        task = progress.add_task("", total=horizon_s)
-        yield lambda now_ns: progress.update(task, completed=now_ns / NS_PER_S)
+    """Show the simulated time of a simulation."""
+    column = TextColumn("{task.completed:.1f}/{task.total:g} s simulated")
+    with _bar(console, horizon_s, column) as update:
+        yield lambda now_ns: update(completed=now_ns / NS_PER_S)
 
 
 @contextmanager
 def draws_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show how many draws of how many are done while the context lasts, on a terminal only."""
-    columns = (BarColumn(), TextColumn("{task.completed:g}/{task.total:g} draws"))
-    disabled = not console.is_terminal
-    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
-        task = progress.add_task("", total=1)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+    """Show the number of completed draws."""
+    column = TextColumn("{task.completed:g}/{task.total:g} draws")
+    with _bar(console, 1, column) as update:
+        yield lambda done, total: update(completed=done, total=total)
 
 
 @contextmanager
 def runs_bar(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show how many runs of how many there are, and until when, on a terminal only."""
+    """Show the number of completed runs, their rate and the remaining time."""
     columns = (
-        BarColumn(),
         TextColumn("{task.completed:,.0f}/{task.total:,.0f} runs"),
         TextColumn("{task.fields[rate]}"),
         TimeRemainingColumn(),
     )
-    disabled = not console.is_terminal
     began_s, before = time.monotonic(), -1
-    with Progress(*columns, console=console, disable=disabled, transient=True) as progress:
-        task = progress.add_task("", total=1, rate="")
+    with _bar(console, 1, *columns) as show:
 
         def update(done: int, total: int) -> None:
             nonlocal before
             before = done if before < 0 else before
             rate = (done - before) / max(time.monotonic() - began_s, 1e-3)
-            text = f"{rate:,.0f}/s" if done > before else "starting; the first time it compiles"
-            progress.update(task, completed=done, total=total, rate=text)
+            text = f"{rate:,.0f}/s" if done > before else "starting; compiles at first use"
+            show(completed=done, total=total, rate=text)
 
         yield update
 
 
 @contextmanager
 def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None]]]:
-    """Show how a search goes while the context lasts, on a terminal only."""
+    """Show the state of an adversary's search, on a terminal only."""
     began_s = time.monotonic()
     with PatientConsole(stderr=True).status("searching") as status:
 
@@ -158,11 +178,11 @@ def search_status() -> Iterator[Callable[[str], Callable[[str, int, float], None
         yield named
 
 
-def account_line(account: Mapping[str, Any], horizon_s: float) -> str:
-    """The recorder's account of a run under way, as a line."""
-    norm = "-" if account["x_norm"] is None else f"{account['x_norm']:.3g}"
+def progress_text(report: Mapping[str, Any], horizon_s: float) -> str:
+    """The recorder's progress report as one line."""
+    norm = "-" if report["x_norm"] is None else f"{report['x_norm']:.3g}"
     return (
-        f"{account['t_s']:.1f}/{horizon_s:g} s  events {account['events']}  "
-        f"delivered {account['deliveries']}  longest drop run {account['longest_loss_burst']}  "
+        f"{report['t_s']:.1f}/{horizon_s:g} s  events {report['events']}  "
+        f"delivered {report['deliveries']}  longest loss burst {report['longest_loss_burst']}  "
         f"‖x‖ {norm}"
     )

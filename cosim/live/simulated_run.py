@@ -20,7 +20,7 @@ from cosim.simulation.virtual_time import Progress, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import ExitStatus, MachineError, why
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 
 class Simulator(Protocol):

@@ -17,7 +17,7 @@ from cosim.output.remarks import remarks
 from cosim.output.run_tables import number_table, print_details, short_numbers
 from cosim.record.run_directory import RECORDING_FILE, REPORT_FILE
 from noack.core.errors import ExitStatus
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}

@@ -20,15 +20,12 @@ import numpy as np
 
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
-from noack.config.triggers import AnyTrigger, DeadlineSettings, DwellSettings
 from noack.core.linear_systems import Matrix, Vector, row_norms
 from noack.disturbances.step import StepDisturbance
 
 GROWTH = 1000.0
 _STILL_GROWING = 2.0
 _LEAST_SAMPLES = 20
-_THRESHOLDS = ("beta", "delta", "epsilon", "floor")
-"""Settings of the policies in units of ‖W x‖."""
 
 
 class Divergence(NamedTuple):
@@ -79,13 +76,7 @@ def _scale(scenario: Scenario) -> float:
             until_s = min(one.until_s or scenario.horizon_s, scenario.horizon_s)
             carried += float(np.linalg.norm(push)) * max(until_s - one.from_s, 0.0)
     setpoint = 0.0 if loop.setpoint is None else float(np.linalg.norm(loop.setpoint))
-    threshold = _threshold(scenario.trigger)
+    threshold = scenario.trigger.largest_threshold
     if loop.weight is not None:
         threshold /= float(np.linalg.svd(loop.weight, compute_uv=False)[-1])
     return max(carried, setpoint, threshold)
-
-
-def _threshold(trigger: AnyTrigger) -> float:
-    if isinstance(trigger, DeadlineSettings | DwellSettings):
-        return _threshold(trigger.rule)
-    return max(float(getattr(trigger, key, 0.0)) for key in _THRESHOLDS)

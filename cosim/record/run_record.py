@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cosim.record.environment import Kind, kind_of
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, SPOOL, read_object
+from cosim.record.run_directory import RECORD, REPORTS_FILE, SCENARIO_FILE, read_object
 from noack.config.resolution import LoopMatrices, loop_of, tables_of
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import MOST_RECORDED_BYTES, load
@@ -27,7 +27,7 @@ from noack.protocol.record_tables import OWNER, entry_names
 from noack.protocol.topology import LOOP_ROLES, RECORDER
 from noack.protocol.wire_format import VERSION, Flow, read_header
 from noack.runtime.control_messages import LogLine, ProcessReport, parse_message
-from noack.runtime.spool import read_chunks
+from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import notices_of
 
 Rows = NDArray[np.void]

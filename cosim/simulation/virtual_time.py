@@ -37,7 +37,7 @@ from noack.protocol.record_tables import (
 )
 from noack.protocol.topology import ACKNOWLEDGES_TO, CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
 from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 

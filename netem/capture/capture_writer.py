@@ -1,4 +1,4 @@
-"""Writes a capture in a thread of its own, so that the packet path never waits for the disk."""
+"""The tap that writes a capture, in a thread of its own: the packet path never waits for a disk."""
 
 import os
 import threading
@@ -7,15 +7,16 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from types import TracebackType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from netem.capture.packet_blocks import Bytes, Events
-from netem.capture.pcapng import SNAP_BYTES, PcapngInterface, PcapngSection
+from netem.capture.pcapng import PcapngInterface, PcapngSection
+from netem.engine.relay_interface import LinkSpec
 from noack.core.errors import CallerError
+from noack.runtime.address import text_of
 
 _STDOUT = 1
 
@@ -30,42 +31,37 @@ class _Batch(NamedTuple):
 class CaptureWriter:
     """An open capture file.
 
-    Make it before the packet path takes its real-time settings: it may compile for some seconds,
-    and its thread would inherit them. One thread at a time may offer batches and close.
+    Create it before the packet path applies its real-time settings: it may compile for some
+    seconds, and its thread would inherit them.
 
     Args:
-        path: the file, which is replaced; a FIFO, which must have or get a reader; ``-`` for the
-            standard output.
-        interfaces: what an event's ``interface`` indexes.
-        snap_bytes: payload bytes captured of each datagram.
-        batches: how many batches may wait to be written.
-        returned: called in the writer's thread with the arrays of each batch that it needs no more.
+        path: the file, which is replaced; a FIFO; ``-`` for standard output.
+        specs: the relay's links. Each has two interfaces: the clients' side, then the server's.
+        batches: maximum number of batches that wait to be written.
 
     Raises:
-        CallerError: the file cannot be opened, or the standard output is a terminal.
+        CallerError: the file cannot be opened, or standard output is a terminal.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        interfaces: Sequence[PcapngInterface],
-        *,
-        snap_bytes: int = SNAP_BYTES,
-        batches: int = 64,
-        returned: Callable[[Events, Bytes], None] | None = None,
-    ) -> None:
+    wants_data = True
+
+    def __init__(self, path: str | Path, specs: Sequence[LinkSpec], *, batches: int = 64) -> None:
         self.error: str | None = None
-        """Why the capture ended early, in one line; None as long as it has not."""
-        self._section = PcapngSection(interfaces, snap_bytes)
-        self._path = "the standard output" if str(path) == "-" else str(path)
+        """Why the capture ended early, in one line; None if it did not."""
+        self._section = PcapngSection(
+            [
+                PcapngInterface(f"{spec.name} {side}", text_of(address))
+                for spec in specs
+                for side, address in (("client", spec.listen), ("server", spec.to))
+            ]
+        )
+        self._path = "standard output" if str(path) == "-" else str(path)
         self._file = _open(path)
         self._batches = batches
-        self._returned = returned
         self._queue: SimpleQueue[_Batch | None] = SimpleQueue()
-        self._untold = np.zeros(len(interfaces), np.int64)
-        self._some_untold = False
-        self._offered = 0
-        self._missing = 0
+        self._unreported = np.zeros(2 * len(specs), np.int64)
+        self._received_events = 0
+        self._missing_events = 0
         self._written = 0
         self._bytes = 0
         self._closed = False
@@ -73,55 +69,58 @@ class CaptureWriter:
         self._thread.start()
 
     @property
-    def missing(self) -> int:
-        """Events that were offered and are not in the file, nor on their way into it."""
-        return self._missing if self.error is None else self._offered - self._written
+    def missing_events(self) -> int:
+        """Number of events that will not be in the file."""
+        if self.error is not None:
+            return self._received_events - self._written
+        return self._missing_events
 
     @property
     def written(self) -> int:
-        """Events in the file."""
+        """Number of events in the file."""
         return self._written
 
-    def offer(self, events: Events, data: Bytes) -> bool:
-        """Hand over a batch; never waits.
+    def take(self, events: Events, data: Bytes) -> None:
+        """Queue a copy of a batch; never waits.
 
         Args:
-            events: shape (n,), of type :data:`netem.relay_events.EVENT`, n ≥ 1.
+            events: shape (n,), of type :data:`netem.relay_events.EVENT`.
             data: their payloads.
-
-        Returns:
-            Whether it was taken. Then the arrays must not change until they are returned.
-            Otherwise its events are missing from the file, which says so.
         """
-        if self._closed or self.error is not None:
+        if self._closed or self.error is not None or not events.size:
             self._count_missing(events.size)
-            return False
-        if self._queue.qsize() >= self._batches:
-            self.miss(np.bincount(events["interface"], minlength=self._untold.size))
-            return False
-        self._offered += events.size
-        missing = None
-        if self._some_untold:
-            missing, self._untold = self._untold, np.zeros_like(self._untold)
-            self._some_untold = False
-        self._queue.put(_Batch(events, data, missing))
-        return True
+        elif self._queue.qsize() >= self._batches:
+            self._miss(np.bincount(events["interface"], minlength=self._unreported.size))
+        else:
+            missing = self._unreported if self._unreported.any() else None
+            try:
+                self._queue.put(_Batch(events.copy(), data.copy(), missing))
+            except MemoryError:
+                self.missing(events.size)
+                return
+            self._received_events += events.size
+            if missing is not None:
+                self._unreported = np.zeros_like(missing)
 
-    def miss(self, events: NDArray[np.int64]) -> None:
-        """Count events that could not even be offered, per interface, shape (interfaces,)."""
-        self._untold += events
-        self._some_untold = True
+    def missing(self, events: int) -> None:
+        """Count events that the relay had no room for, on the first interface."""
+        missed = np.zeros_like(self._unreported)
+        missed[0] = events
+        self._miss(missed)
+
+    def _miss(self, events: NDArray[np.int64]) -> None:
+        self._unreported += events
         self._count_missing(int(events.sum()))
 
     def _count_missing(self, events: int) -> None:
-        self._offered += events
-        self._missing += events
+        self._received_events += events
+        self._missing_events += events
 
     def close(self, patience_s: float = 5.0) -> None:
-        """Write what waits and the statistics, and close.
+        """Write the queued batches and the statistics, and close the file.
 
         Args:
-            patience_s: how long to wait for a disk or a reader that takes nothing.
+            patience_s: how long to wait for a disk or a reader that accepts nothing.
         """
         if not self._closed:
             self._closed = True
@@ -131,30 +130,17 @@ class CaptureWriter:
             before = self._bytes
             self._thread.join(patience_s)
         if self._thread.is_alive() and self.error is None:
-            self._fail(f"it has taken nothing for {patience_s:g} s")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
+            self._fail(f"nothing could be written for {patience_s:g} s")
 
     def _run(self) -> None:
         self._attempt(lambda: self._write(self._section.header()))
         while (batch := self._queue.get()) is not None:
-            self._attempt(partial(self._take, batch))
-            if self._returned is not None:
-                self._returned(batch.events, batch.data)
+            self._attempt(partial(self._write_batch, batch))
         self._attempt(self._finish)
         os.close(self._file)
 
     def _attempt(self, step: Callable[[], None]) -> None:
-        """Take a step, unless the capture has ended; whatever fails ends it."""
+        """Run a step unless the capture has ended; an error ends it."""
         if self.error is not None:
             return
         try:
@@ -164,14 +150,14 @@ class CaptureWriter:
         except ValueError as error:
             self._fail(str(error))
 
-    def _take(self, batch: _Batch) -> None:
+    def _write_batch(self, batch: _Batch) -> None:
         if batch.missing is not None:
             self._section.miss(batch.missing)
         self._write(self._section.packets(batch.events, batch.data))
         self._written += batch.events.size
 
     def _finish(self) -> None:
-        self._section.miss(self._untold)
+        self._section.miss(self._unreported)
         self._write(self._section.statistics())
 
     def _write(self, blocks: bytes | memoryview) -> None:
@@ -183,7 +169,7 @@ class CaptureWriter:
                 done += size
                 self._bytes += size
         except OSError:
-            with suppress(OSError):  # a file must not end in half a block; a pipe cannot be cut
+            with suppress(OSError):  # remove half a block; a pipe cannot be cut
                 os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - done)
             raise
 
@@ -195,7 +181,7 @@ def _open(path: str | Path) -> int:
     if str(path) == "-":
         if os.isatty(_STDOUT):
             raise CallerError(
-                "a capture is not for a terminal: give a file, or pipe it, "
+                "a capture cannot go to a terminal: name a file, or use a pipe, "
                 "for example `| wireshark -k -i -`"
             )
         return os.dup(_STDOUT)

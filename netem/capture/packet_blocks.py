@@ -1,9 +1,9 @@
 """Events as enhanced packet blocks: the part of a capture that must be fast.
 
-Each block holds the datagram under an IP and a UDP header made from the event and, as options, its
-comment, its direction, its number, and how many events are missing before it. Everything is
-compiled (numba) and runs without the interpreter's lock, so that it does not hold up the packet
-path in another thread. It is one file because numba's cache notices changes of this file only.
+A block holds the datagram with an IP and a UDP header, and as options a comment, the direction, the
+packet id, and the number of missing events before it. The code is compiled (numba) and runs without
+the interpreter lock, so that the packet path in another thread does not wait. It is one file
+because numba's cache notices changes of this file only.
 
 Sources: draft-ietf-opsawg-pcapng §4.3, RFC 791, RFC 8200, RFC 768, RFC 1071 (the checksum).
 """
@@ -16,14 +16,14 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from noack.runtime.code_cache import cache_folder, compiler
+from noack.core.code_cache import cache_folder, compiler
 
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Events = NDArray[np.void]
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 FOLDER = cache_folder("capture", [Path(__file__)])
-"""Where what is compiled is kept; None if it is not."""
+"""Folder of the compiled code; None if it is not kept."""
 _compiled = cast(Callable[[_Function], _Function], compiler(FOLDER, nogil=True))
 _integer = cast(Callable[[Any], int], np.int64)  # unsigned and signed would make a float
 _part = cast(Callable[[_Function], _Function], numba.njit)
@@ -46,55 +46,52 @@ def _text(words: str, width: int = 0) -> Bytes:
     return np.frombuffer(words.encode().ljust(width, b"\0"), np.uint8)
 
 
-# In the order of noack.protocol.record_tables.Fate; the last stands for one that is not known here.
+# In the order of noack.protocol.record_tables.Fate, then one for any other number.
 _FATES = np.stack(
     [
         _text("delivered", 32),
         _text("dropped by the loss model", 32),
         _text("forced: delivered", 32),
         _text("corrupted", 32),
-        _text("dropped by the full queue", 32),
+        _text("dropped by a full queue", 32),
         _text("dropped in a blackout", 32),
-        _text("of unknown fate", 32),
+        _text("unknown fate", 32),
     ]
 )
 _COPY = _text("copy, ")
 _AS_FIRST = _text(" as the first of its flow")
 _BY_CAP = _text(" by the cap")
-_STALE = _text("overtaken: stale at the receiver")
+_STALE = _text("delivered out of order (stale)")
 _COMMA = _text(", ")
 _IN_BIT = _text(" in bit ")
 _CORRUPTED_IN_BIT = _text(", corrupted in bit ")
 _OF = _text(" of ")
-_LOSSES_IN_A_ROW = _text(" losses in a row")
-_OF_AT_MOST = _text(" of at most ")
-_IN_A_ROW = _text(" in a row")
+_CONSECUTIVE_LOSSES = _text(" consecutive losses")
+_CONSECUTIVE_LOSS = _text(", consecutive loss ")
+_CAP = _text(", cap ")
 _DELAYED = _text(", delayed ")
 _AFTER = _text(", after ")
 _HELD_BACK = _text(", held back ")
-_FOR_THE_CAP = _text(" so that the cap holds")
+_FOR_THE_GUARANTEE = _text(" for the guarantee")
 _MS = _text(" ms")
-_FORWARD = _text("; forward, flow ")
-_BACK = _text("; reverse, flow ")
-_DATAGRAM = _text(", datagram ")
+_DIRECTIONS = np.stack([_text("; forward, flow ", 16), _text("; reverse, flow ", 16)])
+_PACKET = _text(", packet ")
 
 
 @_compiled
-def blocks_bytes(events: Events, data_bytes: int, snap_bytes: int, interfaces: int) -> int:
-    """Return a bound on the bytes of the events' blocks, or −1 − i if event i is impossible.
+def blocks_bytes(events: Events, data_bytes: int, interfaces: int) -> int:
+    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is impossible.
 
     Args:
         events: shape (n,), of type :data:`netem.relay_events.EVENT`.
         data_bytes: size of the batch's data.
-        snap_bytes: payload bytes captured of each datagram.
-        interfaces: how many interfaces there are.
+        interfaces: number of interfaces.
     """
     total = 0
     for i in range(events.size):
         event = events[i]
         size = _integer(event["size_bytes"])
         offset = _integer(event["offset"])
-        captured = min(size, snap_bytes)
         udp_limit = _MAX_IPV4_BYTES if event["family"] == 4 else _MAX_IPV6_BYTES
         if (
             event["interface"] >= interfaces
@@ -102,26 +99,23 @@ def blocks_bytes(events: Events, data_bytes: int, snap_bytes: int, interfaces: i
             or (event["family"] != 4 and event["family"] != 6)
             or size + _UDP_BYTES > udp_limit
             or offset < 0
-            or offset > data_bytes - captured
+            or offset > data_bytes - size
         ):
             return -1 - i
-        total += captured + _BLOCK_BYTES
+        total += size + _BLOCK_BYTES
     return total
 
 
 @_compiled
-def put_blocks(
-    events: Events, data: Bytes, snap_bytes: int, missing: Counts, written: Counts, out: Bytes
-) -> int:
+def put_blocks(events: Events, data: Bytes, missing: Counts, written: Counts, out: Bytes) -> int:
     """Write the events' enhanced packet blocks into ``out`` and return their bytes.
 
     Args:
-        events: shape (n,), found possible by :func:`blocks_bytes`.
+        events: shape (n,), checked by :func:`blocks_bytes`.
         data: the payloads.
-        snap_bytes: payload bytes captured of each datagram.
-        missing: per interface, events missing before these; told in the next block and set to 0.
-        written: per interface, events written so far; counted on.
-        out: as large as :func:`blocks_bytes` says.
+        missing: per interface, events missing before these; written in the next block, then 0.
+        written: per interface, number of written events; incremented.
+        out: of at least the size that :func:`blocks_bytes` returns.
     """
     at = 0
     for i in range(events.size):
@@ -129,17 +123,13 @@ def put_blocks(
         interface = _integer(event["interface"])
         start = at
         size = _integer(event["size_bytes"])
-        captured = min(size, snap_bytes)
         t_ns = _integer(event["t_ns"])
         packet = start + 28
         payload = _put_headers(out, packet, event)
         offset = _integer(event["offset"])
-        out[payload : payload + captured] = data[offset : offset + captured]
-        checksum = 0 if event["family"] == 4 else 0xFFFF
-        if captured == size:
-            checksum = _udp_checksum(out, packet, payload, size)
-        _put_u16_network(out, payload - 2, checksum)
-        at = _pad(out, payload + captured)
+        out[payload : payload + size] = data[offset : offset + size]
+        _put_u16_network(out, payload - 2, _udp_checksum(out, packet, payload, size))
+        at = _pad(out, payload + size)
 
         at = _put_comment(out, at, event)
         at = _put_u16(out, at, _FLAGS)
@@ -164,7 +154,7 @@ def put_blocks(
         _put_u32(out, start + 8, interface)
         _put_u32(out, start + 12, t_ns >> 32)
         _put_u32(out, start + 16, t_ns)
-        _put_u32(out, start + 20, payload + captured - packet)
+        _put_u32(out, start + 20, payload + size - packet)
         _put_u32(out, start + 24, payload + size - packet)
         at = _put_u32(out, at, block_bytes)
         written[interface] += 1
@@ -173,14 +163,14 @@ def put_blocks(
 
 @_part
 def _identity(event: Any) -> int:
-    """The upper half of a datagram's number: the same wherever the datagram is seen."""
+    """Return the upper half of a packet id, which is the same at both interfaces."""
     link = _integer(event["interface"]) >> 1
     return link << 25 | _integer(event["direction"]) << 24 | _integer(event["flow"]) & 0xFFFFFF
 
 
 @_part
 def _put_headers(out: Bytes, at: int, event: Any) -> int:
-    """Write IP and UDP header, the latter with checksum 0."""
+    """Write the IP header and the UDP header, with UDP checksum 0."""
     udp_bytes = _integer(event["size_bytes"]) + _UDP_BYTES
     source, destination = event["source"], event["destination"]
     if event["family"] == 4:
@@ -215,12 +205,12 @@ def _udp_checksum(out: Bytes, packet: int, payload: int, size_bytes: int) -> int
     addresses = packet + 12 if udp - packet == 20 else packet + 8
     pseudo = _sum(out, addresses, udp - addresses) + 17 + size_bytes + _UDP_BYTES
     checksum = 0xFFFF - _folded(pseudo + _sum(out, udp, _UDP_BYTES + size_bytes))
-    return checksum if checksum else 0xFFFF  # 0 would say that there is none
+    return checksum if checksum else 0xFFFF  # 0 means: no checksum
 
 
 @_part
 def _sum(data: Bytes, at: int, size_bytes: int) -> int:
-    """Sum of big-endian 16-bit words, an odd last byte filled up with 0."""
+    """Sum of big-endian 16-bit words; an odd last byte is padded with 0."""
     upper: int = 0
     lower: int = 0
     for i in range(at, at + size_bytes - 1, 2):
@@ -241,7 +231,7 @@ def _folded(total: int) -> int:
 @_part
 def _put_comment(out: Bytes, start: int, event: Any) -> int:
     """Write the comment as an option."""
-    fate, run, mansd = min(event["fate"], _UNKNOWN), event["run"], event["mansd"]
+    fate, losses, mansd = min(event["fate"], _UNKNOWN), event["run"], event["mansd"]
     at = start + 4
     if event["copy"]:
         at = _put(out, at, _COPY)
@@ -255,7 +245,7 @@ def _put_comment(out: Bytes, start: int, event: Any) -> int:
         at = _put(out, at, _BY_CAP)
         if mansd >= 0:
             at = _put_number(out, _put(out, at, _OF), mansd)
-            at = _put(out, at, _LOSSES_IN_A_ROW)
+            at = _put(out, at, _CONSECUTIVE_LOSSES)
     if event["bit"] >= 0:
         words = _IN_BIT if fate == _CORRUPTED else _CORRUPTED_IN_BIT
         at = _put_number(out, _put(out, at, words), event["bit"])
@@ -264,20 +254,19 @@ def _put_comment(out: Bytes, start: int, event: Any) -> int:
     if event["departure"]:
         at = _put_ms(out, _put(out, at, _AFTER), event["delay_ns"])
     else:
-        if run > 0 and fate != _DELIVERED and fate != _FORCED:
-            at = _put_number(out, _put(out, at, _COMMA), run)
+        if losses > 0 and fate != _DELIVERED and fate != _FORCED:
+            at = _put_number(out, _put(out, at, _CONSECUTIVE_LOSS), losses)
             if mansd >= 0:
-                at = _put_number(out, _put(out, at, _OF_AT_MOST), mansd)
-            at = _put(out, at, _IN_A_ROW)
-        goes_on = fate in (_DELIVERED, _FORCED, _CORRUPTED)
-        if goes_on and event["delay_ns"] > 0:
+                at = _put_number(out, _put(out, at, _CAP), mansd)
+        is_forwarded = fate in (_DELIVERED, _FORCED, _CORRUPTED)
+        if is_forwarded and event["delay_ns"] > 0:
             at = _put_ms(out, _put(out, at, _DELAYED), event["delay_ns"])
-        if goes_on and event["hold_back_ns"] > 0:
+        if is_forwarded and event["hold_back_ns"] > 0:
             at = _put_ms(out, _put(out, at, _HELD_BACK), event["hold_back_ns"])
-            at = _put(out, at, _FOR_THE_CAP)
-    at = _put(out, at, _BACK if event["direction"] else _FORWARD)
+            at = _put(out, at, _FOR_THE_GUARANTEE)
+    at = _put(out, at, _DIRECTIONS[1 if event["direction"] else 0])
     at = _put_number(out, at, event["flow"])
-    at = _put_number(out, _put(out, at, _DATAGRAM), event["packet"])
+    at = _put_number(out, _put(out, at, _PACKET), event["packet"])
     _put_u16(out, start, _COMMENT)
     _put_u16(out, start + 2, at - start - 4)
     return _pad(out, at)
@@ -330,7 +319,7 @@ def _put(out: Bytes, at: int, text: Bytes) -> int:
 
 @_part
 def _pad(out: Bytes, at: int) -> int:
-    """Fill up to the next multiple of 4; blocks begin at one."""
+    """Pad with 0 to a multiple of 4, where blocks begin."""
     while at % 4:
         out[at] = 0
         at += 1

@@ -1,17 +1,17 @@
-"""A pcapng file of the emulator: one section, its interfaces, packets, and statistics at the end.
+"""A pcapng file of the emulator: one section with interfaces, packets, and final statistics.
 
-An interface is one side of a link. Each packet carries its fate as a comment; ``inbound`` packets
-are datagrams as they came in, ``outbound`` ones as they went out. What the comment says::
+An interface is one side of a link. ``inbound`` packets are datagrams that the emulator received,
+``outbound`` packets are datagrams that it forwarded. Each packet has a comment::
 
     delivered | dropped by the loss model | forced: delivered as the first of its flow |
-    forced: delivered by the cap of 4 losses in a row |
-    corrupted in bit 513 | dropped by the full queue | dropped in a blackout
-    [, 2 of at most 4 in a row] [, delayed 10.5 ms] [, held back 1.2 ms so that the cap holds]
-    ; forward, flow 3, datagram 17
+    forced: delivered by the cap of 4 consecutive losses |
+    corrupted in bit 513 | dropped by a full queue | dropped in a blackout
+    [, consecutive loss 2, cap 4] [, delayed 10.5 ms] [, held back 1.2 ms for the guarantee]
+    ; forward, flow 3, packet 17
 
-An outbound packet says instead ``, after 10.613 ms``, the delay that it really had, and where it
-applies ``copy, ...`` or ``overtaken: stale at the receiver``. A datagram has the same packet id
-wherever it is seen.
+The comment of an outbound packet has ``, after 10.613 ms`` instead, its actual delay, and where it
+applies ``copy, ...`` or ``delivered out of order (stale)``. A datagram has the same packet id at
+both interfaces.
 
 Source: draft-ietf-opsawg-pcapng.
 """
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from netem.capture.packet_blocks import (
     FOLDER,
-    MAX_HEADER_BYTES,
     Bytes,
     Events,
     blocks_bytes,
@@ -36,10 +35,10 @@ from netem.capture.packet_blocks import (
 )
 from netem.compile_notice import announced
 from netem.relay_events import EVENT
-from noack.runtime.code_cache import is_kept
+from noack.core.code_cache import is_kept
 
-SNAP_BYTES = 262_144
-"""Payload bytes captured of a datagram unless told otherwise: all."""
+_SNAP_BYTES = 262_144
+"""More than any datagram has: payloads are captured whole."""
 
 _COMPILING_S = 10.0
 _LINKTYPE_RAW = 101
@@ -56,22 +55,20 @@ class PcapngInterface:
     name: str
     """Short, for example ``link0 client``."""
     description: str = ""
-    """For people, for example its address."""
+    """For example its address."""
 
 
 class PcapngSection:
     """The blocks of one capture file, in their order: header, packets, ..., statistics.
 
-    Making one compiles the code that formats packets, which takes some seconds the first time.
+    The first instance compiles the code that formats packets, which takes some seconds.
 
     Args:
-        interfaces: what an event's ``interface`` indexes.
-        snap_bytes: payload bytes captured of each datagram.
+        interfaces: the ``interface`` of an event is an index into them.
     """
 
-    def __init__(self, interfaces: Sequence[PcapngInterface], snap_bytes: int = SNAP_BYTES) -> None:
+    def __init__(self, interfaces: Sequence[PcapngInterface]) -> None:
         self._interfaces = tuple(interfaces)
-        self._snap_bytes = snap_bytes
         self._missing = np.zeros(len(interfaces), np.int64)
         self._all_missing = np.zeros(len(interfaces), np.int64)
         self._written = np.zeros(len(interfaces), np.int64)
@@ -83,7 +80,7 @@ class PcapngSection:
             self.packets(np.empty(0, EVENT), np.empty(0, np.uint8))
 
     def header(self) -> bytes:
-        """Return the section header and the interfaces' descriptions."""
+        """Return the section header and the interface descriptions."""
         blocks = [
             _block(
                 _SECTION,
@@ -93,11 +90,10 @@ class PcapngSection:
                 (_APPLICATION, f"noack netem {version('noack')}".encode()),
             )
         ]
-        snap_bytes = min(self._snap_bytes + MAX_HEADER_BYTES, SNAP_BYTES)
         blocks += [
             _block(
                 _INTERFACE,
-                struct.pack("<HHI", _LINKTYPE_RAW, 0, snap_bytes),
+                struct.pack("<HHI", _LINKTYPE_RAW, 0, _SNAP_BYTES),
                 (_NAME, interface.name.encode()),
                 (_DESCRIPTION, interface.description.encode()),
                 (_RESOLUTION, b"\x09"),
@@ -107,7 +103,7 @@ class PcapngSection:
         return b"".join(blocks)
 
     def packets(self, events: Events, data: Bytes) -> memoryview:
-        """Return the events' packets; they are valid until the next call.
+        """Return the events' packets, which are valid until the next call.
 
         Args:
             events: shape (n,), of type :data:`netem.relay_events.EVENT`.
@@ -116,9 +112,9 @@ class PcapngSection:
         Raises:
             ValueError: an event is impossible: no such interface, too large, beyond the data.
         """
-        events = np.require(events, EVENT, ["C", "W"])  # other kinds would have to be compiled
+        events = np.require(events, EVENT, ["C", "W"])  # other types would be compiled separately
         data = np.require(data, np.uint8, ["C", "W"])
-        bound = blocks_bytes(events, data.size, self._snap_bytes, len(self._interfaces))
+        bound = blocks_bytes(events, data.size, len(self._interfaces))
         if bound < 0:
             raise ValueError(f"event {-1 - bound} of a batch is impossible: {events[-1 - bound]}")
         if bound > self._out.size:
@@ -126,16 +122,16 @@ class PcapngSection:
         if events.size:
             self._start_ns = self._start_ns or int(events["t_ns"][0])
             self._end_ns = int(events["t_ns"][-1])
-        size = put_blocks(events, data, self._snap_bytes, self._missing, self._written, self._out)
+        size = put_blocks(events, data, self._missing, self._written, self._out)
         return self._out.data[:size]
 
     def miss(self, events: NDArray[np.int64]) -> None:
-        """Count events, per interface, that are missing at this place of the file."""
+        """Add events, per interface, that are missing at this place of the file."""
         self._missing += events
         self._all_missing += events
 
     def statistics(self) -> bytes:
-        """Return how many packets each interface had and how many of them are missing."""
+        """Return the numbers of received and of missing packets per interface."""
         return b"".join(
             _block(
                 _STATISTICS,

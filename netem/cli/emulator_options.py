@@ -1,6 +1,7 @@
-"""What the command line takes, and the links that it asks for."""
+"""The command line of an emulator on its own: its options, and the links that they describe."""
 
 import argparse
+import difflib
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
 from netem.words.quantities import OWN_TIME_S
 from netem.words.word_examples import require_no_dashes
-from netem.words.words_to_settings import parse, settings_of
+from netem.words.words_to_settings import KEYWORDS, parse, settings_of
 from noack.config.impairment_files import read_files
 from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
@@ -18,10 +19,11 @@ from noack.runtime.command_line import Parser
 from noack.runtime.process_entry import add_options
 
 LINK_NAME = "relay"
-"""Of the link that the command line itself describes."""
+"""Name of the link that the command line describes."""
 
+_COMMANDS = ("show", "set", "watch")
 _EXAMPLE_LISTEN, _EXAMPLE_TO = ":9000", ":9001"
-"""Where words are explained that say nothing of addresses."""
+"""Addresses for --explain."""
 
 _EPILOG = """
 words, in the order in which they apply; T is a time (10ms), P a percentage (5%), N a number:
@@ -29,7 +31,7 @@ words, in the order in which they apply; T is a time (10ms), P a percentage (5%)
   loss gemodel P [R [1-H [1-K]]]
   loss state P13 [P31 [P32 [P23 [P14]]]]
   loss burst MEAN_LOSS MEAN_BURST
-  loss periodic B/N [from N]  (B datagrams in a row of every N)
+  loss periodic B/N [from N]  (B consecutive datagrams of every N)
   loss script N,N,... [every N]
   loss trace FILE [once]
   loss worst | loss none
@@ -40,23 +42,24 @@ words, in the order in which they apply; T is a time (10ms), P a percentage (5%)
   rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue N]
   blackout T-T[,T-T...] [every T]
 
-settings, wherever they stand:
-  mansd N    at most N successive datagrams of a flow are not delivered
+settings, at any place:
+  mansd N    at most N consecutive losses in each flow
   first      the first datagram of each flow is delivered
-  limit N    at most N datagrams are delayed at once
-  seed N     of the link's random streams
+  limit N    at most N datagrams are delayed at a time
+  seed N     seed of the link's random streams
 
-A flow is what one client, that is an address and a port, sends, or what is answered to it.
+A flow is the datagrams from one client (address and port), or the answers to it.
 
-while one runs with --control NAME (each has --help):
-  noack netem show [NAME]         what has happened so far
-  noack netem set [NAME] WORDS    what it does from now on
-  noack netem watch [NAME]        live
+commands for an emulator that runs with --control NAME (each has --help):
+  noack netem show [NAME]         show its statistics
+  noack netem set [NAME] WORDS    change its impairments
+  noack netem watch [NAME]        show its statistics live
 
-When it is ready, it prints a line on standard output: ready: listening on 127.0.0.1:9000
+When the emulator is ready, it prints a line on standard output:
+  ready: listening on 127.0.0.1:9000
 
-exit status: 0 it ended as asked; 1 something failed; 2 the command line or a file is wrong;
-3 there were unintended losses (a full buffer or queue), so that the guarantee does not hold
+exit status: 0 ended as requested; 1 a failure; 2 a mistake on the command line or in a file;
+3 unintended losses (a full buffer or queue): the guarantee does not hold
 
 examples:
   noack netem --listen :9000 --to :9001 loss 5% mansd 4
@@ -68,7 +71,7 @@ examples:
 
 
 class _Formatter(argparse.HelpFormatter):
-    """Wraps each line of a text by itself; what goes on is indented, a command's line marked."""
+    """Wraps each line of a text separately, with an indent; a command gets a backslash."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         lines: list[str] = []
@@ -95,39 +98,34 @@ def parser() -> Parser:
         "       %(prog)s --explain WORDS ...\n"
         "       %(prog)s show|set|watch [NAME] ...\n"
         "       %(prog)s [--session NAME]",
-        description="A UDP relay that does to datagrams what a network may do, in the words of "
-        "`tc netem`, but never lets more than MANSD successive ones of a flow be lost. Without "
-        "--listen it joins the run that `noack record SCENARIO` has opened.",
+        description="A UDP relay that emulates a network, configured in the words of `tc netem`. "
+        "With mansd N, at most N consecutive datagrams of a flow are lost. Without --listen, it "
+        "joins the run that `noack record SCENARIO` has opened.",
         epilog=_EPILOG,
         formatter_class=_Formatter,
         allow_abbrev=False,
     )
     add_options(parser)
-    alone = parser.add_argument_group("on its own")
+    alone = parser.add_argument_group("links")
     alone.add_argument(
-        "--listen", metavar="HOST:PORT", help="where clients send to; "
+        "--listen", metavar="HOST:PORT", help="address for the clients; "
         ":9000 is 127.0.0.1:9000, and 0.0.0.0:9000 or [::]:9000 is any address of this machine",
     )  # fmt: skip
-    alone.add_argument("--to", metavar="HOST:PORT", help="the server")
+    alone.add_argument("--to", metavar="HOST:PORT", help="address of the server")
     alone.add_argument("words", nargs="*", metavar="WORDS", help="from clients to the server")
     alone.add_argument(
-        "--reverse",
-        metavar="WORDS",
-        nargs="+",
-        help="from the server to clients (no impairment)",
+        "--reverse", metavar="WORDS", nargs="+", help="from the server to clients (no impairment)"
     )
     alone.add_argument("--both", action="store_true", help="the words apply in both directions")
     alone.add_argument("--links", metavar="FILE", type=Path, help="several links, from a TOML file")
+    alone.add_argument("--one-way", action="store_true", help="do not relay the server's answers")
     alone.add_argument(
-        "--one-way", action="store_true", help="what the server answers is not relayed"
+        "--idle", metavar="TIME", help="forget a client without datagrams for TIME (60s)"
     )
-    alone.add_argument(
-        "--idle", metavar="TIME", help="forget a client after so long without datagrams (60s)"
-    )
-    alone.add_argument("--seed", type=int, help="of the random streams (0)")
+    alone.add_argument("--seed", type=int, help="seed of the random streams (0)")
     alone.add_argument(
         "--explain", action="store_true",
-        help="say what the words, or the links of a file, mean, and do nothing",
+        help="explain the words, or the links of a file, and end",
     )  # fmt: skip
     return parser
 
@@ -136,48 +134,41 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
     """Return the options of a command line.
 
     Raises:
-        CallerError: a word stands there as an option, or an option that goes alone does not.
+        CallerError: a word has dashes, or --session has other options beside it.
     """
     require_no_dashes(arguments)
     options = parser.parse_intermixed_args(arguments)
     if any(argument.partition("=")[0] == "--session" for argument in arguments):
         raise CallerError(
-            "--session: joins a run, and goes alone or with --json; words and all other options "
-            "are of an emulator on its own, which has --listen and --to, or --links"
+            "--session joins a run and allows only --json beside it; words and all other options "
+            "belong to an emulator on its own, which needs --listen and --to, or --links"
         )
     return options
 
 
 def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
-    """Return the links that the command line asks for.
+    """Return the links that the command line describes.
 
     Raises:
-        CallerError: it says something wrong.
+        CallerError: it has a mistake.
     """
     if options.links is not None:
         for name in ("listen", "to", "words", "reverse", "both", "one_way", "idle", "seed"):
             if getattr(options, name):
                 shown = name if name == "words" else f"--{name.replace('_', '-')}"
-                raise CallerError(f"{shown}: stands in the file that --links names")
+                raise CallerError(f"{shown}: with --links, set this in the file")
         return load_links(options.links)
     if options.explain:
         options.listen = options.listen or _EXAMPLE_LISTEN
         options.to = options.to or _EXAMPLE_TO
     if options.listen is None and options.to is None:
+        _require_word(options.words)
         raise CallerError("an emulator on its own needs --listen and --to, or --links; see --help")
     if options.listen is None or options.to is None:
-        raise CallerError("--listen and --to go together")
+        raise CallerError("--listen and --to must be given together")
     listen = parse_address(options.listen, "--listen")
     to = parse_address(options.to, "--to", listen)
     forward, reverse, seed = directions(options)
-    idle_s = LinkSpec.idle_s
-    if options.idle is not None:
-        try:
-            idle_s = OWN_TIME_S.read(options.idle)
-        except ValueError:
-            raise CallerError(f"--idle {options.idle}: expected {OWN_TIME_S.expected}") from None
-        if not 0 < idle_s <= 1e6:
-            raise CallerError(f"--idle {options.idle}: must be more than 0")
     return (
         LinkSpec(
             name=LINK_NAME,
@@ -187,25 +178,44 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
             reverse=read_files(reverse, Path()),
             seed=seed,
             return_path=not options.one_way,
-            idle_s=idle_s,
+            idle_s=LinkSpec.idle_s if options.idle is None else _idle_s(options.idle),
         ),
     )
+
+
+def _require_word(words: Sequence[str]) -> None:
+    """Explain a first word that is neither a command nor an impairment."""
+    first = words[0].split()[0] if words and words[0].split() else ""
+    if first and first not in KEYWORDS and not any(word.startswith(first) for word in KEYWORDS):
+        close = difflib.get_close_matches(first, [*_COMMANDS, *KEYWORDS], 1)
+        hint = f"did you mean {close[0]}?" if close else "see --help"
+        raise CallerError(f"{first}: neither a command (show, set, watch) nor a word; {hint}")
+
+
+def _idle_s(text: str) -> float:
+    try:
+        idle_s = OWN_TIME_S.read(text)
+    except ValueError:
+        raise CallerError(f"--idle {text}: expected {OWN_TIME_S.expected}") from None
+    if not 0 < idle_s <= 1e6:
+        raise CallerError(f"--idle {text}: must be more than 0")
+    return idle_s
 
 
 def directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
     """Return the settings forward and reverse, and the seed; files are not read yet.
 
     Raises:
-        CallerError: the words say something wrong.
+        CallerError: the words have a mistake.
     """
     forward, seed = parse(options.words or ())
     if options.both and options.reverse is not None:
-        raise CallerError("--reverse: goes without --both")
+        raise CallerError("--reverse and --both exclude each other")
     if options.one_way and (options.both or options.reverse is not None):
         raise CallerError("--one-way: no reverse direction; leave out --reverse and --both")
     reverse = settings_of(options.reverse) if options.reverse is not None else LinkSettings()
     if seed is not None and options.seed is not None:
-        raise CallerError(f"--seed {options.seed}: the words say seed {seed} already")
+        raise CallerError(f"--seed {options.seed}: the words have seed {seed} already")
     seed = options.seed if seed is None else seed
     if seed is not None and not 0 <= seed < 2**64:
         raise CallerError(f"--seed {seed}: must be 0 or more, below 2^64")

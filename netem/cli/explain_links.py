@@ -1,8 +1,8 @@
-"""``netem --explain``: what links would do, without doing it."""
+"""``netem --explain``: explains what links would do, and relays nothing."""
 
 import json
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
 
 import tomli_w
@@ -12,38 +12,37 @@ from rich.table import Table
 from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
-from netem.loss_prediction import LossPrediction, predict
+from netem.loss_prediction import predict
 from netem.words.explanation import meaning_of, settings_meaning
 from netem.words.settings_to_words import impairment_text, text_of
 from netem.words.tc_command import tc_command
 from noack.config.impairments import LinkSettings
 from noack.runtime.address import text_of as address_text
 
-_NOTHING = LinkSettings()
 _FROM_TO = {"forward": "from clients to the server", "reverse": "from the server to clients"}
-_MOST_TOML = 4000
+_MAX_TOML = 4000
 _NARROW_WIDTH, _WIDE_WIDTH = 20, 44
-"""Least and most columns for words."""
+"""Minimum and maximum columns for words."""
 
 
 class DirectionExplanation(TypedDict):
-    """What a direction would do."""
+    """One direction of a link."""
 
     words: str
     settings: Mapping[str, Any]
     meaning: Sequence[str]
     predicted_loss: float | None
     predicted_loss_note: str
-    """Why there is none, or what it does not count."""
+    """Why there is no prediction, or what it does not count."""
     predicted_loss_without_cap: float | None
     tc: str | None
-    """What comes nearest, after ``tc qdisc add dev DEVICE root netem``."""
+    """The nearest command, after ``tc qdisc add dev DEVICE root netem``."""
     tc_lacks: Sequence[str]
     tc_notes: Sequence[str]
 
 
 class LinkExplanation(TypedDict):
-    """What a link would do."""
+    """One link."""
 
     name: str
     listen: str
@@ -51,11 +50,11 @@ class LinkExplanation(TypedDict):
     seed: int
     forward: DirectionExplanation
     reverse: DirectionExplanation | None
-    """None: one way only."""
+    """None: not relayed."""
 
 
 class Explanation(TypedDict):
-    """What a relay would do."""
+    """The links of a relay."""
 
     links: Sequence[LinkExplanation]
 
@@ -65,12 +64,11 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
 
     Args:
         specs: the links.
-        as_json: one JSON document instead of tables for people.
-        as_file: say what they are in a file of links, too; or they come from one, and say which.
+        as_json: print one JSON document instead of tables for people.
+        as_file: also print them as a file of links; False: print their names instead.
     """
     if as_json:
-        links = [_link_document(spec) for spec in specs]
-        print(json.dumps(Explanation(links=links), indent=2))
+        print(json.dumps(Explanation(links=[_link_document(spec) for spec in specs]), indent=2))
         return
     console = Console(highlight=False)
     for number, spec in enumerate(specs):
@@ -80,9 +78,10 @@ def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
             console.print(Text(_heading(spec), "bold underline"))
         _print_link(console, spec)
         if as_file:
-            console.print(Text("\nin a file of links (--links)", "bold"))
-            # What is copied must not be broken.
-            console.print(Text(_cut("\n".join(_toml(spec)).strip(), _MOST_TOML)), soft_wrap=True)
+            console.print(Text("\nas a file of links (--links)", "bold"))
+            # Text to be copied must not be wrapped.
+            toml = tomli_w.dumps({"link": [_link_table(spec)]}).strip()
+            console.print(Text(_cut(toml, _MAX_TOML)), soft_wrap=True)
 
 
 def _link_document(spec: LinkSpec) -> LinkExplanation:
@@ -119,7 +118,7 @@ def _heading(spec: LinkSpec) -> str:
 
 def _print_link(console: Console, spec: LinkSpec) -> None:
     if spec.return_path and spec.forward == spec.reverse:
-        _print_direction(console, "in both directions, in each by itself", spec.forward)
+        _print_direction(console, "both directions, each by itself", spec.forward)
         return
     _print_direction(console, f"forward, {_FROM_TO['forward']}", spec.forward)
     console.print()
@@ -130,12 +129,12 @@ def _print_link(console: Console, spec: LinkSpec) -> None:
 
 
 def _print_direction(console: Console, title: str, settings: LinkSettings) -> None:
-    if settings == _NOTHING:
-        console.print(Text(f"{title}: nothing happens", "bold"))
+    if settings == LinkSettings():
+        console.print(Text(f"{title}: no impairment", "bold"))
         return
     console.print(Text(f"{title}, in this order", "bold"))
     console.print(_table(settings, console.width))
-    console.print(Text(f"\n{_loss_line(settings)}"))
+    console.print(Text(f"\nexpected loss rate: {_rate_text(settings)}"))
     _print_tc(console, settings)
 
 
@@ -146,26 +145,22 @@ def _table(settings: LinkSettings, width: int) -> Table:
     table.add_column(max_width=most, overflow="fold", style="bold")
     table.add_column(overflow="fold")
     for number, one in enumerate(settings.impairments, 1):
-        # As text: a bracket in a file's name is no markup.
+        # As text: a bracket in a file's name is not markup.
         words, meaning = _cut(impairment_text(one), 200), meaning_of(one)
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
-        table.add_row("", "", "it passes")
+        table.add_row("", "", "no impairment")
     for words, meaning in settings_meaning(settings):
         table.add_row("", words, meaning)
     return table
 
 
-def _loss_line(settings: LinkSettings) -> str:
+def _rate_text(settings: LinkSettings) -> str:
     prediction = predict(settings)
-    without = None if settings.mansd is None else predict(_uncapped(settings)).rate
-    return f"predicted loss in the long run: {_rate_text(prediction, without)}"
-
-
-def _rate_text(prediction: LossPrediction, without_cap: float | None) -> str:
     if prediction.rate is None:
         return f"not known: {prediction.note}"
     text = f"{100 * prediction.rate:.4g}%"
+    without_cap = None if settings.mansd is None else predict(_uncapped(settings)).rate
     if without_cap is not None:
         text += f" (without the cap {100 * without_cap:.4g}%)"
     return f"{text}, {prediction.note}" if prediction.note else text
@@ -175,9 +170,9 @@ def _print_tc(console: Console, settings: LinkSettings) -> None:
     tc = tc_command(settings)
     lacks = ", ".join(tc.lacks)
     if tc.words is None:
-        console.print(Text(f"tc cannot do it; it lacks: {lacks}"))
+        console.print(Text(f"not possible with tc, which lacks: {lacks}"))
         return
-    console.print(Text("with tc, on a network device:"))
+    console.print(Text("nearest command of tc, for a network device:"))
     command = textwrap.wrap(
         f"tc qdisc add dev DEVICE root netem {tc.words}", max(console.width - 2, _NARROW_WIDTH),
         initial_indent="  ", subsequent_indent="      ",
@@ -185,55 +180,34 @@ def _print_tc(console: Console, settings: LinkSettings) -> None:
     )  # fmt: skip
     console.print(Text(" \\\n".join(command)), soft_wrap=True)
     if lacks:
-        console.print(Text(f"but tc lacks: {lacks}"))
+        console.print(Text(f"tc lacks: {lacks}"))
     for note in tc.notes:
-        console.print(Text(f"but {note}"))
+        console.print(Text(f"difference: {note}"))
 
 
 def _uncapped(settings: LinkSettings) -> LinkSettings:
     return settings.model_copy(update={"mansd": None})
 
 
-def _toml(spec: LinkSpec) -> Iterator[str]:
-    """Lines of a file with this link; each table has its own, as inline ones are too long."""
-    link: dict[str, Any] = {
-        "name": spec.name,
-        "listen": address_text(spec.listen),
-        "to": address_text(spec.to),
-    }
+def _link_table(spec: LinkSpec) -> dict[str, Any]:
+    """Return a link's table in a file of links, without default values."""
+    table: dict[str, Any] = {
+        "name": spec.name, "listen": address_text(spec.listen), "to": address_text(spec.to),
+    }  # fmt: skip
     for key in ("seed", "return_path", "idle_s"):
-        value = getattr(spec, key)
-        if value != getattr(LinkSpec, key):
-            link[key] = value
+        if getattr(spec, key) != getattr(LinkSpec, key):
+            table[key] = getattr(spec, key)
     sides = {"forward": _given(spec.forward), "reverse": _given(spec.reverse)}
-    yield from _toml_table("[[link]]", "link", link | {k: v for k, v in sides.items() if v})
-
-
-def _toml_table(header: str, name: str, table: Mapping[str, Any]) -> Iterator[str]:
-    deeper: list[tuple[str, str, Mapping[str, Any]]] = []
-    own: list[str] = []
-    for key, value in table.items():
-        inner = f"{name}.{key}"
-        if isinstance(value, dict):
-            deeper.append((f"[{inner}]", inner, value))
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            deeper += [(f"[[{inner}]]", inner, entry) for entry in value]
-        else:
-            own.append(tomli_w.dumps({key: value}).rstrip())
-    if own:
-        yield from ("", header, *own)
-    for each in deeper:
-        yield from _toml_table(*each)
+    return table | {name: side for name, side in sides.items() if side}
 
 
 def _given(section: BaseModel) -> dict[str, Any]:
-    """The keys of a section that are not their defaults, and those that name what it is."""
-    given: dict[str, Any] = {}
-    for key, field in type(section).model_fields.items():
-        value = getattr(section, key)
-        if key in ("kind", "model") or value != field.default:
-            given[key] = _plain(value)
-    return given
+    """Return the keys of a section that differ from their defaults, and its kind."""
+    return {
+        key: _plain(getattr(section, key))
+        for key, field in type(section).model_fields.items()
+        if key in ("kind", "model") or getattr(section, key) != field.default
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -242,5 +216,5 @@ def _plain(value: Any) -> Any:
     return [_plain(entry) for entry in value] if isinstance(value, tuple) else value
 
 
-def _cut(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+def _cut(text: str, limit: int) -> str:
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."

@@ -1,4 +1,4 @@
-"""Runs a relay, with all that watches it at its side."""
+"""Runs a relay, with live control, statistics, captures and fate traces beside it."""
 
 import argparse
 import json
@@ -26,49 +26,48 @@ from noack.runtime.signals import Signals
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 50_000
-"""A sleeper wakes late by less, nearly always; the core is not kept from others for longer."""
+"""A sleeping thread is nearly always less late than this; longer spins would block the core."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options on how a relay runs, and what watches it."""
-    group = parser.add_argument_group("how it runs")
+    """Add the options for running and recording a relay."""
+    group = parser.add_argument_group("engine")
     group.add_argument(
         "--engine", choices=("auto", "batched", "plain"), default="auto",
-        help="batched is the fast one, for Linux; plain runs everywhere (auto)",
+        help="batched is fast and needs Linux; plain runs everywhere (auto)",
     )  # fmt: skip
     group.add_argument(
         "--segment", action="store_true",
-        help="send runs of datagrams of equal size as one message that the kernel cuts",
+        help="send consecutive datagrams of equal size in one system call (UDP_SEGMENT)",
     )  # fmt: skip
     group.add_argument(
         "--realtime", action="store_true",
-        help="ask for SCHED_FIFO, locked memory, no deep idle states, each where permitted; and "
-        "stay awake for the last 50 µs before a delayed datagram is due",
+        help="request SCHED_FIFO, locked memory and no deep idle states, each where permitted; "
+        "poll during the last 50 µs before a delayed datagram is due",
     )  # fmt: skip
     group.add_argument(
-        "--compile", action="store_true",
-        help="compile for this machine what the first start would, and end",
+        "--compile", action="store_true", help="compile the fast engine for this machine, and end"
     )  # fmt: skip
-    group = parser.add_argument_group("what it records")
+    group = parser.add_argument_group("recording")
     group.add_argument(
         "--capture", metavar="FILE.pcapng",
-        help="all datagrams, with their fates as comments; - for the standard output",
+        help="capture all datagrams, with their fates as comments; - for standard output",
     )  # fmt: skip
     group.add_argument(
-        "--record-fates", metavar="FILE.parquet", type=Path, help="what became of each datagram"
+        "--record-fates", metavar="FILE.parquet", type=Path, help="record packet fates"
     )
     group.add_argument(
         "--replay-fates", metavar="FILE.parquet", type=Path,
-        help="let the same become of each datagram again, by its number in its flow; the record's "
-        "cap is kept, unless mansd says another, whenever they come",
+        help="replay recorded packet fates, matched by flow and packet number; the recorded cap "
+        "applies unless mansd sets another",
     )  # fmt: skip
     relay_attachments.add_options(parser)
 
 
 def compile_all() -> None:
-    """Compile what the fast engine and captures need, and say how long it took."""
+    """Compile the fast engine and captures, and report the time it took."""
     if missing := compiled_engine_is_missing():
-        say(f"nothing is compiled here: the batched engine {missing}")
+        say(f"nothing to compile here: the batched engine {missing}")
         return
     began_s = time.monotonic()
     from netem.capture.pcapng import PcapngSection
@@ -76,45 +75,47 @@ def compile_all() -> None:
 
     load()
     PcapngSection(())
-    say(f"all is compiled ({time.monotonic() - began_s:.1f} s)")
+    say(f"compiled ({time.monotonic() - began_s:.1f} s)")
 
 
 def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
-    """Relay until Ctrl-C; return what has happened.
+    """Relay until Ctrl-C; return the totals.
 
     Args:
         specs: the links.
         options: parsed options of :func:`add_options`.
 
     Raises:
-        CallerError: an address is taken, a file cannot be written.
+        CallerError: an address is in use, or a file cannot be written.
     """
-    side_options = relay_attachments.options_of(options)
+    attachments = relay_attachments.options_of(options)
     if options.capture == "-" and (options.json or options.stats is not None):
-        raise CallerError("--capture -: the standard output is taken by --json or --stats")
+        raise CallerError("--capture -: --json and --stats use standard output, too")
     _check_files(options)
     if options.replay_fates is not None:
         specs = _replaying(specs, options.replay_fates)
     with ExitStack() as last, ExitStack() as stack:
-        with starting(side_options.name):
+        with starting(attachments.name):
             taps = _taps(specs, options, stack)
             opened = open_relay(
                 specs, options.engine, options.segment, taps, _SPIN_NS if options.realtime else 0
             )
             stack.callback(opened.close)
-            # Until all files are complete.
+            # Signals stay handled until all files are complete.
             signals = last.enter_context(Signals().handled())
-            side = stack.enter_context(relay_attachments.attached(opened, side_options))
+            side = stack.enter_context(relay_attachments.attached(opened, attachments))
         stack.enter_context(_in_realtime(options.realtime))
         _say_ready(opened)
-        if options.capture != "-" and not side_options.takes_output:
+        if options.capture != "-" and not attachments.takes_output:
             _print_ready(opened, as_json=options.json)
-        opened.run(lambda: side.left or signals.received is not None, side.housekeeping)
-        return statistics(side.look())
+        opened.run(
+            lambda: side.quit_requested or signals.received is not None, side.commands.run_pending
+        )
+        return statistics(side.commands.look())
 
 
 def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
-    """Let links do what a trace says, and keep its cap where they have none of their own."""
+    """Return links that replay a trace, with its cap unless they have one of their own."""
     fates = read_fates(path, [spec.name for spec in specs])
 
     def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
@@ -124,17 +125,15 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
 
     return [
         replace(
-            spec,
-            forward=settings(spec, "forward"),
-            reverse=settings(spec, "reverse"),
+            spec, forward=settings(spec, "forward"), reverse=settings(spec, "reverse"),
             decisions={side: fates.decisions[spec.name, side] for side in DIRECTIONS},
         )
         for spec in specs
-    ]
+    ]  # fmt: skip
 
 
 def _check_files(options: argparse.Namespace) -> None:
-    """Refuse to write into what is to be read, or into one file twice."""
+    """Refuse one file for two options."""
     files = {
         f"--{name.replace('_', '-')}": Path(given).resolve()
         for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")
@@ -143,7 +142,7 @@ def _check_files(options: argparse.Namespace) -> None:
     for name, path in files.items():
         for other, same in files.items():
             if name > other and path == same and not path.is_char_device():
-                raise CallerError(f"{name} {path}: is the file of {other}, too; take another")
+                raise CallerError(f"{name} {path}: {other} has the same file; choose another")
 
 
 def _taps(
@@ -160,23 +159,22 @@ def _taps(
 @contextmanager
 def _capture(path: str, specs: Sequence[LinkSpec]) -> Iterator[Tap]:
     try:
-        from netem.capture.capture_tap import CaptureTap, interfaces_of
         from netem.capture.capture_writer import CaptureWriter
     except ModuleNotFoundError as error:  # the plain engine runs without numba
         raise CallerError(f"--capture: needs {error.name}, which is not installed") from None
-    writer = CaptureWriter(path, interfaces_of(specs))
+    writer = CaptureWriter(path, specs)
     try:
-        yield CaptureTap(writer, len(specs))
+        yield writer
     finally:
         writer.close()
         if writer.error is not None:
             say(writer.error)
-        elif writer.missing:
-            say(f"{writer.missing} events are missing in the capture")
+        elif writer.missing_events:
+            say(f"the capture lacks {writer.missing_events} events")
 
 
 def _say_ready(opened: Relay) -> None:
-    """Only when Ctrl-C would end it well."""
+    """Report on standard error that the relay runs; call it when Ctrl-C is handled."""
     addresses = opened.addresses()
     for spec in opened.specs:
         name = f" ({spec.name})" if len(opened.specs) > 1 else ""
@@ -185,7 +183,7 @@ def _say_ready(opened: Relay) -> None:
 
 
 def _print_ready(opened: Relay, *, as_json: bool) -> None:
-    """On standard output, for programs that wait for this line."""
+    """Print the line on standard output that programs wait for."""
     addresses = opened.addresses()
     line = f"ready: listening on {', '.join(map(text_of, addresses.values()))}"
     if as_json:
@@ -195,14 +193,14 @@ def _print_ready(opened: Relay, *, as_json: bool) -> None:
         ]
         line = json.dumps({"ready": links})
     if sys.stdout is not None:
-        with suppress(OSError, ValueError):  # nobody reads it; the emulator goes on
+        with suppress(OSError, ValueError):  # no reader: the relay continues
             os.write(sys.stdout.fileno(), f"{line}\n".encode())
 
 
 @contextmanager
 def _in_realtime(wanted: bool) -> Iterator[None]:
-    with realtime(wanted, _FIFO_PRIORITY) as granted:
-        for setting, answer in granted.items():
+    with realtime(wanted, _FIFO_PRIORITY) as applied:
+        for setting, answer in applied.items():
             if answer.startswith("refused"):
                 say(f"{setting} {answer}")
         yield

@@ -1,7 +1,7 @@
-"""What a relay has done, as a table for people."""
+"""The totals of a relay, as a table for people."""
 
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -15,26 +15,27 @@ from netem.control.emulator_statistics import (
     unintended,
 )
 from netem.control.number_texts import NONE, percent_text, time_text
+from netem.control.statistics_view import burst_text
+from netem.engine.relay_interface import DIRECTIONS
 from noack.core.errors import ExitStatus
 
-_CAUSES = {
-    "dropped": "dropped by loss",
-    "corrupted": "corrupted",
-    "overflowed": "dropped from a full queue",
-    "blacked_out": "dropped in a blackout",
+_COUNTS: dict[str, Callable[[DirectionStatistics], int]] = {
+    "dropped by a loss model": lambda side: side["fates"]["dropped"],
+    "corrupted": lambda side: side["fates"]["corrupted"],
+    "dropped by a full queue": lambda side: side["fates"]["overflowed"],
+    "dropped in a blackout": lambda side: side["fates"]["blacked_out"],
+    "forced by the guarantee": lambda side: side["fates"]["forced"],
+    "delivered out of order (stale)": lambda side: side["delivered_out_of_order"],
+    "held back for the guarantee": lambda side: side["held_back"],
+    "duplicated": lambda side: side["duplicated"],
+    "in flight at the end": lambda side: side["in_flight"],
 }
-_COUNTS = {
-    "delivered_out_of_order": "overtaken (stale)",
-    "held_back": "held back, not to overtake too many",
-    "duplicated": "sent twice",
-    "in_flight": "still under way",
-}
+"""Rows that are shown if they are not 0."""
 
 
 class _Row(NamedTuple):
     label: str
-    forward: str
-    reverse: str
+    texts: tuple[str, ...]
     style: str = ""
 
 
@@ -42,11 +43,15 @@ def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> No
     """Print a table for each link.
 
     Args:
-        totals: what has happened.
-        console: where to.
-        predicted: whether the settings predict the loss, as no recorded fates were taken again.
+        totals: the statistics at the end.
+        console: the output.
+        predicted: whether the settings predict the loss; they do not predict replayed fates.
     """
     for link in totals["links"]:
+        clients = link["clients_ever"]
+        title = f"{link['name']}: {link['listen']} → {link['to']}, {clients:,} client"
+        # As text: the brackets of an IPv6 address are not markup.
+        console.print(Text(title + "s" * (clients != 1), "bold"), soft_wrap=True)
         console.print(_table(link, predicted))
     if lost := unintended(totals):
         status = ExitStatus.UNINTENDED_LOSSES
@@ -57,80 +62,54 @@ def print_totals(totals: Statistics, console: Console, *, predicted: bool) -> No
 
 
 def _table(link: LinkStatistics, predicted: bool) -> Table:
-    clients = link["clients_ever"]
-    table = Table(
-        # As text: the brackets of an IPv6 address are no markup.
-        title=Text(
-            f"{link['name']}: {link['listen']} → {link['to']}, "
-            f"{clients:,} client{'' if clients == 1 else 's'}", "bold",
-        ),
-        title_justify="left", box=None, padding=(0, 2, 0, 0),
-    )  # fmt: skip
+    reverse = link["reverse"]
+    both = bool(reverse["arrived"] or reverse["words"] or link["discarded"])
+    table = Table(box=None, padding=(0, 2, 0, 0))
     table.add_column("")
-    table.add_column("forward", justify="right")
-    both = bool(link["reverse"]["arrived"] or link["reverse"]["words"] or link["discarded"])
-    if both:
-        table.add_column("reverse", justify="right")
+    for name in DIRECTIONS[: 1 + both]:
+        table.add_column(name, justify="right")
     for row in _rows(link, predicted):
-        cells = (row.forward, row.reverse) if both else (row.forward,)
-        table.add_row(row.label, *cells, style=row.style)
+        table.add_row(row.label, *row.texts[: 1 + both], style=row.style)
     return table
 
 
 def _rows(link: LinkStatistics, predicted: bool) -> Iterator[_Row]:
-    sides = forward, reverse = link["forward"], link["reverse"]
-    yield _Row("came", _number(forward["arrived"]), _number(reverse["arrived"]))
-    yield _Row("left", _number(forward["forwarded"]), _number(reverse["forwarded"]))
-    for fate, label in _CAUSES.items():
-        yield from _some(label, forward["fates"][fate], reverse["fates"][fate])
-    yield from _some("forced through", forward["fates"]["forced"], reverse["fates"]["forced"])
-    for key, label in _COUNTS.items():
-        yield from _some(label, forward[key], reverse[key])  # type: ignore[literal-required]
-    if forward["arrived_before"] or reverse["arrived_before"]:
-        yield _Row("since the last change:", "", "", "dim")
-    yield _Row("most in a row not delivered", _run(forward), _run(reverse))
-    yield _Row("lost", _share(forward, "lost"), _share(reverse, "lost"))
+    sides = link["forward"], link["reverse"]
+
+    def row(label: str, text: Callable[[DirectionStatistics], str]) -> _Row:
+        return _Row(label, tuple(map(text, sides)))
+
+    yield row("received", lambda side: f"{side['arrived']:,}")
+    yield row("forwarded", lambda side: f"{side['forwarded']:,}")
+    for label, count in _COUNTS.items():
+        if any(map(count, sides)):
+            yield row(label, _number(count))
+    if any(side["arrived_before"] for side in sides):
+        yield _Row("since the last change:", (), "dim")
+    yield row("longest loss burst", burst_text)
+    yield row("loss rate", lambda side: percent_text(side["loss"]["lost"]))
     if predicted and any(side["loss"]["predicted"] is not None for side in sides):
-        full = forward["fates"]["overflowed"] or reverse["fates"]["overflowed"]
-        what = "but for full queues" if full else "in the long run"
-        yield _Row(
-            f"  predicted {what}", _share(forward, "predicted"), _share(reverse, "predicted")
-        )
-    if forward["delivered_out_of_order"] or reverse["delivered_out_of_order"]:
-        yield _Row("lost or stale", _share(forward, "realised"), _share(reverse, "realised"))
-    yield _Row(
-        "delay: median, 99 % within", _times(forward["delay_ns"]), _times(reverse["delay_ns"])
-    )
-    late = (forward["lateness_ns"], reverse["lateness_ns"])
-    if any(times["p50"] is not None for times in late):
-        yield _Row("lateness: median, 99 % within", *map(_times, late))
-    for cause in {**forward["unintended"], **reverse["unintended"]}:
-        there, here = (side["unintended"].get(cause, 0) for side in sides)
-        yield from _some(f"unintended: {cause.replace('_', ' ')}", there, here, "bold red")
+        full = any(side["fates"]["overflowed"] for side in sides)
+        label = "  predicted, without full queues" if full else "  predicted"
+        yield row(label, lambda side: percent_text(side["loss"]["predicted"]))
+    if any(side["delivered_out_of_order"] for side in sides):
+        yield row("loss rate with stale", lambda side: percent_text(side["loss"]["realised"]))
+    yield row("delay p50, p99", lambda side: _times(side["delay_ns"]))
+    if any(side["lateness_ns"]["p50"] is not None for side in sides):
+        yield row("lateness p50, p99", lambda side: _times(side["lateness_ns"]))
+    for cause in sorted({cause for side in sides for cause, n in side["unintended"].items() if n}):
+        numbers = tuple(f"{side['unintended'].get(cause, 0):,}" for side in sides)
+        yield _Row(f"unintended: {cause.replace('_', ' ')}", numbers, "bold red")
     if link["refused"]:
-        yield _Row("refused: too many clients", _number(link["refused"]), "", "bold red")
+        yield _Row("refused: too many clients", (f"{link['refused']:,}",), "bold red")
     if link["port_unreachable"]:
-        yield _Row("nobody listened (ICMP)", f"≥ {link['port_unreachable']:,}", "", "yellow")
+        yield _Row("port unreachable (ICMP)", (f"≥ {link['port_unreachable']:,}",), "yellow")
     if link["discarded"]:
-        yield _Row("answers discarded, one way", "", _number(link["discarded"]))
+        yield _Row("answers discarded (--one-way)", ("", f"{link['discarded']:,}"))
 
 
-def _some(label: str, forward: int, reverse: int, style: str = "") -> Iterator[_Row]:
-    if forward or reverse:
-        yield _Row(label, _number(forward), _number(reverse), style)
-
-
-def _number(number: int) -> str:
-    return f"{number:,}"
-
-
-def _run(side: DirectionStatistics) -> str:
-    cap = "" if side["mansd"] is None else f" of {side['mansd']:,} allowed"
-    return f"{side['longest_loss_burst']:,}{cap}"
-
-
-def _share(side: DirectionStatistics, which: Literal["lost", "predicted", "realised"]) -> str:
-    return percent_text(side["loss"][which])
+def _number(count: Callable[[DirectionStatistics], int]) -> Callable[[DirectionStatistics], str]:
+    return lambda side: f"{count(side):,}"
 
 
 def _times(times: DelayQuantiles) -> str:

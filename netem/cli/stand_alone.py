@@ -1,4 +1,4 @@
-"""The emulator on its own: from a command line to what it has done."""
+"""The emulator on its own: from a command line to its totals."""
 
 import json
 from collections.abc import Sequence
@@ -14,13 +14,13 @@ from noack.core.errors import ExitStatus
 
 
 def alone(arguments: Sequence[str]) -> ExitStatus:
-    """Run the emulator on its own until Ctrl-C, or explain what it would do.
+    """Run the emulator on its own until Ctrl-C, or explain its settings.
 
     Returns:
-        UNINTENDED_LOSSES if there were any, as the guarantee does not hold then.
+        UNINTENDED_LOSSES if there were any: the guarantee does not hold then.
 
     Raises:
-        CallerError: the command line says something wrong.
+        CallerError: the command line has a mistake.
     """
     parser = command_line.parser()
     relay_run.add_options(parser)

@@ -1,7 +1,7 @@
-"""What other threads ask of the relay's thread, which does it between two batches of datagrams.
+"""Commands that other threads submit and the relay's thread runs between two batches of datagrams.
 
-The packet path waits for nobody: statistics, live control and the view have threads of their own,
-and all that they need of the relay is done here, in microseconds.
+The packet path never waits: statistics, live control and the live screen have threads of their own,
+and each command takes microseconds.
 """
 
 import time
@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
-from netem.engine.relay_interface import Direction, LinkReport, Relay
+from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport, Relay
 from netem.loss_prediction import predicted_loss
 from netem.rule_records import Counters
 from netem.words.settings_to_words import text_of
@@ -27,11 +27,10 @@ _PATIENCE_S = 5.0
 
 @dataclass(frozen=True)
 class AppliedSettings:
-    """What a direction of a link does, and since when."""
+    """The settings of a direction, and its counters when they were applied."""
 
     settings: LinkSettings
     since: Counters
-    """Its counters when these settings came into force."""
 
     @cached_property
     def words(self) -> str:
@@ -45,31 +44,28 @@ class AppliedSettings:
 
 
 class Snapshot(NamedTuple):
-    """What has happened in a relay until now."""
+    """The state of a relay at one time."""
 
     engine: str
     links: Sequence[LinkReport]
     in_force: Mapping[tuple[str, Direction], AppliedSettings]
     elapsed_ns: int
-    """Since the relay began."""
+    """Time since the relay started."""
     unix_ns: int
 
 
 class CommandQueue:
-    """Does in the relay's thread what other threads ask for.
-
-    Args:
-        relay: the relay.
-    """
+    """Runs commands of other threads in the relay's thread."""
 
     def __init__(self, relay: Relay) -> None:
         self._relay = relay
         self._began_ns = time.monotonic_ns()
         self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
-        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {}
-        for spec in relay.specs:
-            self._in_force[spec.name, "forward"] = AppliedSettings(spec.forward, Counters())
-            self._in_force[spec.name, "reverse"] = AppliedSettings(spec.reverse, Counters())
+        self._in_force: dict[tuple[str, Direction], AppliedSettings] = {
+            (spec.name, direction): AppliedSettings(getattr(spec, direction), Counters())
+            for spec in relay.specs
+            for direction in DIRECTIONS
+        }
         self._closed = False
         self._lock = Lock()
 
@@ -78,26 +74,26 @@ class CommandQueue:
         """Names of the relay's links."""
         return [spec.name for spec in self._relay.specs]
 
-    def run(self) -> None:
-        """Do what is waiting; called in the relay's thread, at least every 50 ms."""
+    def run_pending(self) -> None:
+        """Run the submitted commands; called in the relay's thread, at least every 50 ms."""
         for _ in range(self._waiting.qsize()):
-            future, do = self._waiting.get_nowait()
+            future, command = self._waiting.get_nowait()
             if not future.set_running_or_notify_cancel():
                 continue
             try:
-                future.set_result(do())
+                future.set_result(command())
             except Exception as error:
                 future.set_exception(error)
 
     def close(self) -> None:
-        """Refuse what is asked from now on; called in the relay's thread when the relay ends."""
+        """Refuse further commands; called in the relay's thread when the relay ends."""
         with self._lock:
             self._closed = True
         while not self._waiting.empty():
             self._waiting.get_nowait()[0].cancel()
 
-    def ask(self, do: Callable[[], T]) -> T:
-        """Have something done in the relay's thread, from another one, and return its result.
+    def submit(self, command: Callable[[], T]) -> T:
+        """Run a command in the relay's thread, from another thread, and return its result.
 
         Raises:
             PeerError: the relay has ended, or does not answer.
@@ -106,27 +102,27 @@ class CommandQueue:
         with self._lock:
             if self._closed:
                 raise PeerError("the emulator has ended")
-            self._waiting.put((future, do))
+            self._waiting.put((future, command))
         try:
             return future.result(_PATIENCE_S)
         except CancelledError:
             raise PeerError("the emulator has ended") from None
         except TimeoutError:
-            if future.done():  # it was the errand's own
+            if future.done():  # the command itself raised it
                 raise
             future.cancel()
             raise PeerError(f"the emulator has not answered for {_PATIENCE_S:g} s") from None
 
     def snapshot(self) -> Snapshot:
-        """Return what has happened, from another thread.
+        """Return the state of the relay, from another thread.
 
         Raises:
             PeerError: the relay has ended, or does not answer.
         """
-        return self.ask(self.look)
+        return self.submit(self.look)
 
     def look(self) -> Snapshot:
-        """Return what has happened; in the relay's thread, or when the relay has ended."""
+        """Return the state of the relay, in its thread or after its end."""
         return Snapshot(
             self._relay.engine,
             self._relay.report(),
@@ -143,14 +139,12 @@ class CommandQueue:
             PeerError: the relay has ended, or does not answer.
         """
 
-        def do() -> None:
+        def command() -> None:
             for direction in directions:
                 self._relay.change(link, direction, settings)
             (report,) = (one for one in self._relay.report() if one.name == link)
             for direction in directions:
-                changed = report.forward if direction == "forward" else report.reverse
-                self._in_force[link, direction] = AppliedSettings(
-                    settings, replace(changed.counters)
-                )
+                counters = replace(getattr(report, direction).counters)
+                self._in_force[link, direction] = AppliedSettings(settings, counters)
 
-        self.ask(do)
+        self.submit(command)

@@ -1,4 +1,4 @@
-"""The other side of live control: asks a running emulator, and follows its statistics."""
+"""Client of live control: sends queries to a running emulator, and receives its statistics."""
 
 import json
 import time
@@ -23,10 +23,10 @@ class Client:
     """A connection to a running emulator.
 
     Args:
-        session: how to reach it, from :func:`netem.control.emulator_session.find`.
+        session: its address and secret, from :func:`netem.control.emulator_session.find`.
 
     Raises:
-        PeerError: it cannot be reached.
+        PeerError: it does not accept the connection.
     """
 
     def __init__(self, session: Session) -> None:
@@ -47,10 +47,10 @@ class Client:
         self._session.close()  # type: ignore[no-untyped-call]
 
     def ask(self, what: str, **content: Any) -> Any:
-        """Ask ``report``, ``settings`` or ``change``, and return the answer.
+        """Send the query ``report``, ``settings`` or ``change``, and return the answer.
 
         Raises:
-            CallerError: what was asked for is wrong; one line.
+            CallerError: the query has a mistake.
             PeerError: there is no answer.
         """
         payload = json.dumps(content | {"token": self._token})
@@ -68,15 +68,15 @@ class Client:
         """
         key = f"netem/{self._name}/statistics"
         with self._session.declare_subscriber(key, RingChannel(2)) as subscriber:
-            heard_s = time.monotonic()
+            received_s = time.monotonic()
             while not stop():
                 sample = subscriber.try_recv()
                 if sample is not None:
-                    heard_s = time.monotonic()
+                    received_s = time.monotonic()
                     yield cast(Statistics, json.loads(sample.payload.to_string()))
-                elif time.monotonic() < heard_s + _SILENCE_S:
+                elif time.monotonic() < received_s + _SILENCE_S:
                     time.sleep(_POLL_S)
                 elif self._name not in running():
                     raise PeerError(f"emulator {self._name!r} has ended")
                 else:
-                    heard_s = time.monotonic()
+                    received_s = time.monotonic()

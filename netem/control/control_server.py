@@ -1,35 +1,32 @@
 """Live control of a relay over zenoh, on loopback.
 
-A running emulator listens on a free TCP port of the loopback interface and says where in its
-session file (:mod:`netem.control.emulator_session`). Below ``netem/NAME`` it
+A running emulator listens on a free TCP port of the loopback interface. Its session file
+(:mod:`netem.control.emulator_session`) holds the address. Below ``netem/NAME`` it
 
-* answers ``report``: statistics (:mod:`netem.control.emulator_statistics`);
-* answers ``settings``: what each link does, in words and as settings;
-* answers ``change``: new settings for a link, which it checks, and answers as ``settings`` does;
+* answers ``report`` with statistics (:mod:`netem.control.emulator_statistics`);
+* answers ``settings`` with the settings of each link, as words and as a table;
+* answers ``change``: checks and applies new settings of a link, and answers as ``settings`` does;
 * publishes ``statistics`` once a second.
 
-A query is a JSON object. It must hold ``token``, the secret of the session file; ``change`` takes
-``link`` (may be left out if there is one), ``direction`` (``forward``, the default, ``reverse`` or
+A query is a JSON object. It must hold ``token``, the secret of the session file. ``change`` takes
+``link`` (optional if there is one), ``direction`` (``forward``, the default, ``reverse`` or
 ``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
-:class:`~noack.config.impairments.LinkSettings`). As with ``tc qdisc change``, the new settings
-replace the old; files that words name are read before they are sent. What is wrong with a query is
-answered in one line, and nothing is changed.
+:class:`~noack.config.impairments.LinkSettings`). The new settings replace the old ones, as with
+``tc qdisc change``. The client reads files that words name, and sends their content. A query with a
+mistake is answered with one line, and changes nothing.
 
-Nobody without the secret gets in: zenoh's connections ask for it as a password (by challenge and
-response, so that it is never sent), and each query is checked for it again.
+zenoh asks each connection for the secret as a password, by challenge and response, so that the
+secret itself is never sent. Each query is checked for it again.
 
-All of this happens in a thread of its own; see :mod:`netem.control.command_queue`.
+All of this runs in a thread of its own; see :mod:`netem.control.command_queue`.
 """
 
 import hmac
 import json
 import secrets
-import threading
-import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from typing import Any, Literal, Self
 
 import zenoh
@@ -37,33 +34,32 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from zenoh import CongestionControl, Priority
 from zenoh.handlers import RingChannel
 
-from netem.control.command_queue import CommandQueue, Snapshot
+from netem.control.command_queue import CommandQueue
 from netem.control.emulator_session import Session, published
-from netem.control.emulator_statistics import statistics
+from netem.control.emulator_statistics import Statistics
+from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.words.settings_to_words import text_of
 from netem.words.words_to_settings import settings_of
 from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
 from noack.config.validation_messages import brief
-from noack.core.errors import CallerError, MachineError, NoackError, PeerError
+from noack.core.errors import CallerError, MachineError, NoackError
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
 _TOKEN_BYTES = 32
-_POLL_S = 0.02
 _PUBLISH_S = 1.0
 _QUERIES = 64
-"""Of each kind wait at most; the oldest give way."""
-_PATIENCE_S = 10.0
+"""Maximum number of waiting queries of each kind; a new query replaces the oldest."""
 
 
 def secret_of(token: str) -> SessionSecret:
-    """Return what zenoh asks for whoever connects."""
+    """Return the secret for zenoh's connections."""
     return SessionSecret("netem", token)
 
 
 class SettingsChange(BaseModel):
-    """What a query for ``change`` says."""
+    """The content of a ``change`` query."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -80,24 +76,22 @@ class SettingsChange(BaseModel):
 
 
 class ControlServer:
-    """Answers queries about a relay, and changes it, while the context lasts.
+    """Answers queries about a relay, and changes it, within the context.
 
     Args:
         name: the emulator's name.
-        errands: how to reach the relay.
+        commands: gives access to the relay.
 
     Raises:
-        CallerError: the name is unfit or in use.
+        CallerError: the name is not allowed, or in use.
         MachineError: no port can be listened on.
     """
 
     def __init__(self, name: str, commands: CommandQueue) -> None:
         self._name = name
-        self._errands = commands
+        self._commands = commands
         self._token = secrets.token_hex(_TOKEN_BYTES)
-        self._snapshots: deque[Snapshot] = deque(maxlen=2)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._serve, name="netem control", daemon=True)
+        self._thread = StatisticsThread(commands, _PUBLISH_S, self._publish, poll=self._serve)
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -114,9 +108,7 @@ class ControlServer:
                 )
             ]
             stack.enter_context(published(Session(self._name, endpoint, self._token)))
-            self._thread.start()
-            stack.callback(self._thread.join, _PATIENCE_S)
-            stack.callback(self._stopping.set)
+            stack.enter_context(self._thread)
             self._stack = stack.pop_all()
         return self
 
@@ -133,23 +125,14 @@ class ControlServer:
         return f"netem/{self._name}/{what}"
 
     def _serve(self) -> None:
-        """Answer, and publish, until stopped."""
-        publish_s = time.monotonic()
-        while not self._stopping.wait(_POLL_S):
-            for queryable, answer in self._queryables:
-                while (query := queryable.try_recv()) is not None:
-                    self._reply(query, answer)
-            if time.monotonic() >= publish_s:
-                publish_s = max(publish_s + _PUBLISH_S, time.monotonic())
-                with suppress(PeerError):
-                    self._publish()
+        for queryable, answer in self._queryables:
+            while (query := queryable.try_recv()) is not None:
+                self._reply(query, answer)
 
-    def _publish(self) -> None:
-        self._snapshots.append(self._errands.snapshot())
-        before = self._snapshots[0] if len(self._snapshots) > 1 else None
+    def _publish(self, document: Statistics) -> None:
         self._session.put(
             self._key("statistics"),
-            json.dumps(statistics(self._snapshots[-1], before)),
+            json.dumps(document),
             congestion_control=CongestionControl.DROP,
             priority=Priority.BACKGROUND,
         )
@@ -162,12 +145,12 @@ class ControlServer:
             query.reply_err(str(error))
         except Exception as error:
             traceback.print_exc()
-            query.reply_err(f"an error of the emulator's own: {error!r}")
+            query.reply_err(f"internal error of the emulator: {error!r}")
         finally:
             query.drop()  # type: ignore[no-untyped-call]
 
     def _admitted(self, query: zenoh.Query) -> dict[str, Any]:
-        """Return what a query asks for, without its token."""
+        """Return the content of a query without its token."""
         try:
             content = json.loads(query.payload.to_string() if query.payload else "")
             token = content.pop("token")
@@ -179,21 +162,15 @@ class ControlServer:
         return dict(content)
 
     def _report(self, _: Mapping[str, Any]) -> object:
-        before = self._snapshots[0] if self._snapshots else None
-        return statistics(self._errands.snapshot(), before)
+        return self._thread.now()
 
     def _settings(self, _: Mapping[str, Any]) -> object:
-        links = self._errands.snapshot().links
-        return {
-            "links": [
-                {
-                    "name": link.name,
-                    "forward": _settings(link.forward.settings),
-                    "reverse": _settings(link.reverse.settings),
-                }
-                for link in links
-            ]
-        }
+        links = [
+            {"name": link.name}
+            | {name: _settings(getattr(link, name).settings) for name in DIRECTIONS}
+            for link in self._commands.snapshot().links
+        ]
+        return {"links": links}
 
     def _change(self, content: Mapping[str, Any]) -> object:
         try:
@@ -207,18 +184,17 @@ class ControlServer:
         directions: Sequence[Direction] = (
             DIRECTIONS if change.direction == "both" else (change.direction,)
         )
-        link = self._link(change.link)
-        self._errands.change(link, directions, settings)
+        self._commands.change(self._link(change.link), directions, settings)
         return self._settings({})
 
     def _link(self, name: str | None) -> str:
-        names = self._errands.links
+        names = self._commands.links
         if name is None and len(names) == 1:
             return names[0]
         if name is None:
-            raise CallerError(f"which link? There are {', '.join(names)}")
+            raise CallerError(f"which link? Links: {', '.join(names)}")
         if name not in names:
-            raise CallerError(f"no link {name!r}; there are {', '.join(names)}")
+            raise CallerError(f"no link {name!r}; links: {', '.join(names)}")
         return name
 
 
@@ -234,4 +210,4 @@ def _require_read(settings: LinkSettings) -> None:
             file = impairment.file
         else:
             continue
-        raise CallerError(f"{file}: read the file first, and send what it says as settings")
+        raise CallerError(f"{file}: read the file first, and send its content as settings")

@@ -1,4 +1,4 @@
-"""Commands on a running emulator: ``noack netem show``, ``set`` and ``watch``."""
+"""Commands for a running emulator: ``noack netem show``, ``set`` and ``watch``."""
 
 import argparse
 import json
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from netem.control.control_client import Client
 from netem.control.emulator_session import Session, find, running
-from netem.control.live_screen import JsonLines, Screen
+from netem.control.live_screen import Screen
 from netem.control.statistics_history import History
 from netem.control.statistics_view import render
 from netem.engine.relay_interface import DIRECTIONS
@@ -21,11 +21,11 @@ from netem.words.word_examples import require_no_dashes
 from netem.words.words_to_settings import settings_of
 from noack.config.impairment_files import read_files
 from noack.config.impairments import LinkSettings
-from noack.core.errors import CallerError, ExitStatus, NoackError, PeerError
+from noack.core.errors import CallerError, ExitStatus, NoackError
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.signals import Signals
 
-_HELP = "name of the emulator, from its --control; may be left out if only one runs"
+_NAME_HELP = "the emulator's --control NAME; optional if only one runs"
 
 
 def main(arguments: Sequence[str]) -> ExitStatus:
@@ -36,33 +36,43 @@ def main(arguments: Sequence[str]) -> ExitStatus:
     except NoackError as error:
         who, as_json = f"noack netem {command}", "--json" in rest
         return failed(str(error), error.exit_status, who=who, as_json=as_json)
-    except BrokenPipeError:  # who reads has seen enough
+    except BrokenPipeError:  # the reader has closed the pipe
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, sys.stdout.fileno())
         os.close(nothing)
         return ExitStatus.OK
 
 
-def _parser(command: str, description: str, examples: Sequence[str], **more: Any) -> Parser:
-    return Parser(
+def _parser(
+    command: str, description: str, examples: Sequence[str], json_help: str, **more: Any
+) -> Parser:
+    parser = Parser(
         prog=f"noack netem {command}",
         description=description,
         epilog="\n  ".join(["examples:", *examples]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
         **more,
     )
+    parser.add_argument("--control", metavar="NAME", help="the same as NAME")
+    parser.add_argument("--json", action="store_true", help=json_help)
+    return parser
+
+
+def _session(options: argparse.Namespace) -> Session:
+    """Return the session that NAME or --control NAME selects."""
+    if options.control is not None and options.name not in (None, options.control):
+        raise CallerError(f"--control {options.control}: NAME is {options.name} already")
+    return find(options.control or options.name)
 
 
 def _show(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
-        "show",
-        "Show what has happened in a running emulator.",
-        ("noack netem show", "noack netem show dns --json"),
-    )
-    parser.add_argument("name", nargs="?", help=_HELP)
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+        "show", "Show the statistics of a running emulator.",
+        ("noack netem show", "noack netem show dns --json"), "print one JSON document",
+    )  # fmt: skip
+    parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    session = find(options.name)
+    session = _session(options)
     with Client(session) as client:
         statistics = client.ask("report")
     if options.json:
@@ -78,42 +88,41 @@ def _show(arguments: Sequence[str]) -> ExitStatus:
 def _set(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
         "set",
-        "Change what a link of a running emulator does. As with `tc qdisc change`, the words\n"
-        "replace all that the direction did, its cap too.",
+        "Change the impairments of a link of a running emulator. The words replace all settings\n"
+        "of the direction, the cap too, as with `tc qdisc change`.",
         ("noack netem set loss 10% mansd 4", "noack netem set dns --direction both delay 20ms 5ms"),
+        "print the links' settings as JSON",
         usage="%(prog)s [NAME] [--link LINK] [--direction forward|reverse|both] WORDS ...",
     )
-    parser.add_argument("words", nargs="*", metavar="[NAME] WORDS", help="e.g. loss 5%% mansd 4")
-    parser.add_argument("--link", help="may be left out if there is only one")
+    parser.add_argument(
+        "words", nargs="*", metavar="[NAME] WORDS", help="for example loss 5%% mansd 4"
+    )
+    parser.add_argument("--link", help="name of the link; optional if there is only one")
     parser.add_argument(
         "--direction", choices=(*DIRECTIONS, "both"), default="forward", help="default: forward"
     )
-    parser.add_argument("--json", action="store_true", help="print the links' settings as JSON")
     require_no_dashes(arguments)
     options = parser.parse_intermixed_args(arguments)
-    name, settings = _name_and_settings(options.words)
+    options.name, settings = _name_and_settings(options.words)
     settings = read_files(settings, Path())
-    session = find(name)
-    with Client(session) as client:
+    with Client(_session(options)) as client:
         before = client.ask("settings")
         answer = client.ask(
-            "change",
-            link=options.link,
-            direction=options.direction,
+            "change", link=options.link, direction=options.direction,
             settings=settings.model_dump(mode="json"),
-        )
+        )  # fmt: skip
     if options.json:
         print(json.dumps(answer, indent=2), flush=True)
         return ExitStatus.OK
     for link in answer["links"]:
         for direction in DIRECTIONS:
-            words_now = link[direction]["words"] or "nothing is done"
-            print(f"{link['name']} {direction}: {words_now}", flush=True)
-    _tell_lost_caps(before["links"], answer["links"])
+            words = link[direction]["words"] or "no impairment"
+            print(f"{link['name']} {direction}: {words}", flush=True)
+    _warn_of_removed_caps(before["links"], answer["links"])
     return ExitStatus.OK
 
 
-def _tell_lost_caps(
+def _warn_of_removed_caps(
     before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]
 ) -> None:
     for old, new in zip(before, after, strict=True):
@@ -121,25 +130,25 @@ def _tell_lost_caps(
             cap = old[direction]["settings"]["mansd"]
             if cap is not None and new[direction]["settings"]["mansd"] is None:
                 print(
-                    f"noack netem set: {new['name']} {direction} has no cap any more, it had "
-                    f"mansd {cap}; the words replace all that was said before",
+                    f"noack netem set: {new['name']} {direction} has no cap now; the words "
+                    f"replaced all settings, mansd {cap} too",
                     file=sys.stderr, flush=True,
                 )  # fmt: skip
 
 
 def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
-    """Tell the emulator's name, if the words begin with it, from what it shall do."""
+    """Separate the emulator's name, if the words begin with one, from the settings."""
     name, rest = None, words
     if words and words[0] in running():
         name, rest = words[0], words[1:]
     if not rest:
-        raise CallerError("say what the link shall do, e.g. loss 5% mansd 4; or: loss none")
+        raise CallerError("words are missing, for example: loss 5% mansd 4; or: loss none")
     try:
         return name, settings_of(rest)
     except CallerError:
         if name is None:
             with suppress(CallerError):
-                # What follows is understood: the first word is the name of one that does not run.
+                # The rest is valid: the first word is the name of an emulator that does not run.
                 return words[0], settings_of(words[1:])
         raise
 
@@ -147,27 +156,26 @@ def _name_and_settings(words: Sequence[str]) -> tuple[str | None, LinkSettings]:
 def _watch(arguments: Sequence[str]) -> ExitStatus:
     parser = _parser(
         "watch",
-        "Watch a running emulator; where the output is no terminal, a line a second for each\n"
-        "direction of a link that has seen datagrams.",
-        ("noack netem watch", "noack netem watch dns --json"),
-    )
-    parser.add_argument("name", nargs="?", help=_HELP)
-    parser.add_argument("--json", action="store_true", help="print a JSON document a second")
+        "Show a running emulator's statistics live. If the output is not a terminal, print one\n"
+        "line per second for each direction of a link that has received datagrams.",
+        ("noack netem watch", "noack netem watch dns --json"), "print one JSON document per second",
+    )  # fmt: skip
+    parser.add_argument("name", nargs="?", help=_NAME_HELP)
     options = parser.parse_args(arguments)
-    session = find(options.name)
-    ended: PeerError | None = None
-    with Signals().handled() as signals, Client(session) as client:
-        with JsonLines() if options.json else Screen(_title(session)) as screen:
-            screen.show(client.ask("report"))
-            try:
-                for statistics in client.follow(
-                    lambda: screen.look() or signals.received is not None
-                ):
-                    screen.show(statistics)
-            except PeerError as error:
-                ended = error
-        if ended is not None:
-            raise ended
+    session = _session(options)
+    with (
+        Signals().handled() as signals,
+        Client(session) as client,
+        Screen(_title(session), as_json=options.json) as screen,
+    ):
+
+        def stop() -> bool:
+            screen.poll()
+            return screen.quit_requested or signals.received is not None
+
+        screen.show(client.ask("report"))
+        for statistics in client.follow(stop):
+            screen.show(statistics)
     return ExitStatus.OK
 
 
@@ -185,4 +193,4 @@ COMMANDS: Mapping[str, Callable[[Sequence[str]], ExitStatus]] = {
     "set": _set,
     "watch": _watch,
 }
-"""By their names."""
+"""The commands by name."""

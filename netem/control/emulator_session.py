@@ -1,11 +1,11 @@
-"""Session files: where a running emulator can be reached, and the secret that it asks for.
+"""Session files: the address of a running emulator, and its secret.
 
 A file lies in the user's runtime directory, readable by its owner only, while the emulator runs
 (:mod:`noack.runtime.lock_file`).
 """
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,11 +18,11 @@ from noack.runtime.private_folder import require_name
 
 
 class Session(NamedTuple):
-    """How to reach an emulator."""
+    """Address and secret of an emulator."""
 
     name: str
     endpoint: str
-    """zenoh endpoint, e.g. ``tcp/127.0.0.1:7447``."""
+    """zenoh endpoint, for example ``tcp/127.0.0.1:7447``."""
     token: str
     """The secret; see :mod:`netem.control.control_server`."""
 
@@ -32,47 +32,49 @@ _KIND = "netem"
 _STARTING = "netem_starting"
 
 
+def _in_use(name: str) -> CallerError:
+    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
+
+
+@contextmanager
+def _locked(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
+    require_name(name, "emulator")
+    try:
+        with lock_file.lock_file(kind, name, content) as path:
+            yield path
+    except FileExistsError:
+        raise _in_use(name) from None
+
+
 @contextmanager
 def published(session: Session) -> Iterator[Path]:
-    """Keep a session's file while the context lasts.
+    """Keep a session's file within the context.
 
     Raises:
-        CallerError: the name is unfit or in use, or the folder is not the user's own.
+        CallerError: the name is not allowed or in use, or the folder is not the user's own.
     """
-    require_name(session.name, "emulator")
-    with ExitStack() as stack:
-        try:
-            path = stack.enter_context(lock_file.lock_file(_KIND, session.name, session._asdict()))
-        except FileExistsError:
-            raise _in_use(session.name) from None
+    with _locked(_KIND, session.name, session._asdict()) as path:
         yield path
 
 
 @contextmanager
 def starting(name: str | None) -> Iterator[None]:
-    """Let others see that an emulator starts, which may take long; None: nobody can reach it.
+    """Publish that an emulator starts, which may take long; None: it has no name.
 
     Raises:
-        CallerError: the name is unfit or in use, or the folder is not the user's own.
+        CallerError: the name is not allowed or in use, or the folder is not the user's own.
     """
-    with ExitStack() as stack:
-        if name is not None:
-            require_name(name, "emulator")
-            try:
-                stack.enter_context(lock_file.lock_file(_STARTING, name, {}))
-            except FileExistsError:
-                raise _in_use(name) from None
-            if name in running():
-                raise _in_use(name)
+    if name is None:
+        yield
+        return
+    with _locked(_STARTING, name, {}):
+        if name in running():
+            raise _in_use(name)
         yield
 
 
-def _in_use(name: str) -> CallerError:
-    return CallerError(f"--control {name}: an emulator of this name runs; choose another name")
-
-
 def running() -> list[str]:
-    """Return the names of the emulators of this user that can be reached.
+    """Return the names of this user's emulators that accept commands.
 
     Raises:
         CallerError: the folder is open to others.
@@ -91,20 +93,19 @@ def find(name: str | None) -> Session:
     begun = [file.path.stem for file in lock_file.live_lock_files(_STARTING)]
     if name not in files and (name in begun or (name is None and begun and not files)):
         raise PeerError(
-            f"emulator {name or begun[0]!r} is starting; its first start compiles for some time, "
-            "and it says `ready` on its standard output when it can be reached"
+            f"emulator {name or begun[0]!r} is starting; its first start compiles for some time; "
+            "it prints `ready` on standard output when it accepts commands"
         )
     if not files:
+        which = "" if name is None else f" {name!r}"
         raise CallerError(
-            ("no emulator" if name is None else f"no emulator {name!r}")
-            + " runs that can be reached; start one with `noack netem --control NAME …`"
+            f"no emulator{which} accepts commands; start one with `noack netem --control NAME …`"
         )
-    if name is None:
-        if len(files) > 1:
-            raise CallerError(f"which emulator? There are {', '.join(files)}")
-        (name,) = files
-    elif name not in files:
-        raise CallerError(f"no emulator {name!r} runs; there are {', '.join(files)}")
+    if name is None and len(files) > 1:
+        raise CallerError(f"which emulator? Running: {', '.join(files)}")
+    name = name or next(iter(files))
+    if name not in files:
+        raise CallerError(f"no emulator {name!r}; running: {', '.join(files)}")
     try:
         return _SESSION.validate_json(files[name].content, strict=True)
     except ValidationError as error:

@@ -1,6 +1,7 @@
-"""Statistics of a relay as a document of JSON: its keys, and how it is made of reports.
+"""A relay's statistics as a JSON document: its keys, and how reports become a document.
 
-Keys are only ever added. Counts are since the relay began; ``recent`` is since the document before.
+Keys are only ever added. Counts are totals since the relay started; ``recent`` covers the time
+since the previous document.
 """
 
 from datetime import UTC, datetime
@@ -11,17 +12,24 @@ from numpy.typing import NDArray
 
 from netem.control.command_queue import AppliedSettings, Snapshot
 from netem.engine.histogram import coarse, quantile_ns
-from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkReport
+from netem.engine.relay_interface import (
+    DIRECTIONS,
+    Direction,
+    DirectionReport,
+    FlowReport,
+    LinkReport,
+)
 from netem.rule_records import Counters
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import text_of
 
-_WORDS_SHOWN = 200
+_MAX_WORDS = 200
+"""Longer settings are cut to this number of characters."""
 
 
 class DelayQuantiles(TypedDict):
-    """Of a time, in ns; null if there is none to speak of."""
+    """Quantiles of a time in ns; null if nothing was measured."""
 
     p50: int | None
     p99: int | None
@@ -30,30 +38,29 @@ class DelayQuantiles(TypedDict):
 
 
 class LossStatistics(TypedDict):
-    """Share of the datagrams that are not effectively delivered; null if not known."""
+    """Shares of the datagrams since the present settings apply; null if unknown."""
 
     realised: float | None
-    """Since the settings came into force that the direction has now."""
+    """Not effectively delivered: lost, or delivered out of order (stale)."""
     lost: float | None
-    """Of that, what no intact copy leaves of; the rest leaves, but is overtaken."""
+    """No intact copy was forwarded."""
     drawn: float | None
-    """Of that, what the settings drew to be dropped or corrupted; the rest came to a full queue or
-    in a blackout."""
+    """Dropped or corrupted by the settings' random draws, not by a full queue or a blackout."""
     predicted: float | None
-    """What is drawn in the long run; see :mod:`netem.loss_prediction`."""
+    """Expected value of ``drawn``; see :mod:`netem.loss_prediction`."""
 
 
 class RecentRates(TypedDict):
-    """What has happened since the document before."""
+    """Rates since the previous document."""
 
     seconds: float
     arrived_per_s: float
     arrived_bits_per_s: float
-    """Of payload."""
+    """Payload only."""
     forwarded_per_s: float
     forwarded_bits_per_s: float
     loss: float | None
-    """Share of what has arrived that is not effectively delivered."""
+    """Share of the arrived datagrams that was not effectively delivered."""
     delay_ns: DelayQuantiles
     lateness_ns: DelayQuantiles
 
@@ -73,40 +80,39 @@ class DirectionStatistics(TypedDict):
     words: str
     """Its settings in the words of ``tc netem``; long tables are cut."""
     arrived_before: int
-    """Datagrams that had come when these settings were applied; ``loss`` and
-    ``longest_loss_burst`` count from there."""
+    """Datagrams that arrived before these settings applied; ``loss`` and ``longest_loss_burst``
+    count from there."""
     arrived: int
     arrived_bytes: int
     forwarded: int
-    """Datagrams and copies that have left."""
+    """Forwarded datagrams and copies."""
     forwarded_bytes: int
     fates: dict[str, int]
-    """How many datagrams had each fate: ``delivered``, ``dropped`` by a loss model, ``forced`` by
-    the cap, ``corrupted``, ``overflowed``, ``blacked_out``."""
+    """Datagrams by fate: ``delivered``, ``dropped`` by a loss model, ``forced`` by the cap,
+    ``corrupted``, ``overflowed``, ``blacked_out``."""
     duplicated: int
     delivered_out_of_order: int
-    """Left after a newer one of their flow: stale at the receiver."""
+    """Forwarded after a newer datagram of their flow: stale at the receiver."""
     held_back: int
-    """Not let overtake, as that would have broken the guarantee."""
+    """Held back for the guarantee."""
     longest_loss_burst: int
-    """Most successive datagrams of a flow that were not effectively delivered, of those that came
-    since the settings are in force."""
+    """Maximum number of consecutive datagrams of a flow that were not effectively delivered."""
     mansd: int | None
-    """The cap on that; null if there is none."""
+    """The cap on that number (M − 1); null if there is none."""
     loss: LossStatistics
     unintended: dict[str, int]
-    """Unintended losses, by cause; any breaks the guarantee."""
+    """Unintended losses by cause; any of them voids the guarantee."""
     in_flight: int
-    """Datagrams that are delayed, or queue for a bottleneck, now."""
+    """Datagrams that are delayed or wait for a bottleneck now."""
     most_in_flight: int
     flows: list[FlowStatistics]
-    """Those that sent most of the clients that are there now, at most 16."""
+    """The present clients that sent most, at most 16."""
     delay_ns: DelayQuantiles
     """From arrival to departure."""
     lateness_ns: DelayQuantiles
-    """From when a delayed datagram should have left until it did."""
+    """From the scheduled to the actual departure of a delayed datagram."""
     delay_histogram: list[list[int]]
-    """Of each step that is not empty: its shortest time, in ns, and how many there are."""
+    """Lower limit in ns and count of each bin that is not empty."""
     lateness_histogram: list[list[int]]
     recent: RecentRates | None
     """Null in the first document."""
@@ -121,12 +127,12 @@ class LinkStatistics(TypedDict):
     clients: int
     clients_ever: int
     refused: int
-    """Datagrams of more clients than are served."""
+    """Datagrams of clients beyond the maximum number of clients."""
     discarded: int
-    """Answers to a link that takes none; 0 if the system does not count them."""
+    """Answers to a link without a reverse direction; 0 if the system does not count them."""
     port_unreachable: int
-    """How often ICMP said that nobody listens where the server should be; at least so often did a
-    datagram come to nobody."""
+    """ICMP messages that no program listens at the server's port; a lower bound on the datagrams
+    lost there."""
     forward: DirectionStatistics
     reverse: DirectionStatistics
 
@@ -135,9 +141,9 @@ class Statistics(TypedDict):
     """A relay."""
 
     time: str
-    """Wall time, UTC, as in ISO 8601."""
+    """Wall time, UTC, ISO 8601."""
     elapsed_s: float
-    """Since the relay began."""
+    """Time since the relay started."""
     engine: str
     links: list[LinkStatistics]
 
@@ -146,29 +152,26 @@ def statistics(after: Snapshot, before: Snapshot | None = None) -> Statistics:
     """Return the statistics of a relay.
 
     Args:
-        after: what has happened.
-        before: an earlier snapshot of the same relay, for what is recent.
+        after: the state of the relay.
+        before: an earlier snapshot of the same relay, for the recent rates.
     """
     earlier = {link.name: link for link in before.links} if before is not None else {}
     seconds = (after.elapsed_ns - before.elapsed_ns) / NS_PER_S if before is not None else 0.0
+    links = [_link(link, earlier.get(link.name), seconds, after) for link in after.links]
     return {
         "time": datetime.fromtimestamp(after.unix_ns / NS_PER_S, UTC).isoformat(),
         "elapsed_s": after.elapsed_ns / NS_PER_S,
         "engine": after.engine,
-        "links": [
-            _link(link, earlier.get(link.name), seconds, after) for link in after.links
-        ],
-    }  # fmt: skip
+        "links": links,
+    }
 
 
 def _link(
     after: LinkReport, before: LinkReport | None, seconds: float, snapshot: Snapshot
 ) -> LinkStatistics:
-    def direction(
-        name: Direction, report: DirectionReport, old: DirectionReport | None
-    ) -> DirectionStatistics:
-        key = (after.name, name)
-        return _direction(report, snapshot.in_force[key], old, seconds)
+    def direction(name: Direction) -> DirectionStatistics:
+        in_force = snapshot.in_force[after.name, name]
+        return _direction(getattr(after, name), in_force, getattr(before, name, None), seconds)
 
     return {
         "name": after.name,
@@ -179,8 +182,8 @@ def _link(
         "refused": after.refused,
         "discarded": after.discarded,
         "port_unreachable": after.port_unreachable,
-        "forward": direction("forward", after.forward, before.forward if before else None),
-        "reverse": direction("reverse", after.reverse, before.reverse if before else None),
+        "forward": direction("forward"),
+        "reverse": direction("reverse"),
     }
 
 
@@ -192,7 +195,7 @@ def _direction(
 ) -> DirectionStatistics:
     counters, since, words = report.counters, in_force.since, in_force.words
     return {
-        "words": words if len(words) <= _WORDS_SHOWN else words[: _WORDS_SHOWN - 1] + "…",
+        "words": words if len(words) <= _MAX_WORDS else words[: _MAX_WORDS - 1] + "…",
         "arrived_before": since.arrived,
         "arrived": counters.arrived,
         "arrived_bytes": counters.arrived_bytes,
@@ -237,16 +240,16 @@ def _recent(after: DirectionReport, before: DirectionReport, seconds: float) -> 
 
 
 def unintended(totals: Statistics) -> int:
-    """Return how many datagrams were lost unintentionally in all links."""
-    directions = [link[side] for link in totals["links"] for side in ("forward", "reverse")]
+    """Return the number of unintended losses of all links."""
+    directions = [link[name] for link in totals["links"] for name in DIRECTIONS]
     return sum(sum(direction["unintended"].values()) for direction in directions)
 
 
 def loss_share(after: Counters, before: Counters) -> float | None:
-    """Return the share of what came between that was not effectively delivered; None if nothing.
+    """Return the share of the arrived datagrams that was not effectively delivered.
 
-    What was overtaken is not effectively delivered. It shows when it leaves, so that in a short
-    time more may be lost than came: the share is at most 1.
+    None if no datagram arrived. A stale datagram counts when it is forwarded, so that more may be
+    lost than arrived in a short time; the share is at most 1.
     """
     arrived = after.arrived - before.arrived
     if arrived == 0:
@@ -260,24 +263,18 @@ def _effective(counters: Counters) -> int:
 
 
 def _share(after: Counters, before: Counters, *fates: str) -> float | None:
-    """Return the share of what came between that had one of some fates; None if nothing came."""
+    """Return the share of the arrived datagrams with one of these fates; None if none arrived."""
     arrived = after.arrived - before.arrived
-    if arrived == 0:
-        return None
     lost: int = sum(getattr(after, fate) - getattr(before, fate) for fate in fates)
-    return lost / arrived
+    return lost / arrived if arrived else None
 
 
 def quantiles(counts: NDArray[np.int64]) -> DelayQuantiles:
     """Return quantiles of a histogram of :mod:`netem.engine.histogram`."""
     if not counts.any():
         return {"p50": None, "p99": None, "p999": None, "max": None}
-    return {
-        "p50": round(quantile_ns(counts, 0.5)),
-        "p99": round(quantile_ns(counts, 0.99)),
-        "p999": round(quantile_ns(counts, 0.999)),
-        "max": round(quantile_ns(counts, 1.0)),
-    }
+    p50, p99, p999, largest = (round(quantile_ns(counts, q)) for q in (0.5, 0.99, 0.999, 1.0))
+    return {"p50": p50, "p99": p99, "p999": p999, "max": largest}
 
 
 def _flow(flow: FlowReport) -> FlowStatistics:

@@ -1,4 +1,4 @@
-"""The view, drawn live: in full on a terminal, as lines of text on anything else."""
+"""The live screen: a full picture on a terminal, lines of text or JSON on any other output."""
 
 import contextlib
 import io
@@ -25,16 +25,18 @@ _MESSAGES_SHOWN = 3
 
 
 class Screen:
-    """Shows statistics while the context lasts; the last picture stays when it ends.
+    """Shows statistics within the context; the last picture remains afterwards.
 
-    What others write to standard error meanwhile is shown below, and written at the end.
+    Messages on standard error are shown below the picture, and written at the end.
 
     Args:
-        title: of the emulator.
+        title: name of the emulator.
+        as_json: print each document as a line of JSON instead.
     """
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, *, as_json: bool = False) -> None:
         self._title = title
+        self._as_json = as_json
         self._console = Console()
         self._history = History()
         self._live: Live | None = None
@@ -42,24 +44,21 @@ class Screen:
         self._messages = _Messages()
         self._keys = False
         self._stack = ExitStack()
-        self.left = False
-        """Whether the person has pressed q."""
+        self.quit_requested = False
+        """Whether the user has pressed q."""
 
     def __enter__(self) -> Self:
-        if self._console.is_terminal and not self._console.is_dumb_terminal:
+        if self._console.is_terminal and not self._console.is_dumb_terminal and not self._as_json:
             with ExitStack() as stack:
                 stack.callback(self._leave)
                 stack.enter_context(contextlib.redirect_stderr(self._messages))
                 self._keys = stack.enter_context(_single_keys())
                 self._live = stack.enter_context(
                     Live(
-                        console=self._console,
-                        screen=True,
-                        auto_refresh=False,
-                        redirect_stdout=False,
-                        redirect_stderr=False,
+                        console=self._console, screen=True, auto_refresh=False,
+                        redirect_stdout=False, redirect_stderr=False,
                     )
-                )
+                )  # fmt: skip
                 self._stack = stack.pop_all()
             self._draw()
         return self
@@ -68,23 +67,24 @@ class Screen:
         self._stack.close()
 
     def show(self, statistics: Statistics) -> None:
-        """Show newer statistics."""
-        if self._live is not None:
+        """Show new statistics."""
+        if self._as_json:
+            print(json.dumps(statistics), flush=True)
+        elif self._live is None:
+            print("\n".join(plain_lines(statistics)), flush=True)
+        else:
             self._history.add(statistics)
             self._draw()
-        else:
-            print("\n".join(plain_lines(statistics)), flush=True)
 
-    def look(self) -> bool:
-        """Look at keyboard and size of the terminal; return whether the person wants to leave."""
+    def poll(self) -> None:
+        """Read the keyboard, and draw again if the terminal's size has changed."""
         while self._keys and select.select([sys.stdin], (), (), 0)[0]:
             keys = os.read(sys.stdin.fileno(), 64)
             self._keys = bool(keys)
-            self.left = self.left or b"q" in keys.lower()
+            self.quit_requested |= b"q" in keys.lower()
         if self._live is not None and self._console.size != self._size:
             self._size = self._console.size
             self._draw()
-        return self.left
 
     def _draw(self) -> None:
         assert self._live is not None
@@ -100,24 +100,6 @@ class Screen:
             self._console.print(render(self._history, self._title, self._console.width, None))
         for message in self._messages.lines:
             print(message, file=sys.stderr)
-
-
-class JsonLines:
-    """Stands in for a :class:`Screen` where a program reads: a line of JSON each time."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def show(self, statistics: Statistics) -> None:
-        """Write newer statistics."""
-        print(json.dumps(statistics), flush=True)
-
-    def look(self) -> bool:
-        """Nobody presses a key."""
-        return False
 
 
 class _Messages(io.TextIOBase):
@@ -138,7 +120,7 @@ class _Messages(io.TextIOBase):
 
 @contextlib.contextmanager
 def _single_keys() -> Iterator[bool]:
-    """Take keys as they are pressed, and unseen; yield whether there is a keyboard."""
+    """Read keys at once and without echo; yield whether there is a keyboard."""
     if not sys.stdin.isatty():
         yield False
         return

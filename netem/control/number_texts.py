@@ -1,4 +1,4 @@
-"""Figures as a person reads them: numbers with units, small charts of blocks."""
+"""Numbers with units, and small charts of block characters, as the terminal shows them."""
 
 from collections.abc import Sequence
 
@@ -13,20 +13,12 @@ def rate_text(per_s: float) -> str:
 
 def bits_text(bits_per_s: float) -> str:
     """Bits per second, with three digits."""
-    for unit, size in (("Gbit/s", 1e9), ("Mbit/s", 1e6), ("kbit/s", 1e3)):
-        if bits_per_s >= 0.9995 * size:
-            return f"{_three_digits(bits_per_s / size)} {unit}"
-    return f"{bits_per_s:.0f} bit/s"
+    return _with_unit(bits_per_s, ("Gbit/s", "Mbit/s", "kbit/s", "bit/s"))
 
 
 def time_text(t_ns: float | None) -> str:
     """A duration, with three digits."""
-    if t_ns is None:
-        return NONE
-    for unit, size in (("s", 1e9), ("ms", 1e6), ("µs", 1e3)):
-        if t_ns >= 0.9995 * size:
-            return f"{_three_digits(t_ns / size)} {unit}"
-    return f"{t_ns:.0f} ns"
+    return NONE if t_ns is None else _with_unit(t_ns, ("s", "ms", "µs", "ns"))
 
 
 def percent_text(share: float | None) -> str:
@@ -36,9 +28,9 @@ def percent_text(share: float | None) -> str:
     percent = 100 * share
     if percent == 0 or percent >= 99.995:
         return f"{percent:.0f} %"
-    return f"{percent:.1f} %" if percent >= 9.995 else f"{percent:.2g} %" if (
-        percent < 0.0995
-    ) else f"{percent:.2f} %"  # fmt: skip
+    if percent < 0.0995:
+        return f"{percent:.2g} %"
+    return f"{percent:.1f} %" if percent >= 9.995 else f"{percent:.2f} %"
 
 
 def elapsed_text(elapsed_s: float) -> str:
@@ -49,12 +41,10 @@ def elapsed_text(elapsed_s: float) -> str:
 
 
 def sparkline(values: Sequence[float | None], top: float) -> str:
-    """Return one block for each value: of full height at ``top``, none where there is no value."""
-    if top <= 0:
-        top = 1.0
+    """Return one block per value: of full height at ``top``, blank where there is no value."""
     last = len(_BLOCKS) - 1
     return "".join(
-        " " if value is None else _BLOCKS[min(max(round(value / top * last), 0), last)]
+        " " if value is None else _BLOCKS[min(max(round(value / (top or 1.0) * last), 0), last)]
         for value in values
     )
 
@@ -65,7 +55,11 @@ def bar(share: float, width: int) -> tuple[str, str]:
     return "━" * filled, "─" * (width - filled)
 
 
-def _three_digits(value: float) -> str:
-    return (
-        f"{value:.0f}" if value >= 99.95 else f"{value:.1f}" if value >= 9.995 else f"{value:.2f}"
-    )
+def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
+    """Write a value with three digits in units of 10⁹, 10⁶, 10³ or 1."""
+    for unit, size in zip(units, (1e9, 1e6, 1e3), strict=False):
+        if value >= 0.9995 * size:
+            part = value / size
+            digits = 0 if part >= 99.95 else 1 if part >= 9.995 else 2
+            return f"{part:.{digits}f} {unit}"
+    return f"{value:.0f} {units[-1]}"

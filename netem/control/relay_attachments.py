@@ -1,66 +1,64 @@
-"""What watches and changes a relay, at its side while it runs: options, threads, housekeeping."""
+"""What watches and changes a relay while it runs: live control, statistics lines, live screen."""
 
 import argparse
 import math
 import sys
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from netem.control.command_queue import CommandQueue, Snapshot
+from netem.control.command_queue import CommandQueue
 from netem.control.control_server import ControlServer
-from netem.control.emulator_statistics import statistics
 from netem.control.live_screen import Screen
-from netem.control.statistics_lines import StatisticsLines
+from netem.control.statistics_lines import statistics_lines
+from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import Relay
-from noack.core.errors import CallerError, PeerError
+from noack.core.errors import CallerError
 
 _VIEW_S = 1.0
-_LOOK_S = 0.05
-_PATIENCE_S = 2.0
+_POLL_S = 0.05
 _SWITCH_S = 0.0002
-"""How long another thread may keep the interpreter while the relay's wants it."""
+"""Longest time for which another thread keeps the interpreter while the relay's thread waits."""
 
 
 class Options(NamedTuple):
     """How a relay is watched and changed."""
 
     name: str | None = None
-    """Under which it can be reached while it runs; None: not at all."""
+    """Name for live control; None: no live control."""
     stats_s: float | None = None
-    """Between two lines of statistics; None for no lines."""
+    """Time between two lines of statistics; None: no lines."""
     stats_file: Path | None = None
-    """Where the lines go; None: to the standard output."""
+    """File for the lines; None: standard output."""
     view: bool = False
-    """Show it in the terminal."""
+    """Show live statistics in the terminal."""
 
     @property
     def takes_output(self) -> bool:
-        """Whether the standard output is a view's, or of lines of statistics."""
+        """Whether the live screen or the lines of statistics use standard output."""
         return self.view or (self.stats_s is not None and self.stats_file is None)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options on watching a relay to a command line."""
-    group = parser.add_argument_group("to watch it, and change it while it runs")
+    """Add the options for watching and changing a relay to a command line."""
+    group = parser.add_argument_group("watch it, and change it while it runs")
     group.add_argument(
-        "--control", metavar="NAME", help="let `noack netem show|set|watch NAME` reach it"
-    )
+        "--control", metavar="NAME", help="accept `noack netem show|set|watch NAME`"
+    )  # fmt: skip
     group.add_argument(
-        "--stats", metavar="SECONDS", type=float, help="print statistics as JSON lines, so often"
-    )
-    group.add_argument("--stats-file", metavar="FILE", help="write them there instead")
-    group.add_argument("--view", action="store_true", help="show it live in this terminal")
+        "--stats", metavar="SECONDS", type=float,
+        help="print statistics as JSON lines every SECONDS",
+    )  # fmt: skip
+    group.add_argument("--stats-file", metavar="FILE", help="write these lines to FILE instead")
+    group.add_argument("--view", action="store_true", help="show live statistics in this terminal")
 
 
 def options_of(parsed: argparse.Namespace) -> Options:
-    """Return what the options of :func:`add_options` say.
+    """Return the options of :func:`add_options`.
 
     Raises:
-        CallerError: they do not go together.
+        CallerError: they contradict each other.
     """
     stats_s, file = parsed.stats, parsed.stats_file
     if stats_s is not None and not (math.isfinite(stats_s) and stats_s >= 0.01):
@@ -68,83 +66,53 @@ def options_of(parsed: argparse.Namespace) -> Options:
     if file is not None and stats_s is None:
         stats_s = 1.0
     if parsed.view and stats_s is not None and file is None:
-        raise CallerError("--view and --stats both want the terminal; give --stats-file FILE")
+        raise CallerError("--view and --stats both use standard output; add --stats-file FILE")
     return Options(parsed.control, stats_s, Path(file) if file is not None else None, parsed.view)
 
 
-class AttachedTaps:
-    """What the relay's thread has to know of those at its side."""
+class AttachedRelay:
+    """What the relay's thread needs of the threads that watch it.
 
-    def __init__(self, commands: CommandQueue) -> None:
-        self._errands = commands
-        self.left = False
-        """Whether the person at the terminal wants to end."""
+    Args:
+        commands: run in the relay's thread, at least every 50 ms.
+        screen: the live screen, if there is one.
+    """
 
-    def look(self) -> Snapshot:
-        """What has happened; in the relay's thread, or when the relay has ended."""
-        return self._errands.look()
+    def __init__(self, commands: CommandQueue, screen: Screen | None) -> None:
+        self.commands = commands
+        self._screen = screen
 
-    def housekeeping(self) -> None:
-        """Serve them; called in the relay's thread at least every 50 ms."""
-        self._errands.run()
+    @property
+    def quit_requested(self) -> bool:
+        """Whether the user has pressed q on the live screen."""
+        return self._screen is not None and self._screen.quit_requested
 
 
 @contextmanager
-def attached(relay: Relay, options: Options) -> Iterator[AttachedTaps]:
-    """Watch a relay while the context lasts, in which it runs; it is closed after that.
+def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
+    """Watch a relay that runs within the context and is closed after it.
 
-    Enter before the relay's thread takes real-time settings, which new threads would inherit.
+    Enter the context before the relay's thread applies real-time settings: new threads would
+    inherit them.
 
     Raises:
         CallerError: an option is wrong.
-        MachineError: the live control cannot be opened.
+        MachineError: live control cannot be opened.
     """
     commands = CommandQueue(relay)
-    side = AttachedTaps(commands)
+    screen = None
     with ExitStack() as stack:
         if options.stats_s is not None:
-            stack.enter_context(StatisticsLines(commands, options.stats_s, options.stats_file))
+            stack.enter_context(statistics_lines(commands, options.stats_s, options.stats_file))
         if options.name is not None:
             stack.enter_context(ControlServer(options.name, commands))
         if options.view:
-            stack.enter_context(_view(commands, side, options.name))
+            title = "noack netem" if options.name is None else f"noack netem {options.name}"
+            screen = stack.enter_context(Screen(title))
+            stack.enter_context(
+                StatisticsThread(commands, _VIEW_S, screen.show, poll=screen.poll, poll_s=_POLL_S)
+            )
         stack.callback(commands.close)
-        stack.enter_context(_short_turns())
-        yield side
-
-
-@contextmanager
-def _view(commands: CommandQueue, side: AttachedTaps, name: str | None) -> Iterator[None]:
-    stopping = threading.Event()
-    with Screen(f"noack netem {name}" if name is not None else "noack netem") as screen:
-
-        def run() -> None:
-            before: Snapshot | None = None
-            due_s = time.monotonic()
-            while not stopping.wait(_LOOK_S):
-                side.left = screen.look()
-                if time.monotonic() < due_s:
-                    continue
-                due_s = max(due_s + _VIEW_S, time.monotonic())
-                with suppress(PeerError):
-                    snapshot = commands.snapshot()
-                    screen.show(statistics(snapshot, before))
-                    before = snapshot
-
-        thread = threading.Thread(target=run, name="view", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            stopping.set()
-            thread.join(_PATIENCE_S)
-
-
-@contextmanager
-def _short_turns() -> Iterator[None]:
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(_SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_S)
+        yield AttachedRelay(commands, screen)

@@ -1,83 +1,67 @@
-"""Statistics as JSON lines: one object (``emulator_statistics``) per line, at intervals."""
+"""Statistics as JSON lines: one document of ``emulator_statistics`` per line, at intervals."""
 
 import json
 import os
 import sys
-import threading
-import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Self, TextIO
+from typing import TextIO
 
-from netem.control.command_queue import CommandQueue, Snapshot
-from netem.control.emulator_statistics import statistics
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics
+from netem.control.statistics_thread import StatisticsThread
 from netem.standard_error import say
-from noack.core.errors import CallerError, PeerError
-
-_PATIENCE_S = 2.0
+from noack.core.errors import CallerError
 
 
-class StatisticsLines:
-    """Writes a line at once, every ``period_s``, and at the end of the context.
+@contextmanager
+def statistics_lines(commands: CommandQueue, period_s: float, path: Path | None) -> Iterator[None]:
+    """Write a line at once, every ``period_s``, and at the end of the context.
 
-    It writes in a thread of its own. If that fails, a line on standard error says so, and the relay
-    goes on.
+    If a line cannot be written, a message on standard error reports it, and the relay continues.
 
     Args:
-        errands: how to reach the relay; the context ends after they are closed.
-        period_s: between two lines.
-        path: a file, which is replaced; None for the standard output.
+        commands: gives access to the relay; closed before the context ends.
+        period_s: time between two lines.
+        path: a file, which is replaced; None for standard output.
 
     Raises:
         CallerError: the file cannot be opened.
     """
+    try:
+        file = sys.stdout if path is None else path.open("w")
+    except OSError as error:
+        raise CallerError(f"--stats-file {path}: cannot be written ({error.strerror})") from None
+    writer = _LineWriter(file, "standard output" if path is None else str(path))
+    try:
+        with StatisticsThread(commands, period_s, writer.write, at_end=True):
+            yield
+    finally:
+        if path is not None:
+            file.close()
 
-    def __init__(self, commands: CommandQueue, period_s: float, path: Path | None) -> None:
-        self._errands = commands
-        self._period_s = period_s
-        self._name = "the standard output" if path is None else str(path)
+
+class _LineWriter:
+    def __init__(self, file: TextIO, name: str) -> None:
+        self._file = file
+        self._name = name
+        self._failed = False
+
+    def write(self, document: Statistics) -> None:
+        """Write a line, unless an earlier one failed."""
+        if self._failed:
+            return
         try:
-            self._file: TextIO = sys.stdout if path is None else path.open("w")
+            self._file.write(json.dumps(document) + "\n")
+            self._file.flush()
         except OSError as error:
-            raise CallerError(
-                f"--stats-file {path}: cannot be written ({error.strerror})"
-            ) from None
-        self._before: Snapshot | None = None
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="statistics", daemon=True)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stopping.set()
-        self._thread.join(_PATIENCE_S)
-
-    def _run(self) -> None:
-        try:
-            self._write_lines()
-        except OSError as error:
+            self._failed = True
             say(
-                f"statistics can no longer be written to {self._name} ({error.strerror}); "
-                "the relay goes on"
+                f"statistics cannot be written to {self._name} ({error.strerror}); "
+                "the relay continues"
             )
-            # What is left in the buffer must not fail again.
+            # Closing the file writes the buffer once more, which must not fail.
             nothing = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nothing, self._file.fileno())
             os.close(nothing)
-        if self._file is not sys.stdout:
-            self._file.close()
-
-    def _write_lines(self) -> None:
-        due_s = time.monotonic()
-        while not self._stopping.wait(max(due_s - time.monotonic(), 0)):
-            due_s = max(due_s + self._period_s, time.monotonic())
-            with suppress(PeerError):
-                self._write(self._errands.snapshot())
-        self._write(self._errands.look())
-
-    def _write(self, snapshot: Snapshot) -> None:
-        self._file.write(json.dumps(statistics(snapshot, self._before)) + "\n")
-        self._file.flush()
-        self._before = snapshot

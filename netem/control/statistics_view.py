@@ -1,11 +1,11 @@
-"""An emulator's statistics as a picture in the terminal.
+"""An emulator's statistics as a picture in the terminal, and as lines of text.
 
-Drawn in full if there is room: a panel for each link with its two directions side by side. With
-more links than fit, a table with a line for each direction.
+Each link has a panel with its two directions side by side. If the terminal has no room for all
+panels, a table has one row per direction.
 """
 
+import textwrap
 from collections.abc import Callable, Sequence
-from typing import Literal
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -16,7 +16,6 @@ from netem.control.emulator_statistics import (
     DelayQuantiles,
     DirectionStatistics,
     LinkStatistics,
-    RecentRates,
     Statistics,
 )
 from netem.control.number_texts import (
@@ -37,7 +36,7 @@ _LABEL_WIDTH = 9
 _FRAME_WIDTH = 4
 _WORDS_LINES = 3
 _CHART_WIDTH = 20
-_LEAST_CHART_WIDTH = 8
+_MIN_CHART_WIDTH = 8
 _LOST = ("dropped", "corrupted", "overflowed", "blacked_out")
 
 
@@ -46,164 +45,153 @@ def render(history: History, title: str, width: int, height: int | None) -> Rend
 
     Args:
         history: the statistics.
-        title: of the emulator.
-        width: columns of the terminal, for the charts.
-        height: its lines; None for as many as are needed.
+        title: name of the emulator.
+        width: columns of the terminal.
+        height: lines of the terminal; None: no limit.
     """
-    statistics = history.latest
-    if statistics is None:
+    latest = history.latest
+    if latest is None:
         return Text(f"{title}: waiting for statistics", style="dim")
+    heading = Text.assemble(
+        (f" {title}", "bold"), (f"  {elapsed_text(latest['elapsed_s'])}, {latest['engine']}", "dim")
+    )
     column = (width - _FRAME_WIDTH - _LABEL_WIDTH - 2) // 2
-    panels = [_panel(history, link, column) for link in statistics["links"]]
-    needed = 1 + sum(lines for _, lines in panels)
-    if height is None or needed <= height:
-        return Group(_heading(statistics, title), *(panel for panel, _ in panels))
-    return Group(_heading(statistics, title), _table(history, statistics, width, height - 3))
-
-
-def _heading(statistics: Statistics, title: str) -> Text:
-    heading = Text(" ")
-    heading.append(title, style="bold")
-    heading.append(f"  {elapsed_text(statistics['elapsed_s'])}, {statistics['engine']}", "dim")
-    return heading
+    panels = [_panel(history, link, column) for link in latest["links"]]
+    if height is None or 1 + sum(lines for _, lines in panels) <= height:
+        return Group(heading, *(panel for panel, _ in panels))
+    return Group(heading, _table(history, latest, width, height - 3))
 
 
 def _panel(history: History, link: LinkStatistics, column: int) -> tuple[RenderableType, int]:
-    """Return a link's panel, and of how many lines it is."""
+    """Return a link's panel and its number of lines."""
     grid = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
     grid.add_column(width=_LABEL_WIDTH, style="dim")
     for _ in DIRECTIONS:
         grid.add_column(width=column)
-    columns = [_cells(history, link["name"], name, link[name], column) for name in DIRECTIONS]
     lines = 2
-    for (label, forward), (_, reverse) in zip(*columns, strict=True):
-        grid.add_row(label, forward, reverse)
-        lines += max(_lines(forward), _lines(reverse))
+    forward, reverse = (_cells(history, link, name, column) for name in DIRECTIONS)
+    for (label, left), (_, right) in zip(forward, reverse, strict=True):
+        grid.add_row(label, left, right)
+        lines += 1 + max(cell.plain.count("\n") for cell in (left, right))
     unintended = _unintended(link)
-    content: RenderableType = grid
-    if unintended is not None:
-        content = Group(grid, unintended)
-        lines += 1
     title = Text.assemble(
         (link["name"], "bold"), f"  {link['listen']} → {link['to']}  ",
         (_clients_text(link), "dim"),
     )  # fmt: skip
-    style = "blue" if unintended is None else "red"
-    return Panel(content, title=title, title_align="left", border_style=style), lines
-
-
-def _lines(cell: Text) -> int:
-    return cell.plain.count("\n") + 1
+    panel = Panel(
+        Group(grid, *unintended), title=title, title_align="left",
+        border_style="red" if unintended else "blue",
+    )  # fmt: skip
+    return panel, lines + len(unintended)
 
 
 def _clients_text(link: LinkStatistics) -> str:
     text = f"{link['clients']} client{'' if link['clients'] == 1 else 's'}"
     if link["refused"]:
         text += f", {link['refused']:,} datagrams refused"
-    unheard = link["port_unreachable"]
-    return f"{text}, {unheard:,} times nobody listened" if unheard else text
+    if link["port_unreachable"]:
+        text += f", port unreachable {link['port_unreachable']:,} times"
+    return text
 
 
-def _unintended(link: LinkStatistics) -> Text | None:
-    """Return the line on unintended losses, if there are any."""
+def _unintended(link: LinkStatistics) -> list[Text]:
+    """Return the line about unintended losses, if there are any."""
     causes = [
         f"{number:,} {cause.replace('_', ' ')} ({name})"
         for name in DIRECTIONS
         for cause, number in link[name]["unintended"].items()
         if number
     ]
-    if not causes:
-        return None
-    return Text(
-        f"unintended losses: {', '.join(causes)}", "bold white on red", no_wrap=True,
-        overflow="ellipsis",
-    )  # fmt: skip
+    text = f"unintended losses: {', '.join(causes)}"
+    style = "bold white on red"
+    return [Text(text, style, no_wrap=True, overflow="ellipsis")] if causes else []
 
 
 def _cells(
-    history: History, link: str, direction: Direction, of: DirectionStatistics, width: int
+    history: History, link: LinkStatistics, direction: Direction, width: int
 ) -> list[tuple[str, Text]]:
-    """Return the rows of a direction, each with its label."""
-    recent = of["recent"]
-    arrivals = history.series(link, direction, lambda recent: recent["arrived_per_s"], width)
-    departures = history.series(link, direction, lambda recent: recent["forwarded_per_s"], width)
-    losses = history.series(link, direction, lambda recent: recent["loss"], width)
-    top = _top([*arrivals, *departures])
-    loss, delay, late = of["loss"], of["delay_ns"], of["lateness_ns"]
+    """Return the label and the text of each row of a direction."""
+    of = link[direction]
+
+    def series(key: str) -> Sequence[float | None]:
+        return history.series(link["name"], direction, key, width)
+
+    arrivals, departures = series("arrived_per_s"), series("forwarded_per_s")
+    losses, top = series("loss"), _top([*arrivals, *departures])
+    recent, delay, late = of["recent"], of["delay_ns"], of["lateness_ns"]
     if recent is not None and recent["delay_ns"]["p50"] is not None:
         delay, late = recent["delay_ns"], recent["lateness_ns"]
     return [
         ("", Text(_ARROWS[direction], "bold cyan")),
-        ("", _wrapped(of["words"] or "nothing is done", width)),
-        ("in", _flow(recent, "arrived_per_s", "arrived_bits_per_s", width)),
+        ("", _wrapped(of["words"] or "no impairment", width)),
+        ("received", Text(_flow(of, "arrived"))),
         ("", Text(sparkline(arrivals, top), "green")),
-        ("out", _flow(recent, "forwarded_per_s", "forwarded_bits_per_s", width)),
+        ("forwarded", Text(_flow(of, "forwarded"))),
         ("", Text(sparkline(departures, top), "green")),
-        ("loss", _loss(of)),
-        ("", Text(sparkline(losses, _top([*losses, loss["predicted"]])), "yellow")),
-        ("drawn", _drawn(of)),
+        ("loss", Text(_loss(of))),
+        ("", Text(sparkline(losses, _top([*losses, of["loss"]["predicted"]])), "yellow")),
+        ("drawn", Text(_drawn(of))),
         ("lost", _wrapped(_lost_text(of), width)),
-        ("run", _run(of, width)),
-        ("delay", _times(delay, width)),
-        ("lateness", _times(late, width)),
-        ("under way", Text(f"{of['in_flight']:,}  (most {of['most_in_flight']:,})")),
+        ("burst", _burst(of, width)),
+        ("delay", Text(_times(delay, width))),
+        ("lateness", Text(_times(late, width))),
+        ("in flight", Text(f"{of['in_flight']:,}, max {of['most_in_flight']:,}")),
     ]
 
 
-def _flow(
-    recent: RecentRates | None,
-    datagrams: Literal["arrived_per_s", "forwarded_per_s"],
-    bits: Literal["arrived_bits_per_s", "forwarded_bits_per_s"],
-    width: int,
-) -> Text:
-    if recent is None:
-        return Text(NONE)
-    rate, volume = rate_text(recent[datagrams]), bits_text(recent[bits])
-    gap = min(13 - len(rate), width - len(rate) - len(volume))
-    return Text.assemble((rate, "bold"), " " * max(gap, 1), volume)
+def _rate(of: DirectionStatistics, key: str) -> str:
+    recent = of["recent"]
+    return NONE if recent is None else rate_text(recent[key])  # type: ignore[literal-required]
 
 
-def _times(times: DelayQuantiles, width: int) -> Text:
+def _flow(of: DirectionStatistics, key: str) -> str:
+    """Return a recent rate in datagrams and in bits per second."""
+    recent = of["recent"]
+    bits = "" if recent is None else bits_text(recent[f"{key}_bits_per_s"])  # type: ignore[literal-required]
+    return f"{_rate(of, f'{key}_per_s')}  {bits}".strip()
+
+
+def _times(times: DelayQuantiles, width: int) -> str:
     if times["p50"] is None:
-        return Text(NONE)
+        return NONE
     text = f"p50 {time_text(times['p50']):<9} p99 {time_text(times['p99'])}"
-    return Text(text if len(text) <= width else text.removeprefix("p50 ").replace("  ", " "))
+    return text if len(text) <= width else text.removeprefix("p50 ").replace("  ", " ")
 
 
 def _top(values: Sequence[float | None]) -> float:
     return max((value for value in values if value is not None), default=0.0)
 
 
-def _loss(of: DirectionStatistics) -> Text:
-    loss = of["loss"]
-    text = Text(percent_text(loss["lost"]), "bold")
-    if loss["realised"] != loss["lost"]:
-        text.append(f"  {percent_text(loss['realised'])} with what is stale", "dim")
-    return text
+def _loss(of: DirectionStatistics) -> str:
+    lost, realised = of["loss"]["lost"], of["loss"]["realised"]
+    stale = f", with stale {percent_text(realised)}" if realised != lost else ""
+    return percent_text(lost) + stale
 
 
-def _drawn(of: DirectionStatistics) -> Text:
-    loss = of["loss"]
-    text = Text(percent_text(loss["drawn"]))
-    if loss["predicted"] is not None:
-        text.append(f"  {percent_text(loss['predicted'])} predicted", "dim")
-    return text
+def _drawn(of: DirectionStatistics) -> str:
+    drawn, predicted = of["loss"]["drawn"], of["loss"]["predicted"]
+    expected = "" if predicted is None else f", predicted {percent_text(predicted)}"
+    return percent_text(drawn) + expected
 
 
 def _lost_text(of: DirectionStatistics) -> str:
     lost = [(fate.replace("_", " "), of["fates"][fate]) for fate in _LOST]
-    lost.append(("delivered_out_of_order", of["delivered_out_of_order"]))
+    lost.append(("stale", of["delivered_out_of_order"]))
     return ", ".join(f"{number:,} {cause}" for cause, number in lost if number) or "0"
 
 
-def _run(of: DirectionStatistics, width: int) -> Text:
+def burst_text(of: DirectionStatistics) -> str:
+    """Return the longest loss burst beside its cap."""
+    cap = of["mansd"]
+    return f"{of['longest_loss_burst']:,}, {'no cap' if cap is None else f'cap {cap:,}'}"
+
+
+def _burst(of: DirectionStatistics, width: int) -> Text:
     longest, cap, forced = of["longest_loss_burst"], of["mansd"], of["fates"]["forced"]
+    text = Text(burst_text(of))
     end = Text(f"  {forced:,} forced", "magenta") if forced else Text()
-    if cap is None:
-        return Text(f"{longest:,} in a row, no cap").append_text(end)
-    text = Text(f"{longest:,} of {cap:,}")
     room = width - len(text) - len(end) - 2
-    if room > 0:
+    if cap is not None and room > 0:
         style = "green" if longest < cap else "yellow" if longest == cap else "bold red"
         filled, rest = bar(longest / cap if cap else float(longest > 0), room)
         text.append("  ").append(filled, style).append(rest, "dim")
@@ -211,104 +199,84 @@ def _run(of: DirectionStatistics, width: int) -> Text:
 
 
 def _wrapped(text: str, width: int) -> Text:
-    """Break a text into lines at its spaces; what is too long for the room is cut."""
-    lines = [""]
-    for word in text.split():
-        if lines[-1] and len(lines[-1]) + 1 + len(word) > width:
-            lines.append(word)
-        else:
-            lines[-1] = f"{lines[-1]} {word}".strip()
-    if len(lines) > _WORDS_LINES:
-        lines = [*lines[: _WORDS_LINES - 1], f"{lines[_WORDS_LINES - 1]} …"]
-    return Text(
-        "\n".join(line if len(line) <= width else line[: width - 1] + "…" for line in lines)
-    )
+    return Text("\n".join(textwrap.wrap(text, width, max_lines=_WORDS_LINES, placeholder=" …")))
 
 
-def _table(history: History, statistics: Statistics, width: int, lines: int) -> RenderableType:
-    """Return a table with a line for each direction that has seen datagrams.
+def _burst_of_cap(of: DirectionStatistics) -> str:
+    return f"{of['longest_loss_burst']:,}/{NONE if of['mansd'] is None else of['mansd']}"
 
-    What there is no room for beside the links' names is left out, the chart first.
-    """
+
+_COLUMNS: dict[str, Callable[[DirectionStatistics], str]] = {
+    "received": lambda of: _rate(of, "arrived_per_s"),
+    "forwarded": lambda of: _rate(of, "forwarded_per_s"),
+    "loss": lambda of: percent_text(of["loss"]["lost"]),
+    "predicted": lambda of: percent_text(of["loss"]["predicted"]),
+    "burst/cap": _burst_of_cap,
+    "p99": lambda of: time_text((of["recent"] or of)["delay_ns"]["p99"]),
+}
+"""Columns of the table: heading and text."""
+_OPTIONAL = ("predicted", "p99", "forwarded")
+"""Columns that are omitted, in this order, if the terminal is too narrow."""
+
+
+def _table(history: History, latest: Statistics, width: int, lines: int) -> RenderableType:
+    """Return a table with a row for each direction that has received datagrams."""
     rows = [
-        (link, name) for link in statistics["links"] for name in DIRECTIONS if link[name]["arrived"]
+        (link, name) for link in latest["links"] for name in DIRECTIONS if link[name]["arrived"]
     ]
     shown = rows[:lines]
     names = [f" {'→' if name == 'forward' else '←'} {link['name']}" for link, name in shown]
     name_width = min(max(map(len, names), default=0), width // 3)
-    columns = {heading: [cell(link[name]) for link, name in shown] for heading, cell in _CELLS}
-    widths = {heading: max(map(len, (heading, *cells))) for heading, cells in columns.items()}
-    for heading in _LEFT_OUT:
-        if name_width + sum(widths.values()) + len(widths) > width:
-            del columns[heading], widths[heading]
-    chart_width = min(width - name_width - sum(widths.values()) - len(widths) - 1, _CHART_WIDTH)
-    has_chart = chart_width >= _LEAST_CHART_WIDTH
+    columns = {
+        heading: [text(link[name]) for link, name in shown] for heading, text in _COLUMNS.items()
+    }
+
+    def room() -> int:
+        widths = [max(map(len, (heading, *texts))) for heading, texts in columns.items()]
+        return width - name_width - sum(widths) - len(widths)
+
+    for heading in _OPTIONAL:
+        if room() < 0:
+            del columns[heading]
+    chart_width = min(room() - 1, _CHART_WIDTH)
+    if chart_width >= _MIN_CHART_WIDTH:
+        series = [
+            history.series(link["name"], name, "arrived_per_s", chart_width) for link, name in shown
+        ]
+        columns["last minute"[:chart_width]] = [sparkline(one, _top(one)) for one in series]
 
     table = Table(box=None, padding=(0, 1, 0, 0), header_style="dim", pad_edge=False)
     table.add_column(" link", no_wrap=True, overflow="ellipsis", width=name_width)
     for heading in columns:
         table.add_column(heading, justify="right", no_wrap=True)
-    if has_chart:
-        table.add_column("last minute"[:chart_width], no_wrap=True, width=chart_width)
     for row, (link, name) in enumerate(shown):
-        cells: list[str | Text] = [column[row] for column in columns.values()]
-        if has_chart:
-            series = history.series(
-                link["name"], name, lambda one: one["arrived_per_s"], chart_width
-            )
-            cells.append(Text(sparkline(series, _top(series)), "green"))
         of = link[name]
         beyond = of["mansd"] is not None and of["longest_loss_burst"] > of["mansd"]
-        bad = beyond or any(of["unintended"].values())
-        table.add_row(Text(names[row]), *cells, style="bold red" if bad else "")
+        style = "bold red" if beyond or any(of["unintended"].values()) else ""
+        table.add_row(Text(names[row]), *(texts[row] for texts in columns.values()), style=style)
     hidden = len(rows) - len(shown)
     return Group(table, Text(f" … and {hidden} more", "dim")) if hidden else table
 
 
-def _per_s(of: DirectionStatistics, which: Literal["arrived_per_s", "forwarded_per_s"]) -> str:
-    return rate_text(of["recent"][which]) if of["recent"] else NONE
-
-
-_CELLS: Sequence[tuple[str, Callable[[DirectionStatistics], str]]] = (
-    ("in", lambda of: _per_s(of, "arrived_per_s")),
-    ("out", lambda of: _per_s(of, "forwarded_per_s")),
-    ("loss", lambda of: percent_text(of["loss"]["lost"])),
-    ("predicted", lambda of: percent_text(of["loss"]["predicted"])),
-    (
-        "run",
-        lambda of: f"{of['longest_loss_burst']:,}/{NONE if of['mansd'] is None else of['mansd']}",
-    ),
-    ("p99", lambda of: time_text((of["recent"] or of)["delay_ns"]["p99"])),
-)
-"""A line's columns: heading and text."""
-_LEFT_OUT = ("predicted", "p99", "out")
-"""In this order, where there is no room."""
+def _used(statistics: Statistics) -> list[tuple[LinkStatistics, Direction]]:
+    """Return the directions that have received datagrams."""
+    links = statistics["links"]
+    return [(link, name) for link in links for name in DIRECTIONS if link[name]["arrived"]]
 
 
 def plain_lines(statistics: Statistics) -> list[str]:
-    """Return a line of text for each direction that has seen datagrams, for what is no terminal."""
-    return [
-        _plain_line(statistics["elapsed_s"], link, name)
-        for link in statistics["links"]
-        for name in DIRECTIONS
-        if link[name]["arrived"]
-    ]
+    """Return a line of text for each direction that has received datagrams."""
+    return [_plain_line(statistics["elapsed_s"], *one) for one in _used(statistics)]
 
 
 def _plain_line(elapsed_s: float, link: LinkStatistics, name: Direction) -> str:
     of = link[name]
-    recent = of["recent"]
-    parts = [f"{elapsed_s:.1f} s", f"{link['name']} {name}"]
-    if recent is not None:
-        parts += [
-            f"in {rate_text(recent['arrived_per_s'])} {bits_text(recent['arrived_bits_per_s'])}",
-            f"out {rate_text(recent['forwarded_per_s'])} "
-            f"{bits_text(recent['forwarded_bits_per_s'])}",
-        ]
-    parts.append(f"loss {_loss(of).plain}")
-    parts.append(f"drawn {_drawn(of).plain}")
-    parts.append(f"run {_run(of, 0).plain}")
-    parts.append(f"delay p99 {time_text((recent or of)['delay_ns']['p99'])}")
-    parts.append(f"under way {of['in_flight']:,}")
+    parts = [
+        f"{elapsed_s:.1f} s", f"{link['name']} {name}", f"received {_flow(of, 'arrived')}",
+        f"forwarded {_flow(of, 'forwarded')}", f"loss {_loss(of)}", f"drawn {_drawn(of)}",
+        f"longest loss burst {burst_text(of)}", f"forced {of['fates']['forced']:,}",
+        f"delay p99 {time_text((of['recent'] or of)['delay_ns']['p99'])}",
+        f"in flight {of['in_flight']:,}",
+    ]  # fmt: skip
     parts += [f"UNINTENDED {n:,} {cause}" for cause, n in of["unintended"].items() if n]
     return "  ".join(parts)

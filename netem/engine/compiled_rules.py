@@ -1,6 +1,6 @@
 """Compiles the rules of a link with numba: the very functions that :mod:`netem.link_machine` runs.
 
-What is compiled is kept in the user's cache; see :mod:`noack.runtime.code_cache`.
+What is compiled is kept in the user's cache; see :mod:`noack.core.code_cache`.
 """
 
 import importlib
@@ -23,8 +23,8 @@ from netem.rule_program import new_flow
 from netem.rule_records import array_of, dtype_of
 from netem.rules.link_rules import LinkMemory, LinkProgram
 from netem.rules.mansd import NEVER_NS
-from noack.runtime import code_cache
-from noack.runtime.code_cache import cache_folder, compiler
+from noack.core import code_cache
+from noack.core.code_cache import cache_folder, compiler
 
 _PROGRAM = {
     "stages": rule_records.RuleStage,

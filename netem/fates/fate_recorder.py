@@ -1,4 +1,4 @@
-"""Records fate traces: a tap of the relay that writes in a thread of its own."""
+"""The tap that records a fate trace, in a thread of its own."""
 
 import threading
 from collections.abc import Sequence
@@ -18,34 +18,34 @@ from netem.relay_events import EVENT
 from netem.standard_error import say
 from noack.core.errors import CallerError
 
-_FIELDS = {"arrival_ns": "t_ns"}
-"""From a trace's columns to the fields of an event, where they differ."""
+_FIELDS = {"arrival_ns": "t_ns", "consecutive_losses": "run"}
+"""Fields of an event whose columns have another name."""
 _RAW = np.dtype((np.void, EVENT.itemsize))
-"""Events without their fields, as which numpy copies them ten times as fast."""
+"""Events without their fields, which numpy copies ten times as fast."""
 _GROUP_ROWS = 65_536
 _MAGIC = b"PAR1"
-_MOST_WAITING = 1_000_000
+_MAX_WAITING = 1_000_000
 
 
 class FateRecorder:
-    """Writes a trace while the context lasts.
+    """Writes a trace within the context.
 
-    It never holds up the relay: what it cannot take is counted as missing. A trace with holes
-    cannot be replayed, so that the first one is told at once, in a line on standard error.
+    The relay never waits: an event that cannot be queued is counted as missing. A trace with
+    missing events cannot be replayed, so that a line on standard error reports the first at once.
 
     Args:
-        path: the file, which is replaced; it can be read when the context has ended.
+        path: the file, which is replaced, and complete when the context has ended.
         specs: the relay's links, in its order.
-        most_waiting: at most so many rows wait to be written.
+        max_waiting: maximum number of rows that wait to be written.
 
     Raises:
-        CallerError: the file cannot be written, or is another program's.
+        CallerError: the file cannot be written, or is not a Parquet file.
     """
 
     wants_data = False
 
     def __init__(
-        self, path: Path, specs: Sequence[LinkSpec], most_waiting: int = _MOST_WAITING
+        self, path: Path, specs: Sequence[LinkSpec], max_waiting: int = _MAX_WAITING
     ) -> None:
         self._path = path
         self._specs = specs
@@ -55,7 +55,7 @@ class FateRecorder:
             for name, kind in {"link": "int16", "direction": "int16", **NUMBERS}.items()
         }
         self._gathered = 0
-        self._most_waiting = most_waiting
+        self._max_waiting = max_waiting
         self._queue: SimpleQueue[NDArray[Any] | str | None] = SimpleQueue()
         self._taken = 0
         self._done = 0
@@ -81,37 +81,37 @@ class FateRecorder:
 
     @property
     def rows(self) -> int:
-        """Rows in the file, when the context has ended."""
+        """Number of rows in the file, after the context."""
         return self._done - self._unwritten
 
     @property
     def missing_events(self) -> int:
-        """How many events are not in the trace; of 0 it is whole."""
+        """Number of events that are not in the trace."""
         return self._missed + self._unwritten
 
     def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
-        """Take what has come in; called in the relay's thread."""
+        """Queue the arrivals; called in the relay's thread."""
         try:
             rows = events.view(_RAW)[events["departure"] == 0]
         except MemoryError:
             self.missing(len(events))
             return
-        if self._taken - self._done + len(rows) > self._most_waiting:
+        if self._taken - self._done + len(rows) > self._max_waiting:
             self.missing(len(rows))
         elif len(rows):
             self._taken += len(rows)
             self._queue.put(rows)
 
     def missing(self, events: int) -> None:
-        """Take note that events were lost; called in the relay's thread."""
+        """Count events that the relay had no room for; called in its thread."""
         if self._missed == 0 and events:
-            self._queue.put("events are missing, as they come faster than they are written")
+            self._queue.put("events are missing: they arrive faster than they can be written")
         self._missed += events
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
             if isinstance(item, str):
-                self._tell(item)
+                self._report(item)
             else:
                 self._gather(item.view(EVENT))
         if self._gathered:
@@ -119,7 +119,7 @@ class FateRecorder:
         self._end()
 
     def _gather(self, rows: NDArray[Any]) -> None:
-        """Put rows into columns, batch by batch: the interpreter is never held for long."""
+        """Copy rows into columns, in groups, to release the interpreter lock often."""
         while len(rows):
             part, rows = np.split(rows, [_GROUP_ROWS - self._gathered])
             here = slice(self._gathered, self._gathered + len(part))
@@ -156,21 +156,21 @@ class FateRecorder:
     def _fail(self, error: OSError) -> None:
         if not self._failed:
             self._failed = True
-            self._tell(f"cannot be written any more ({_reason(error)})")
+            self._report(f"cannot be written ({_reason(error)})")
 
-    def _tell(self, what: str) -> None:
-        say(f"fate trace {self._path}: {what}; it cannot be replayed, the relay goes on")
+    def _report(self, what: str) -> None:
+        say(f"fate trace {self._path}: {what}; it cannot be replayed; the relay continues")
 
 
 def _check_overwriting(path: Path) -> None:
-    """Refuse to overwrite what was not written by one like this."""
+    """Refuse to overwrite a file that is not Parquet."""
     with suppress(OSError), path.open("rb") as file:
         if path.is_file() and file.read(len(_MAGIC)) not in (b"", _MAGIC):
             raise CallerError(
-                f"--record-fates {path}: is there already, and no Parquet file; take another name"
+                f"--record-fates {path}: exists and is not a Parquet file; choose another name"
             )
 
 
 def _reason(error: OSError) -> str:
-    # Arrow says where in its code it failed, and then "[errno 28] No space left on device".
+    # Arrow's message ends with "[errno 28] No space left on device".
     return str(error).rpartition("] ")[2]

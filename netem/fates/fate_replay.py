@@ -1,4 +1,4 @@
-"""Reads fate traces back, as the decisions that a link takes again in a replay."""
+"""Reads fate traces: the decisions that a link repeats in a replay."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,40 +18,39 @@ from noack.core.errors import CallerError, one_line
 from noack.protocol.record_tables import Fate
 
 _LONGEST_NS = 2**62
-"""No delay is longer; added to a time it stays within 64 bits."""
+"""Maximum delay: its sum with a time fits into 64 bits."""
 _LOST = (Fate.DROPPED, Fate.OVERFLOWED, Fate.BLACKED_OUT)
 
 
 class Fates(NamedTuple):
-    """What a trace says, of each direction of each link."""
+    """The content of a trace, for each direction of each link."""
 
     decisions: Mapping[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]]
-    """Of each flow, in the order of its datagrams."""
+    """Decisions of each flow, in packet order."""
     caps: Mapping[tuple[str, Direction], int | None]
-    """M − 1, if it was kept."""
+    """The cap (M − 1), if the recorded fates keep it."""
 
 
 def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     """Read a trace, for :func:`netem.rule_program.program_of` and :class:`netem.link_machine.Link`.
 
-    A replayed link takes the decisions of each flow again, datagram by datagram: the same fate, the
-    same flipped bits, and the same delay from the datagram's arrival. When datagrams come at other
-    times than they did, the cap of the replaying link is kept all the same. A flow that the trace
-    does not know, and a flow that goes on beyond it, meets the link's own settings.
+    A replaying link repeats the decisions of each flow, packet by packet: the same fate, the same
+    flipped bits, and the same delay from arrival. It keeps its cap even if the datagrams arrive at
+    other times. Flows and packets beyond the trace meet the link's own settings.
 
     Args:
         path: the file.
-        links: the links to be replayed; None for all that the trace has.
+        links: the links to be replayed; None: all links of the trace.
 
     Raises:
-        CallerError: the file is no trace, or has holes, or does not know a link.
+        CallerError: the file is not a trace, has missing events, or lacks a link.
     """
     table, settings = _read(path)
     links_recorded = list(settings)
     for link in links or ():
         if link not in links_recorded:
             known = ", ".join(links_recorded)
-            raise CallerError(f"{path}: has no fates of a link {link!r}; it has those of {known}")
+            raise CallerError(f"{path}: has no link {link!r}; its links: {known}")
     columns = {name: table[name].to_numpy() for name in SCHEMA.names}
     found: dict[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]] = {}
     caps: dict[tuple[str, Direction], int | None] = {}
@@ -61,31 +60,31 @@ def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
             rows = {name: column[here] for name, column in columns.items()}
             found[link, direction] = _flows(rows, len(table), f"{path}: {link} {direction}")
             cap = getattr(settings[link], direction).mansd
-            # It may have been changed on the way.
-            kept = cap is not None and rows["run"].max(initial=0) <= cap
+            # The cap may have changed during the recording.
+            kept = cap is not None and rows["consecutive_losses"].max(initial=0) <= cap
             caps[link, direction] = cap if kept else None
     return Fates(found, caps)
 
 
 def _read(path: Path) -> tuple[pa.Table, Mapping[str, "_Link"]]:
-    """Return a trace's table, and what its links did at its start, by name."""
+    """Return a trace's table, and the settings of its links at the start, by name."""
     try:
         with pq.ParquetFile(path) as file:
             document = _document(path, (file.metadata.metadata or {}).get(METADATA.encode()))
             if not file.schema_arrow.equals(SCHEMA):
-                raise CallerError(f"{path}: is no fate trace: its columns are others")
+                raise CallerError(f"{path}: not a fate trace: it has other columns")
             table = file.read()
             table.validate(full=True)
     except pa.ArrowInvalid:
         raise CallerError(
-            f"{path}: is no fate trace, or one that was not finished as the emulator was killed"
+            f"{path}: not a fate trace, or incomplete because the emulator was killed"
         ) from None
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         raise CallerError(f"{path}: cannot be read ({one_line(error)})") from None
     if document.missing_events or any(column.null_count for column in table.columns):
         raise CallerError(
             f"{path}: {document.missing_events or 'some'} events are missing; "
-            "a trace with holes cannot be replayed"
+            "an incomplete trace cannot be replayed"
         )
     return table, {link.name: link for link in document.links}
 
@@ -106,7 +105,7 @@ class _Header(BaseModel):
 
 
 class _Document(_Header):
-    """What is needed of a trace's metadata."""
+    """The part of a trace's metadata that a replay needs."""
 
     missing_events: Annotated[int, Field(ge=0)]
     links: list[_Link]
@@ -116,10 +115,10 @@ def _document(path: Path, text: bytes | None) -> _Document:
     try:
         header = _Header.model_validate_json(text or b"", strict=True)
         if header.format != FORMAT:
-            raise CallerError(f"{path}: is of another format, that of noack {header.version}")
+            raise CallerError(f"{path}: has the format of noack {header.version}; record it again")
         return _Document.model_validate_json(text or b"", strict=True)
     except ValidationError:
-        raise CallerError(f"{path}: is no fate trace of this program") from None
+        raise CallerError(f"{path}: not a fate trace of this program") from None
 
 
 def _flows(
@@ -136,8 +135,8 @@ def _flows(
     if len(wrong):
         k = wrong[0]
         raise CallerError(
-            f"{place}: flow {flows[k]}: expected datagram {expected[k]} and found {packets[k]}; "
-            "a trace with holes cannot be replayed"
+            f"{place}: flow {flows[k]}: expected packet {expected[k]}, found {packets[k]}; "
+            "an incomplete trace cannot be replayed"
         )
     names = ("fate", "delay_ns", "copy_delay_ns", "bit", "copy_bit")
     columns = [rows[name][order].tolist() for name in names]
@@ -149,7 +148,7 @@ def _flows(
 
 
 def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> None:
-    """Check that the rows say what an emulator can have done."""
+    """Check that an emulator can have made these decisions."""
     delay, copy = rows["delay_ns"], rows["copy_delay_ns"]
     lost = np.isin(rows["fate"], _LOST)
     possible = (
@@ -165,4 +164,4 @@ def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> Non
     if not possible.all():
         k = int(np.flatnonzero(~possible)[0])
         what = ", ".join(f"{name} {rows[name][k]}" for name in SCHEMA.names[2:])
-        raise CallerError(f"{place}: no emulator did this: {what}")
+        raise CallerError(f"{place}: impossible decision: {what}")

@@ -1,22 +1,22 @@
-"""The file of a fate trace: Parquet with a row for each datagram that came in, in that order.
+"""The file of a fate trace: Parquet with a row for each received datagram, in order of arrival.
 
 ========================= =====================================================================
 column
 ========================= =====================================================================
-``link``, ``direction``   where it came in; ``forward`` is from client to server
+``link``, ``direction``   where it arrived; ``forward`` is from client to server
 ``flow``, ``packet``      number of its flow, and its number in the flow, from 0
-``arrival_ns``            when it came, in Unix time
-``size_bytes``            of the payload
+``arrival_ns``            time of arrival, Unix time
+``size_bytes``            size of the payload
 ``fate``                  :class:`noack.protocol.record_tables.Fate`
-``run``                   successive datagrams, up to it, that are not effectively delivered
-``delay_ns``              from its arrival until it leaves; −1 never
-``copy_delay_ns``         the same of its duplicate; −1 if there is none
-``bit``, ``copy_bit``     which bit of it, and of its duplicate, is flipped; −1 none
-``hold_back_ns``               by how much it is held back so that the cap holds
+``consecutive_losses``    length of the loss burst that ends with it; 0 if it is delivered
+``delay_ns``              from arrival to departure; −1: never forwarded
+``copy_delay_ns``         the same for its duplicate; −1: no duplicate
+``bit``, ``copy_bit``     flipped bit of it, and of its duplicate; −1: none
+``hold_back_ns``          time for which the guarantee holds it back
 ========================= =====================================================================
 
-The file's metadata has a JSON document under ``noack``: the version that wrote it, the links with
-their seeds and their settings at the start, and how many events are missing.
+The file's metadata has a JSON document under ``noack``: the version of the program, the links with
+their seeds and their settings at the start, and the number of missing events.
 """
 
 import json
@@ -29,7 +29,7 @@ import pyarrow as pa
 
 from netem.engine.relay_interface import DIRECTIONS, LinkSpec
 
-FORMAT = 1
+FORMAT = 2
 METADATA = "noack"
 
 NUMBERS: Mapping[str, str] = {
@@ -38,14 +38,14 @@ NUMBERS: Mapping[str, str] = {
     "arrival_ns": "int64",
     "size_bytes": "int32",
     "fate": "int8",
-    "run": "int32",
+    "consecutive_losses": "int32",
     "delay_ns": "int64",
     "copy_delay_ns": "int64",
     "bit": "int32",
     "copy_bit": "int32",
     "hold_back_ns": "int64",
 }
-"""Columns of numbers and their types."""
+"""Numeric columns and their types."""
 
 _NAMES = pa.dictionary(pa.int16(), pa.string())
 SCHEMA = pa.schema(

@@ -19,6 +19,8 @@ from noack.core.linear_systems import Matrix, Vector, discretise, transition
 from noack.core.random_streams import stream
 from noack.observers.observability import unobservable_mode
 from noack.protocol.record_tables import entry_names, tables
+from noack.trigger.policy_settings import ModelMatrices
+from noack.trigger.trigger_policy import Policy
 
 _SURELY_FINITE = 600.0
 """‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is still a number; beyond, the exponential itself must tell."""
@@ -120,6 +122,17 @@ def loop_of(resolved: Scenario) -> LoopMatrices:
         state_names=model.state_names or (),
         input_names=model.input_names or (),
     )
+
+
+def policy_of(resolved: Scenario) -> Policy:
+    """Return the trigger policy of a resolved scenario.
+
+    Raises:
+        CallerError: the policy cannot be used with the scenario's model.
+    """
+    model = resolved.model
+    matrices = ModelMatrices(np.array(model.A), np.array(model.B), np.array(model.gain))
+    return resolved.trigger.trigger_policy(matrices)
 
 
 def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:

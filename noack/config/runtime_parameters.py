@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import NoneType
 from typing import Any, get_args
 
-from pydantic import BaseModel
+from noack.trigger.policy_settings import PolicySettings
 
 LOSS, MANSD, SETPOINT = "network.loss", "network.mansd", "controller.setpoint"
 
@@ -24,9 +24,6 @@ SHORT: Mapping[str, str] = {
 }
 """Short names of keys."""
 
-_AT_THE_START = ("eta_0",)
-"""Numbers of a trigger that say how it begins."""
-
 
 def full_key(name: str) -> str:
     """Return the scenario's key for a name that may be short, such as ``loss.p``."""
@@ -35,16 +32,16 @@ def full_key(name: str) -> str:
     return f"network.{name}" if name.startswith("loss.") else name
 
 
-def trigger_parameters(trigger: BaseModel) -> tuple[str, ...]:
+def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
     """The keys of a trigger's numbers: policy and norm stay what they are."""
     return tuple(
         f"trigger.{name}"
         for name, field in type(trigger).model_fields.items()
-        if name not in _AT_THE_START and _is_number(field.annotation)
+        if name not in trigger.at_start_only and _is_number(field.annotation)
     )
 
 
-def require_runtime_parameters(settings: Mapping[str, Any], trigger: BaseModel) -> None:
+def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySettings) -> None:
     """Check that all keys are such as can be changed during a run.
 
     Args:

@@ -27,9 +27,10 @@ from noack.config.sections.run_sections import (
 )
 from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
-from noack.config.triggers import AnyTrigger, DecayingSettings
+from noack.config.triggers import AnyTrigger
 from noack.core.errors import CallerError
 from noack.settings.section import ScenarioSection
+from noack.trigger.decaying import DecayingSettings
 
 MOST_CHANGES = 256
 """In a run."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from noack.config.disturbances import require_disturbances
 from noack.config.setpoint import input_at
-from noack.config.triggers import require_on_grid
 from noack.core.clock import NS_PER_S
 from noack.protocol.wire_format import MAX_DIMENSION
 from noack.settings.matrices import require_length, require_shape
@@ -42,7 +41,7 @@ def check_trigger(scenario: "Scenario") -> None:
         ValueError: they do not fit together.
     """
     scenario.trigger.check(scenario.model.dimensions[0], _dimensions(scenario))
-    require_on_grid(scenario.trigger, scenario.timing.measurement_period_ns)
+    scenario.trigger.check_period(scenario.timing.measurement_period_ns)
 
 
 def check_setpoint(scenario: "Scenario") -> None:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from noack.config.plant_systems import LinearSettings
-from noack.config.triggers import DecayingSettings
 from noack.core.errors import CallerError
+from noack.plants.linear import LinearSettings
+from noack.trigger.decaying import DecayingSettings
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario

@@ -34,6 +34,7 @@ _STRING = re.compile(
 )
 """Strings and comments of TOML; one that does not end where it must ends where it could have."""
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
+_TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_LEVELS}}}")
 
@@ -76,8 +77,10 @@ def parsed(text: str, source: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise CallerError(f"{source}: {_TOO_DEEP}") from None
-    except ValueError as error:
+    except tomllib.TOMLDecodeError as error:
         raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
+    except ValueError:  # Python parses no integer of thousands of digits
+        raise CallerError(f"{source}: {_TOO_LARGE}") from None
 
 
 def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
@@ -93,7 +96,7 @@ def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
     except TypeError as error:
         raise CallerError(printable(f"{source}: {error}")) from None
     except ValueError:  # Python writes no integer of thousands of digits
-        raise CallerError(f"{source}: an integer is too large") from None
+        raise CallerError(f"{source}: {_TOO_LARGE}") from None
     try:
         # Through JSON, because strict validation takes arrays for tuples only there.
         return model.model_validate_json(text)

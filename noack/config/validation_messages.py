@@ -79,7 +79,7 @@ def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
     if chosen and isinstance(value, Mapping):
         return _choice(key, value, at)
     if chosen or kind in ("model_type", "model_attributes_type", "dict_type"):
-        return f"{shown}: should be a table{_table_example(at)}"
+        return f"{shown}: should be a table{_table_example(value, at)}"
     if kind == "too_short":
         least = mistake["ctx"]["min_length"]
         return f"{shown}: needs at least {'one entry' if least == 1 else f'{least} entries'}"
@@ -111,6 +111,7 @@ def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
     kind: Any = root
     path: list[Any] = []
     section: type[BaseModel] | None = None
+    alternatives = _choices(kind)
     for part in place:
         choices, _ = _choices(kind)
         if part in choices:
@@ -118,7 +119,8 @@ def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
             continue
         path.append(part)
         kind, section = _within(kind, part)
-    return _Place(path, section, *_choices(kind), kind)
+        alternatives = _choices(kind)
+    return _Place(path, section, *alternatives, kind)
 
 
 def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
@@ -218,9 +220,14 @@ def _choice(key: str, value: Any, at: _Place) -> str:
     return f"{key} = {_show(chosen)}: must be one of {known}{hint}"
 
 
-def _table_example(at: _Place) -> str:
+def _table_example(value: Any, at: _Place) -> str:
+    """An example of the table: of the kind that the value names, or for a class of the user's."""
+    known = isinstance(value, str) and value in at.choices
+    if not known and "python" in at.choices and str(value).isidentifier():
+        file = f"my_{at.path[0]}.py"
+        return f', e.g. {{ {at.discriminator} = "python", file = "{file}", name = "{value}" }}'
     if at.choices:
-        chosen = list(at.choices)[1]
+        chosen = str(value) if known else list(at.choices)[1]
         needed = (
             f", {name} = ..." for name, field in at.choices[chosen].model_fields.items()
             if field.is_required() and name != at.discriminator

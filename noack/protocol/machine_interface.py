@@ -1,4 +1,4 @@
-"""What a pure machine is: inputs and time in, outputs out; no socket, no clock, no randomness.
+"""A pure machine: inputs and time in, outputs out; no socket, no clock, no randomness.
 
 The live shells (``noack.runtime``), the simulator and replay drive machines through this interface.
 """
@@ -9,14 +9,14 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from noack.protocol.wire_format import Message
 
 GENERATION = 2**40
-"""A restarted process numbers from its generation times this on: newer than all before it."""
+"""A restarted process numbers its messages from generation · 2⁴⁰ on, above all earlier ones."""
 
 
 class Start(NamedTuple):
-    """Where a machine takes up its work in a run."""
+    """Where in a run a machine begins its work."""
 
     generation: int = 0
-    """How often its process has been started anew in this run; one that was knows no state."""
+    """How often its process was restarted in this run; a restarted process knows no state."""
     from_ns: int = 0
     """No timer is due before."""
 
@@ -26,13 +26,13 @@ class Start(NamedTuple):
         return self.generation * GENERATION
 
     @property
-    def again(self) -> bool:
-        """Whether the process was started anew while the run went on."""
+    def is_restart(self) -> bool:
+        """Whether the process was restarted during the run."""
         return self.generation > 0
 
 
 BEGINNING = Start()
-"""The run's own start."""
+"""The start of the run."""
 
 
 class Record(NamedTuple):
@@ -43,9 +43,9 @@ class Record(NamedTuple):
 
 
 RESTART = "restart"
-"""Level of the notice of a process that takes another's place."""
+"""Level of the notice of a restarted process."""
 FAILED = "failed"
-"""Level of the notice of a plant that cannot go on."""
+"""Level of the notice of a plant that has failed."""
 
 
 class Notice(NamedTuple):
@@ -69,9 +69,9 @@ class Machine(Protocol[T]):
         ...
 
     def on_timer(self, now_ns: int) -> Sequence[T | Record | Notice]:
-        """Do what was due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
+        """Do the work due at :meth:`next_deadline_ns`; ``now_ns`` may be later than that."""
         ...
 
     def next_deadline_ns(self) -> int | None:
-        """When :meth:`on_timer` is due next; None while nothing is."""
+        """When :meth:`on_timer` is due next; None if no timer is set."""
         ...

@@ -1,6 +1,6 @@
-"""What processes tell each other over the control plane, as JSON; whoever reads it checks it.
+"""Messages of the control plane, as JSON. The reader checks each of them.
 
-Whatever else reaches the plane, or a damaged file, is none of it and must not end a process.
+Any other input, such as a damaged file, is refused and must not end a process.
 """
 
 import re
@@ -28,108 +28,108 @@ Ranges = tuple[tuple[Count, Count], ...]
 
 
 class ControlMessage(BaseModel):
-    """A message; it may say more."""
+    """A message; further fields are allowed."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="allow")
 
 
 def _require_number(host: str) -> str:
-    ip_address(host)  # of a name nobody knows how long its look-up takes
+    ip_address(host)  # the look-up of a name could take arbitrarily long
     return host
 
 
 SocketAddress = tuple[
     Annotated[str, AfterValidator(_require_number)], Annotated[int, Field(ge=1, le=65_535)]
 ]
-"""An address: host, as a number, and port."""
+"""Numeric host and port."""
 
 
 class AdmissionRequest(ControlMessage):
-    """A process asks whether it may join."""
+    """A process asks for admission to the run."""
 
     instance: str
-    """Tells it from another of its role."""
+    """Random name of this process."""
 
 
 class Admission(ControlMessage):
-    """The coordinator says who a process is in the run."""
+    """The coordinator admits a process."""
 
     generation: Generation
-    """How many of its role were in the run before it."""
+    """How many processes of its role were in the run before it."""
     admitted_ns: Nanoseconds
-    """Simulated time at which it was let in; whatever is older was for the one before it."""
+    """Simulated time of the admission; older messages were meant for the process before it."""
     from_ns: Nanoseconds
-    """When it is to take up its work."""
+    """Simulated time at which its work begins."""
     address: SocketAddress | None
-    """Where the one before it received, and now it."""
-    after: str | None
-    """What became of the one before it."""
+    """Receiving address of the process before it, which it takes over; None at the run's start."""
+    replaces: str | None
+    """How the process before it ended; None at the run's start."""
 
 
 class JoinRequest(ControlMessage):
-    """A process is ready to start."""
+    """A process is ready and waits at the start barrier."""
 
     instance: str
     address: SocketAddress | None
-    """Where it receives; None for the recorder."""
+    """Its receiving address; None for the recorder."""
 
 
 class ChangeAnnouncement(ControlMessage):
-    """The coordinator says what is changed, and from when on."""
+    """The coordinator announces a change of runtime parameters."""
 
     number: Count
-    """Of the run's changes."""
+    """Numbers the changes of the run from 0."""
     t_ns: Count
-    """Simulated time from which on it is in force."""
+    """Simulated time from which it applies."""
     settings: dict[str, JsonValue]
-    """Values by keys of the scenario."""
-    said_ns: Nanoseconds
-    """Simulated time at which it was asked for."""
-    said_at: str
-    """The same by the calendar, or that the scenario says so."""
+    """Values by scenario key."""
+    requested_ns: Nanoseconds
+    """Simulated time of the request."""
+    requested_at: str
+    """Date and time of the request; or that the scenario contains the change."""
 
 
 class ChangeRequest(ControlMessage):
-    """A person asks for a change of settings; or, with none, what they are."""
+    """A user requests a change of runtime parameters; without settings, their values."""
 
     settings: dict[str, JsonValue] = Field({})
-    """Values by keys of the scenario."""
+    """Values by scenario key."""
 
 
 class ChangeReply(ControlMessage):
-    """The coordinator answers what is asked of a run's settings."""
+    """The coordinator answers a change request."""
 
     name: str
     run_dir: str
     t_s: FiniteFloat
     """Simulated time."""
     from_s: FiniteFloat | None
-    """From when on what was asked for is in force; None if nothing was."""
+    """Simulated time from which the change applies; None if none was requested."""
     runtime_parameters: dict[str, JsonValue]
-    """Values by keys, with all changes that have been announced."""
+    """Values by scenario key, all announced changes included."""
 
 
 class RunStart(ControlMessage):
-    """The coordinator says that the run begins, or has begun."""
+    """The coordinator lets a process pass the start barrier."""
 
     epoch_ns: Count
     """Monotonic clock reading at simulated time 0."""
     addresses: dict[str, SocketAddress]
-    """Where each process receives."""
+    """Receiving address of each process."""
     changes: tuple[ChangeAnnouncement, ...] = ()
-    """What is known by now of changes."""
+    """The changes announced so far."""
 
 
 class BatchHeader(ControlMessage):
-    """A batch of rows."""
+    """Header of a batch of rows."""
 
     first: Count
-    """Number of its first row in its table, of those of this generation."""
+    """Number of its first row among this generation's rows of the table."""
     generation: Generation = 0
 
 
 class PersistedAck(ControlMessage):
-    """The recorder says what it has on disk of an generation of a process."""
+    """The recorder confirms the rows of a process that are on disk."""
 
     generation: Count
     rows: dict[str, Ranges]
@@ -137,14 +137,14 @@ class PersistedAck(ControlMessage):
 
 
 class MissingRows(ControlMessage):
-    """The recorder says what it lacks of a process that says goodbye."""
+    """The recorder answers a final report with the rows that it misses."""
 
     rows: dict[str, Ranges]
     """By table."""
 
 
 class LogLine(ControlMessage):
-    """A line of a process for the run's log."""
+    """A line for the run's log."""
 
     t_ns: Nanoseconds
     level: str
@@ -152,7 +152,7 @@ class LogLine(ControlMessage):
 
 
 class ChannelCounters(ControlMessage):
-    """Counters of what a process hears."""
+    """Counters of received datagrams."""
 
     rejected: dict[str, Count] = Field({})
     """Datagrams by reason."""
@@ -160,24 +160,24 @@ class ChannelCounters(ControlMessage):
 
 
 class ProcessReport(ControlMessage):
-    """What a process says at its end."""
+    """Final report of a process."""
 
     ended: str
     """Why it ended."""
     channel: ChannelCounters
     rows: dict[str, Count]
-    """How many it made, by table."""
+    """Number of rows that it recorded, by table."""
     generation: Count = 0
     instance: str = ""
-    """Tells it from another of its role."""
+    """Random name of the process."""
     realtime: dict[str, str] = Field({})
-    """Each real-time setting, and whether it was granted."""
+    """Whether each real-time setting was applied."""
     reached_ns: Nanoseconds | None = None
-    """Simulated time up to which it had done what was due; None if it failed."""
+    """Simulated time up to which all its deadlines were served; None if it failed."""
 
 
 class RunProgress(ControlMessage):
-    """The recorder's account of a run under way."""
+    """The recorder's progress report during the run."""
 
     t_s: FiniteFloat
     events: Count
@@ -186,22 +186,22 @@ class RunProgress(ControlMessage):
     x_norm: float | None
     live: str | None
     void: list[str] = []
-    """Why claims about the run are void already, as far as is known, or why that is not known."""
+    """Which claims are void so far, and why; or why that cannot be checked during the run."""
     changes: list[str] = []
-    """What was changed during the run."""
+    """Changes of runtime parameters during the run."""
 
 
 M = TypeVar("M", bound=ControlMessage)
 
 
 def parse_message(kind: type[M], payload: bytes | str) -> dict[str, Any]:
-    """Return what a message says.
+    """Return the fields of a message.
 
     Raises:
-        PeerError: it is none of this kind.
+        PeerError: the payload is not a message of this kind.
     """
     try:
         return kind.model_validate_json(payload).model_dump(exclude_unset=True)
     except ValidationError as error:
         name = re.sub("(?<=[a-z])(?=[A-Z])", " ", kind.__name__).strip("_").lower()
-        raise PeerError(f"no {name} of this version of noack: {brief(error)}") from None
+        raise PeerError(f"not a valid {name}: {brief(error)}") from None

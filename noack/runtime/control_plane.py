@@ -1,8 +1,7 @@
 """The control plane: start barrier, liveliness, stop, telemetry, all on zenoh.
 
-A star over TCP on loopback: the coordinator listens, everyone else connects, with a secret that
-only follows from the run's key. The loop's data never travels here, and nothing in the loop waits
-for it.
+The coordinator listens on TCP on loopback. All other processes connect to it with a secret that is
+derived from the run's key. Loop data never travels here, and the loop never waits for it.
 """
 
 import hashlib
@@ -22,13 +21,13 @@ from noack.protocol.topology import COORDINATOR
 from noack.runtime.join_ticket import Ticket
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 
-_ASK_AGAIN_S = 5.0
+_REQUEST_AGAIN_S = 5.0
 _POLL_S = 0.01
-"""Twenty runs that wait at their start are a hundred processes that look so often."""
+"""Twenty runs that wait at the start barrier are a hundred processes that poll at this rate."""
 
 
 def secret_of(ticket: Ticket) -> SessionSecret:
-    """Return the secret of a run's plane; the run's key cannot be found from it."""
+    """Return the secret of a run's control plane; the run's key cannot be derived from it."""
     keyed = hashlib.blake2b(b"the control plane's password", key=ticket.key, digest_size=32)
     return SessionSecret(f"{ticket.run_id:016x}", keyed.hexdigest())
 
@@ -37,7 +36,7 @@ class ControlPlane:
     """One process's connection to the control plane of a run.
 
     Args:
-        ticket: admission to the run; every key lies below ``noack/RUN``.
+        ticket: the run's ticket; every key lies below ``noack/RUN``.
         role: this process.
         listen: this is the coordinator.
 
@@ -64,11 +63,13 @@ class ControlPlane:
             self.key("alive", COORDINATOR, "*"), RingChannel(8), history=True
         )
         self._coordinator_gone_s: float | None = None
-        # As many as there can be: none is ever pushed out.
+        # Room for all possible changes: none is ever pushed out.
         self._changes = self.session.declare_subscriber(
             self.key("change"), RingChannel(MOST_CHANGES)
         )
-        self._kept = self.session.declare_subscriber(self.key("kept", role), RingChannel(1))
+        self._persisted = self.session.declare_subscriber(
+            self.key("persisted", role), RingChannel(1)
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -77,7 +78,7 @@ class ControlPlane:
         self.close()
 
     def close(self) -> None:
-        """Leave the plane; the others see this process's token vanish."""
+        """Close the session; this process's liveliness token vanishes."""
         if not self.session.is_closed():
             self.session.close()  # type: ignore[no-untyped-call]
 
@@ -86,7 +87,7 @@ class ControlPlane:
         return "/".join((self._prefix, *parts))
 
     def stop_requested(self) -> str | None:
-        """The reason of a stop that the coordinator has asked for, or None."""
+        """The reason of the coordinator's stop request; None without a request."""
         if self._stop_reason is None:
             sample = self._stops.try_recv()
             if sample is not None:
@@ -95,11 +96,11 @@ class ControlPlane:
         return self._stop_reason
 
     def coordinator_gone(self, *, for_s: float = 0.0) -> bool:
-        """Whether the coordinator was there and has disappeared.
+        """Whether the coordinator's liveliness token has vanished.
 
         Args:
-            for_s: for how long it must have been away. On a busy machine a connection may end
-                because one of its ends was not run; it comes back by itself.
+            for_s: for at least how long, in seconds. On a busy machine a connection may break
+                because one end got no CPU time; it comes back by itself.
         """
         while (life := self._coordinator.try_recv()) is not None:
             gone = life.kind == zenoh.SampleKind.DELETE
@@ -108,39 +109,39 @@ class ControlPlane:
         return since_s is not None and time.monotonic() - since_s >= for_s
 
     def request_stop(self, reason: str) -> None:
-        """Ask every process of the run to end."""
+        """Ask all processes of the run to stop."""
         self.session.put(self.key("stop"), reason, priority=Priority.REAL_TIME)
 
     def acknowledge_rows(self, role: str, content: object) -> None:
-        """Tell a process what of it is on disk."""
+        """Confirm to a process which of its rows are on disk."""
         self.session.put(
-            self.key("kept", role),
+            self.key("persisted", role),
             json.dumps(content),
             congestion_control=CongestionControl.DROP,
         )
 
-    def kept(self) -> bytes | None:
-        """The recorder's newest word on what it has of this process, if there is a new one."""
-        sample = self._kept.try_recv()
+    def persisted(self) -> bytes | None:
+        """The recorder's newest confirmation of rows of this process; None without a new one."""
+        sample = self._persisted.try_recv()
         return None if sample is None else sample.payload.to_bytes()
 
-    def announce(self, content: object) -> None:
-        """Tell every process of the run of a change of settings."""
+    def announce_change(self, content: object) -> None:
+        """Announce a change of runtime parameters to all processes."""
         self.session.put(self.key("change"), json.dumps(content), priority=Priority.REAL_TIME)
 
-    def announced(self) -> bytes | None:
-        """The next change that was announced; None if there is none."""
+    def next_change(self) -> bytes | None:
+        """The next announced change; None if there is none."""
         sample = self._changes.try_recv()
         return None if sample is None else sample.payload.to_bytes()
 
-    def leave(self, reason: str) -> None:
-        """Tell the coordinator that this process ends, and why; without it, it counts as dead."""
+    def report_end(self, reason: str) -> None:
+        """Report to the coordinator why this process ends; without a report it counts as dead."""
         self.session.put(
-            self.key("left", self.role, self.instance), reason, priority=Priority.REAL_TIME
+            self.key("ended", self.role, self.instance), reason, priority=Priority.REAL_TIME
         )
 
     def publish_telemetry(self, table: str, header: bytes, payload: bytes) -> None:
-        """Publish a batch; it never blocks, and is dropped when the recorder does not keep up."""
+        """Publish a batch without blocking; it is dropped if the recorder cannot keep up."""
         self.session.put(
             self.key("telemetry", self.role, table),
             payload,
@@ -150,7 +151,7 @@ class ControlPlane:
         )
 
     def publish_telemetry_blocking(self, table: str, header: bytes, payload: bytes) -> None:
-        """Publish a batch outside the loop, waiting for room."""
+        """Publish a batch outside the loop; block until there is room."""
         self.session.put(
             self.key("telemetry", self.role, table),
             payload,
@@ -172,7 +173,7 @@ class ControlPlane:
 
     @staticmethod
     def dismiss(query: zenoh.Query) -> None:
-        """Leave a request without an answer; whoever still waits for one asks again."""
+        """Drop a request unanswered; a process that still waits sends it again."""
         query.drop()  # type: ignore[no-untyped-call]
 
     def request(
@@ -183,11 +184,17 @@ class ControlPlane:
         timeout_s: float,
         give_up: Callable[[], bool] = lambda: False,
     ) -> bytes:
-        """Ask the queryable ``what/ROLE`` and return its answer.
+        """Send a request to the queryable ``what/ROLE`` and return the answer.
 
-        An answer may take as long as ``timeout_s``. It is asked for again when the queryable does
-        not exist yet, and every five seconds: when a connection was interrupted, question or answer
-        may be lost. So who answers must take a question twice.
+        The request is sent again while the queryable does not exist, and every five seconds: an
+        interrupted connection may lose request or answer. So the answering side must accept a
+        request twice.
+
+        Args:
+            what: name of the queryable.
+            content: sent as JSON.
+            timeout_s: how long to wait for an answer.
+            give_up: ends the wait early when it returns true.
 
         Raises:
             NoAnswerError: no answer came.
@@ -196,18 +203,18 @@ class ControlPlane:
         deadline_s = time.monotonic() + timeout_s
         payload = json.dumps(content)
         while (left_s := deadline_s - time.monotonic()) > 0 and not give_up():
-            wait_s = min(left_s, _ASK_AGAIN_S)
+            wait_s = min(left_s, _REQUEST_AGAIN_S)
             replies = self.session.get(
                 self.key(what, self.role),
                 FifoChannel(4),
                 payload=payload,
-                timeout=wait_s + _ASK_AGAIN_S,  # zenoh's own would come as an error's answer
+                timeout=wait_s + _REQUEST_AGAIN_S,  # zenoh would report its own as an error answer
             )
             again_s = time.monotonic() + wait_s
             while not give_up() and time.monotonic() < again_s:
                 try:
                     reply = replies.try_recv()
-                except zenoh.ZError:  # the query has ended without an answer
+                except zenoh.ZError:  # the query ended without an answer
                     break
                 if reply is None:
                     time.sleep(_POLL_S)

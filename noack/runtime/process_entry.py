@@ -1,4 +1,4 @@
-"""A process's way into a run and out of it: ticket, command line, exit status."""
+"""Entry of a process into a run and its exit: ticket, command line, exit status."""
 
 import argparse
 import json
@@ -12,11 +12,12 @@ from noack.core.errors import ExitStatus, NoackError, NoAnswerError
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.control_plane import ControlPlane
 from noack.runtime.join_ticket import DEFAULT_SESSION, Ticket, loads, wait_for_ticket
-from noack.runtime.process_life import HORIZON, RunProcess, lifeline_cut
+from noack.runtime.life_cycle import HORIZON, Event
+from noack.runtime.process_life import RunProcess, lifeline_cut
 from noack.runtime.signals import Signals
 
 _TICKET_TIMEOUT_S = 24 * 3600.0
-"""A person may take long to start the recorder; who does not want to wait, interrupts."""
+"""A person may start the recorder late; Ctrl-C ends the wait."""
 
 TICKET_ON_STDIN = "NOACK_TICKET_ON_STDIN"
 
@@ -28,38 +29,39 @@ def run_process(
     *,
     as_json: bool = False,
 ) -> ExitStatus:
-    """Join a run as ``role``, do ``body``, and return the exit status.
+    """Join a run as ``role``, run ``body``, and return the exit status.
 
-    A mistake or a peer's fault becomes one line on standard error, with no traceback; ``as_json``
-    also a document on standard output.
+    A caller's or a peer's error becomes one line on standard error, without a traceback; with
+    ``as_json`` also a document on standard output.
     """
     with Signals().handled() as signals:
         try:
             ticket = _ticket(role, session, signals)
-            node = _admitted(role, ticket, signals)
-            with node.plane:
+            process = _admitted(role, ticket, signals)
+            with process.plane:
                 try:
-                    body(node)
+                    body(process)
                 except Exception as error:
-                    node.fail(error)
+                    process.fail(error)
                     raise
                 finally:
-                    node.plane.leave(node.ended)
+                    process.life.apply(Event.END)
+                    process.plane.report_end(process.ended)
         except NoackError as error:
             if signals.received is None:
                 return failed(str(error), error.exit_status, who=f"noack {role}", as_json=as_json)
         except Exception:
             traceback.print_exc()
-            print(f"noack {role}: ended by an error of its own, see above", file=sys.stderr)
+            print(f"noack {role}: internal error, see above", file=sys.stderr)
             return ExitStatus.FAILED
         if signals.received is None and not ticket.launched:
-            print(f"noack {role}: ended: {node.ended}", file=sys.stderr)
-            return ExitStatus.OK if node.ended == HORIZON else ExitStatus.FAILED
+            print(f"noack {role}: ended: {process.ended}", file=sys.stderr)
+            return ExitStatus.OK if process.ended == HORIZON else ExitStatus.FAILED
         return signals.status
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every process takes."""
+    """Add the options that all processes have."""
     parser.add_argument("--session", default=DEFAULT_SESSION, help="name of the recorder's session")
     parser.add_argument("--json", action="store_true", help="print the final report as JSON")
 
@@ -67,7 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def main(
     role: str, body: Callable[[RunProcess], None], arguments: Sequence[str] | None
 ) -> ExitStatus:
-    """Command line of one process that does nothing but join a run."""
+    """Command line of a process that only joins runs."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = Parser(
         prog=f"noack {role}",
@@ -86,10 +88,10 @@ def join_run(
 ) -> ExitStatus:
     """Join a run with the options of :func:`add_options`."""
 
-    def body_and_report(node: RunProcess) -> None:
-        body(node)
+    def body_and_report(process: RunProcess) -> None:
+        body(process)
         if options.json:
-            print(json.dumps(node.report, indent=2))
+            print(json.dumps(process.report, indent=2))
 
     return run_process(role, body_and_report, options.session, as_json=options.json)
 
@@ -111,23 +113,22 @@ def _ticket(role: str, session: str, signals: Signals) -> Ticket:
 
 
 def _admitted(role: str, ticket: Ticket, signals: Signals) -> RunProcess:
-    """Connect to a run and ask to be let in.
+    """Connect to a run and request admission.
 
-    A launched process tries again as long as its launcher waits. On a busy machine a connection may
-    not come about in time, or without what zenoh should have told of the coordinator; then nothing
-    is ever answered over it.
+    A launched process tries again while its launcher lives. On a busy machine a connection may
+    fail, or zenoh may not learn of the coordinator's queryables: then no request is answered.
 
     Raises:
-        PeerError: this process is not let in, or there is no answer.
+        PeerError: the coordinator refused or did not answer.
     """
     while True:
         try:
             with ExitStack() as stack:
                 plane = stack.enter_context(ControlPlane(ticket, role))
-                node = RunProcess(role, ticket, plane, signals)
-                node.request_admission()
+                process = RunProcess(role, ticket, plane, signals)
+                process.request_admission()
                 stack.pop_all()
-                return node
+                return process
         except NoAnswerError:
             if not ticket.launched or signals.received or lifeline_cut():
                 raise

@@ -1,15 +1,15 @@
 """The real-time loop: drives a machine from a socket and a clock.
 
 One thread waits in ``select`` for the socket or the next absolute deadline, whichever comes first.
-select's timeout has microsecond steps; asyncio's and epoll's timers have milliseconds. A deadline
-that was missed is served late and in order, never skipped.
+The timeout of select has microsecond steps; the timers of asyncio and epoll have millisecond steps.
+A missed deadline is served late and in order; none is skipped.
 """
 
 import os
 import select
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from noack.core.clock import RunClock
 from noack.protocol.machine_interface import Machine, Notice, Record
@@ -17,11 +17,11 @@ from noack.protocol.machine_interface import Machine, Notice, Record
 T = TypeVar("T")
 
 _HOUSEKEEPING_S = 0.05
-_BREATH_S = 0.002
+_OVERLOAD_PAUSE_S = 0.002
 _QUIET_S = 0.0005
-"""Housekeeping takes a tenth of a millisecond and is kept this far from the next deadline."""
-_give_way: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
-"""Lets others of the same real-time priority go first: junk is never as urgent as they are."""
+"""Housekeeping takes 0.1 ms; it waits when the next deadline is nearer than this."""
+_yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
+"""After a rejected datagram: lets other threads of the same real-time priority run first."""
 
 
 class Channel(Protocol[T]):
@@ -33,18 +33,18 @@ class Channel(Protocol[T]):
         ...
 
     def receive(self, readable: int) -> T | None:
-        """Take one message from a file descriptor; None if there was none worth taking.
+        """Return one message from a file descriptor; None if there was none.
 
-        Work is bounded: of what is not worth taking it looks at a few in a row at the most.
+        Work is bounded: at most a few datagrams that are no messages are read in one call.
         """
         ...
 
     def send(self, message: T) -> None:
-        """Send a message; never blocks and never raises for a peer's fault."""
+        """Send a message; never blocks, and never raises because of a peer."""
         ...
 
     def tend(self, now_ns: int) -> Sequence[Notice]:
-        """See to itself, called every 50 ms; returns lines for the log."""
+        """Do its own housekeeping, every 50 ms; return lines for the log."""
         ...
 
 
@@ -52,15 +52,15 @@ class RecordSink(Protocol):
     """Where a machine's records and notices go."""
 
     def append(self, record: Record) -> None:
-        """Take a row."""
+        """Add a row."""
         ...
 
     def notice(self, notice: Notice) -> None:
-        """Take a line for the log."""
+        """Add a line for the log."""
         ...
 
     def flush(self) -> None:
-        """Hand over what has been gathered; called every 50 ms."""
+        """Publish the collected rows; called every 50 ms."""
         ...
 
 
@@ -81,76 +81,103 @@ def run_loop(
         machine: the pure machine.
         channel: its socket.
         clock: simulated time.
-        telemetry: takes its records and notices.
+        telemetry: receives its records and notices.
         end_ns: when to end; None runs until stopped.
         stop: asked every 50 ms of wall time.
         spin_us: busy-wait for the last microseconds before a deadline.
-        news: tells the machine what has become known beside its socket, before the first step and
-            every 50 ms; what it answers goes on record.
+        news: passes input from outside the socket to the machine, before the first step and every
+            50 ms, and returns the machine's outputs.
 
     Returns:
-        By how much the machine was behind its deadlines at the end, in ns; 0 if it was not.
+        How late the machine's next deadline was at the end, in ns; 0 if it was not late.
     """
-    spin_s = spin_us * 1e-6
+    loop = _Loop(machine, channel, clock, telemetry, spin_us * 1e-6, news)
     # Looked up once: after milliseconds of sleep the code runs cold, and every step counts.
-    receive, send, handle, on_timer = (
-        channel.receive,
-        channel.send,
-        machine.handle,
-        machine.on_timer,
-    )
-    next_deadline_ns, now_ns, wall_s_until = (
-        machine.next_deadline_ns,
-        clock.now_ns,
-        clock.wall_s_until,
-    )
-
-    def emit(outputs: Sequence[T | Record | Notice]) -> None:
-        for output in outputs:
-            if isinstance(output, Record):
-                telemetry.append(output)
-            elif isinstance(output, Notice):
-                telemetry.notice(output)
-            else:
-                send(output)
-
-    emit(news(now_ns()))
-    housekeeping_s = time.monotonic() + _HOUSEKEEPING_S
-    rested = False
+    step, housekeeping_is_due = loop.step, loop.housekeeping_is_due
     while True:
-        deadline_ns = next_deadline_ns()
-        if deadline_ns is not None and now_ns() >= deadline_ns:
-            emit(on_timer(now_ns()))
-            wait_s = 0.0  # look at the socket between late steps, so that it is never starved
+        step()
+        if housekeeping_is_due():
+            loop.do_housekeeping()
+            if stop() or (end_ns is not None and clock.now_ns() >= end_ns):
+                deadline_ns = machine.next_deadline_ns()
+                return 0 if deadline_ns is None else max(clock.now_ns() - deadline_ns, 0)
+            loop.schedule_housekeeping()
+
+
+class _Loop(Generic[T]):
+    """The parts of one turn of the loop."""
+
+    def __init__(
+        self,
+        machine: Machine[T],
+        channel: Channel[T],
+        clock: RunClock,
+        telemetry: RecordSink,
+        spin_s: float,
+        news: Callable[[int], Sequence[Record | Notice]],
+    ) -> None:
+        self._channel, self._telemetry, self._news = channel, telemetry, news
+        self._handle, self._on_timer = machine.handle, machine.on_timer
+        self._next_deadline_ns = machine.next_deadline_ns
+        self._now_ns, self._wall_s_until = clock.now_ns, clock.wall_s_until
+        self._spin_s = spin_s
+        self._slept = False
+        """Whether the loop has waited for a deadline since the last housekeeping."""
+        self._emit(news(clock.now_ns()))
+        self.schedule_housekeeping()
+
+    def schedule_housekeeping(self) -> None:
+        """Set the time of the next housekeeping."""
+        self._slept = False
+        self._housekeeping_s = time.monotonic() + _HOUSEKEEPING_S
+
+    def step(self) -> None:
+        """Serve the deadline if it is due, or wait for it; then read the socket once."""
+        deadline_ns = self._next_deadline_ns()
+        if deadline_ns is not None and self._now_ns() >= deadline_ns:
+            self._emit(self._on_timer(self._now_ns()))
+            wait_s = 0.0  # the socket is read between late steps, so that it never starves
         else:
-            wait_s = housekeeping_s - time.monotonic()
+            wait_s = self._housekeeping_s - time.monotonic()
             if deadline_ns is not None:
-                left_s = wall_s_until(deadline_ns) - spin_s
-                # Housekeeping that came due too near the deadline waits until that is over.
+                left_s = self._wall_s_until(deadline_ns) - self._spin_s
+                # Housekeeping that is due too near the deadline is done after it.
                 wait_s = left_s if wait_s <= 0 else min(left_s, wait_s)
             wait_s = max(wait_s, 0.0)
-        readable, _, _ = select.select(channel.watched, (), (), wait_s)
-        rested = rested or (wait_s > 0 and not readable)
+        readable, _, _ = select.select(self._channel.watched, (), (), wait_s)
         if readable:
-            message = receive(readable[0])
+            message = self._channel.receive(readable[0])
             if message is not None:
-                emit(handle(message, now_ns()))
+                self._emit(self._handle(message, self._now_ns()))
             else:
-                _give_way()
-        overdue_s = time.monotonic() - housekeeping_s
+                _yield_core()
+        elif wait_s > 0:
+            self._slept = True
+
+    def housekeeping_is_due(self) -> bool:
+        """Whether its time has come and no deadline is near, or it is a whole period late."""
+        overdue_s = time.monotonic() - self._housekeeping_s
         if overdue_s < 0:
-            continue
-        deadline_ns = next_deadline_ns()
-        quiet = deadline_ns is None or wall_s_until(deadline_ns) > _QUIET_S
-        if quiet or overdue_s > _HOUSEKEEPING_S:
-            emit(channel.tend(now_ns()))
-            emit(news(now_ns()))
-            telemetry.flush()
-            if not rested:
-                # Overloaded: at real-time priority nobody else would get this core any more, not
-                # even the thread that keeps this process's connection to the control plane alive.
-                time.sleep(_BREATH_S)
-            rested = False
-            if stop() or (end_ns is not None and now_ns() >= end_ns):
-                return 0 if deadline_ns is None else max(now_ns() - deadline_ns, 0)
-            housekeeping_s = time.monotonic() + _HOUSEKEEPING_S
+            return False
+        deadline_ns = self._next_deadline_ns()
+        quiet = deadline_ns is None or self._wall_s_until(deadline_ns) > _QUIET_S
+        return quiet or overdue_s > _HOUSEKEEPING_S
+
+    def do_housekeeping(self) -> None:
+        """Look after the channel, pass news on, publish the rows."""
+        self._emit(self._channel.tend(self._now_ns()))
+        self._emit(self._news(self._now_ns()))
+        self._telemetry.flush()
+        if not self._slept:
+            # Overload: at real-time priority no other thread would get this core, not even the one
+            # that keeps this process's connection to the control plane alive.
+            time.sleep(_OVERLOAD_PAUSE_S)
+
+    def _emit(self, outputs: Sequence[T | Record | Notice]) -> None:
+        for output in outputs:
+            if isinstance(output, Record):
+                self._telemetry.append(output)
+            elif isinstance(output, Notice):
+                self._telemetry.notice(output)
+            else:
+                self._channel.send(output)

@@ -1,7 +1,7 @@
-"""Runs that go on now, and how their owner reaches them from another terminal.
+"""The user's active runs, and how to reach them from another terminal.
 
-The launcher keeps a file for each (:mod:`noack.runtime.lock_file`). It holds what opens the run's
-control plane, from which the key that authenticates the loop's datagrams cannot be found.
+The launcher keeps a lock file for its run (:mod:`noack.runtime.lock_file`). It holds the secret of
+the run's control plane. The key that authenticates the loop's datagrams cannot be derived from it.
 """
 
 import json
@@ -29,10 +29,10 @@ class OpenRun(NamedTuple):
     """How to reach a run."""
 
     run_id: str
-    """As its control plane's keys have it."""
+    """As in the keys of its control plane."""
     run_dir: str
     session: str | None
-    """Name of the session that people's processes join; None if all were launched."""
+    """Session name for processes started by hand; None if all were launched."""
     endpoint: str
     """zenoh endpoint of the control plane."""
     user: str
@@ -44,7 +44,7 @@ _OPEN_RUN = TypeAdapter(OpenRun)
 
 @contextmanager
 def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
-    """Keep a run's file while the context lasts.
+    """Keep a run's lock file while the context lasts.
 
     Raises:
         CallerError: the folder is not the user's own.
@@ -58,14 +58,14 @@ def published(ticket: Ticket, session: str | None) -> Iterator[Path]:
 
 
 def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
-    """Return the newest run of this user that goes on.
+    """Return the newest active run of this user.
 
     Args:
-        session: the one of this session.
-        run_dir: the one with this run directory.
+        session: only a run of this session.
+        run_dir: only the run with this run directory.
 
     Raises:
-        CallerError: there is none.
+        CallerError: no such run is active.
     """
     newest_first = sorted(
         lock_file.live_lock_files(_KIND), key=lambda file: file.written_ns, reverse=True
@@ -80,29 +80,30 @@ def find(session: str | None = None, run_dir: Path | None = None) -> OpenRun:
     if fitting:
         return fitting[0]
     if not found:
-        raise CallerError("no run goes on; start one, e.g. `noack demo`")
+        raise CallerError("no run is active; start one, e.g. `noack demo`")
     which = f"in session {session!r}" if run_dir is None else f"in {run_dir}"
     others = ", ".join(run.run_dir for run in found)
-    raise CallerError(f"no run goes on {which}; there is {others}")
+    raise CallerError(f"no run is active {which}; active: {others}")
 
 
-def ask(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Ask a run for a change of settings, or with none what they are; return its answer.
+def request_change(run: OpenRun, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Request a change of runtime parameters; without settings, their values. Return the answer.
 
     Raises:
-        CallerError: what was asked for is wrong; one line per mistake.
+        CallerError: the settings are wrong; one line per mistake.
         PeerError: the run does not answer.
     """
     secret = SessionSecret(run.user, run.password)
     try:
-        star = open_session(run.endpoint, secret, listen=False)
+        plane = open_session(run.endpoint, secret, listen=False)
     except zenoh.ZError as error:
         raise PeerError(f"{run.run_dir}: the run cannot be reached: {cause_of(error)}") from None
     try:
-        question = json.dumps({"settings": dict(settings)})
-        answer = answer_to(star, f"noack/{run.run_id}/knobs", question, _ANSWER_S)
+        request = json.dumps({"settings": dict(settings)})
+        key = f"noack/{run.run_id}/runtime_parameters"
+        answer = answer_to(plane, key, request, _ANSWER_S)
     finally:
-        star.close()  # type: ignore[no-untyped-call]
+        plane.close()  # type: ignore[no-untyped-call]
     if answer is None:
         raise PeerError(f"{run.run_dir}: the run does not answer")
     return parse_message(ChangeReply, answer)
@@ -112,6 +113,4 @@ def _read(file: lock_file.LockFile) -> OpenRun:
     try:
         return _OPEN_RUN.validate_json(file.content, strict=True)
     except ValidationError as error:
-        raise PeerError(
-            f"{file.path}: what tells of a run cannot be read: {brief(error)}"
-        ) from None
+        raise PeerError(f"{file.path}: not a valid file of an active run: {brief(error)}") from None

@@ -14,6 +14,8 @@ from typing import BinaryIO
 
 from noack.core.errors import MachineError, why
 
+SPOOL = "spool"
+"""The spool's folder in the run directory."""
 _CHUNK = struct.Struct("<QQ")
 
 

@@ -1,7 +1,7 @@
-"""A star on zenoh, over TCP: its centre listens, and everyone else connects with its secret.
+"""zenoh sessions over TCP: one process listens, the others connect with a shared secret.
 
-There is no way to open one without a secret. zenoh asks who connects for it by challenge and
-response, so that it is never sent, and lets nobody else in.
+No session opens without a secret. zenoh checks it by challenge and response, so that it is never
+sent, and refuses all other connections.
 """
 
 import json
@@ -17,28 +17,28 @@ from zenoh.handlers import FifoChannel
 from noack.core.errors import CallerError
 
 LEASE_MS = 2000
-"""Whoever is silent for so long is gone."""
+"""A peer that is silent for longer is gone."""
 _CONNECT_MS = 5000
 _SHAKE_HANDS_MS = 2000
-"""Of those who have connected and not yet shown the secret, zenoh serves 100 at a time."""
+"""zenoh serves at most 100 connections at a time that have not yet shown the secret."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5}
-"""Who finds that many before him comes again soon."""
+"""Of a connection that finds 100 before it."""
 
 
 class SessionSecret(NamedTuple):
-    """What opens a star; neither part holds a colon or a line's end."""
+    """User and password of a session; neither contains a colon or a line break."""
 
     user: str
     password: str
 
 
 def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh.Session:
-    """Open a session in a star.
+    """Open a session.
 
     Args:
-        endpoint: where the centre listens, e.g. ``tcp/127.0.0.1:7447``.
-        secret: the centre lets in who has it; who connects shows it.
-        listen: this is the centre.
+        endpoint: the listening address, e.g. ``tcp/127.0.0.1:7447``.
+        secret: required from all that connect.
+        listen: listen on the endpoint instead of connecting to it.
 
     Raises:
         zenoh.ZError: the endpoint cannot be listened on, or reached; or the secret is wrong.
@@ -53,7 +53,7 @@ def open_session(endpoint: str, secret: SessionSecret, *, listen: bool) -> zenoh
 
 @contextmanager
 def _dictionary(secret: SessionSecret) -> Iterator[str]:
-    """A file for zenoh, which reads passwords from nothing else, that never lies on a disk."""
+    """A password file for zenoh that is never on a disk: zenoh reads passwords from files only."""
     reading, writing = os.pipe()
     try:
         with os.fdopen(writing, "w") as pipe:
@@ -66,12 +66,12 @@ def _dictionary(secret: SessionSecret) -> Iterator[str]:
 def session_config(
     endpoint: str, *, listen: bool, more: Mapping[str, Any] | None = None
 ) -> zenoh.Config:
-    """Return the configuration of a star's centre (``listen``), or of one who connects to it.
+    """Return the zenoh configuration of a listening or of a connecting session.
 
     Args:
-        endpoint: where the centre listens.
-        listen: this is the centre.
-        more: further settings of zenoh by their keys.
+        endpoint: the listening address.
+        listen: listen on the endpoint instead of connecting to it.
+        more: further zenoh settings by key.
     """
     config = zenoh.Config()
     side, other = ("listen", "connect") if listen else ("connect", "listen")
@@ -85,12 +85,12 @@ def session_config(
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
-        "adminspace/enabled": False,  # it would tell the configuration, with the secret
-        # Its shared-memory path would take payloads of 3 KiB and more past the socket.
+        "adminspace/enabled": False,  # it would publish the configuration with the secret
+        # Shared memory would bypass the socket for payloads of 3 KiB and more.
         "transport/shared_memory/enabled": False,
         "transport/unicast/accept_timeout": _SHAKE_HANDS_MS,
         "transport/link/tx/lease": LEASE_MS,
-        # A batch that finds no room is dropped at once; the loop does not wait for it.
+        # A batch without room is dropped at once: the loop must not wait.
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
     }
     for key, value in (settings | dict(more or {})).items():
@@ -99,17 +99,17 @@ def session_config(
 
 
 def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float) -> str | None:
-    """Ask a star's centre, and return its answer; None if there is none in time.
+    """Send a request to the listening session and return its answer; None without one in time.
 
     Raises:
-        CallerError: what was asked for is wrong; one line.
+        CallerError: the request was refused as wrong.
     """
     replies = session.get(key, FifoChannel(4), payload=question, timeout=timeout_s)
     deadline_s = time.monotonic() + timeout_s
     while time.monotonic() < deadline_s:
         try:
             reply = replies.try_recv()
-        except zenoh.ZError:  # the query has ended without an answer
+        except zenoh.ZError:  # the query ended without an answer
             return None
         if reply is None:
             time.sleep(0.002)
@@ -121,6 +121,5 @@ def answer_to(session: zenoh.Session, key: str, question: str, timeout_s: float)
 
 
 def cause_of(error: zenoh.ZError) -> str:
-    """Return what went wrong, in zenoh's words."""
-    # zenoh ends its messages with the place in its own source.
+    """Return zenoh's message without the place in its own source."""
     return str(error).partition(" at /")[0]

@@ -27,10 +27,9 @@ def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[s
         if entry.ispkg:
             continue
         for one in vars(import_module(entry.name)).values():
-            if not (isinstance(one, type) and issubclass(one, base)) or one is base:
-                continue
-            if one.__module__ == entry.name:
-                found[get_args(one.model_fields[key].annotation)[0]] = one
+            if isinstance(one, type) and issubclass(one, base) and one.__module__ == entry.name:
+                names = get_args(one.model_fields[key].annotation)  # empty for a base class
+                found |= dict.fromkeys(names, one)
     return found
 
 

@@ -13,16 +13,6 @@ import numpy as np
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.config.state_estimation import SteadyState, steady_state
-from noack.config.triggers import (
-    AbsoluteSettings,
-    AnyTrigger,
-    DeadlineSettings,
-    DecayingSettings,
-    DwellSettings,
-    MixedSettings,
-    RelativeSettings,
-    SelfTriggeredSettings,
-)
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.theory.certificate import Constants, NetworkConditions
@@ -135,7 +125,7 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
     is left of the one in the other, and three times that to be rarely beyond. With time the first
     one grows as the plant does, and every threshold is reached.
     """
-    least = least_threshold(resolved.trigger)
+    least = resolved.trigger.least_threshold
     if least is None:
         return []
     weight = np.eye(loop.n) if loop.weight is None else loop.weight
@@ -147,23 +137,6 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
             f"at once: at least {3 * size:.2g} is advised, for the noise not to transmit",
         )
     ]  # fmt: skip
-
-
-def least_threshold(trigger: AnyTrigger) -> float | None:
-    """Below what a trigger's threshold of ‖e_s‖_W never falls; None of one that has none."""
-    match trigger:
-        case DecayingSettings() | SelfTriggeredSettings():
-            return trigger.floor
-        case AbsoluteSettings():
-            return trigger.delta
-        case RelativeSettings():
-            return 0.0
-        case MixedSettings():
-            return trigger.epsilon
-        case DeadlineSettings() | DwellSettings():
-            return least_threshold(trigger.rule)
-        case _:
-            return None
 
 
 def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:

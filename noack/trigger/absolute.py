@@ -5,10 +5,45 @@ inter-event time is positive for bounded states, as e_s grows from 0 at a bounde
 """
 
 from dataclasses import dataclass
+from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
+from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
 from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class AbsoluteSettings(WeightedSettings):
+    """Send-on-delta: transmit when ‖e_s‖_W > δ."""
+
+    policy: Literal["absolute"]
+    """The event-triggering policy."""
+    delta: Size
+    """δ, in the units of ‖W x‖."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A small δ."""
+        return cls(policy="absolute", delta=0.05)
+
+    def trigger_policy(self, model: ModelMatrices) -> "AbsoluteTrigger":
+        """Return the behaviour."""
+        return AbsoluteTrigger(self.delta, self.weight_matrix)
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        return f"‖e_s‖ > {self.delta:g}"
+
+    @property
+    def largest_threshold(self) -> float:
+        """δ."""
+        return self.delta
+
+    @property
+    def least_threshold(self) -> float:
+        """δ."""
+        return self.delta
 
 
 @dataclass(frozen=True)

@@ -1,32 +1,41 @@
-"""Any rule, or a deadline: transmit at the latest T_max after the last event.
+"""Any rule with a deadline: transmit at the latest T_max after the last event.
 
-The combined rule of Garcia & Antsaklis's earlier work (the paper's reference Garcia16iet): silence
-then tells the controller something. What the rule keeps below its threshold stays there.
+This is the combined rule of Garcia & Antsaklis's earlier work (the paper's reference Garcia16iet):
+if the controller hears nothing for T_max, an update was lost. What the rule keeps below its
+threshold stays there.
 """
 
-from dataclasses import dataclass
+from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.combined import CombinedSettings, CombinedTrigger
+from noack.trigger.mixed import MixedSettings
+from noack.trigger.policy_settings import ModelMatrices, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule
 
 
-@dataclass(frozen=True)
-class DeadlineTrigger:
+class DeadlineSettings(CombinedSettings):
+    """Any rule, and at the latest so long after the last event."""
+
+    policy: Literal["deadline"]
+    """The event-triggering policy."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A deadline for the mixed rule."""
+        return cls(policy="deadline", rule=MixedSettings.example(n), interval_s=1.0)
+
+    def trigger_policy(self, model: ModelMatrices) -> "DeadlineTrigger":
+        """Return the behaviour."""
+        return DeadlineTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
+
+    @property
+    def description(self) -> str:
+        """The rule's condition, or the deadline."""
+        return f"{self.rule.description}, or {self.interval_s:g} s after the last event"
+
+
+class DeadlineTrigger(CombinedTrigger):
     """A rule with a deadline."""
-
-    rule: Policy
-    interval_ns: int
-
-    @property
-    def weight(self) -> Matrix | None:
-        """That of the rule."""
-        return self.rule.weight
-
-    @property
-    def initial_dynamic_variable(self) -> float:
-        """That of the rule."""
-        return self.rule.initial_dynamic_variable
 
     def trigger_rule(self, n: int) -> TriggerRule:
         """The rule's, and the deadline."""

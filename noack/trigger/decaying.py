@@ -7,12 +7,60 @@ minimum inter-event time is positive by Theorem 2 for 0 < α < ᾱ; with ε > 0 
 """
 
 import math
+from dataclasses import dataclass
+from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix, Vector, norm
+from noack.settings.section import NonNegative, Positive
+from noack.trigger.policy_settings import ModelMatrices, WeightedSettings
 from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
 from noack.trigger.trigger_rule import TriggerRule
 
 
+class DecayingSettings(WeightedSettings):
+    """The paper's trigger: transmit when ‖e_s‖_W > max(β e^{−αt}, floor)."""
+
+    policy: Literal["decaying"] = "decaying"
+    """The event-triggering policy."""
+    beta: Positive
+    """β, in the units of ‖W x‖."""
+    alpha_per_s: Positive
+    """α, per second."""
+    floor: NonNegative = 0.0
+    """ε: the threshold never falls below it (practical stability); 0 is the paper's rule."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A decay slower than that of the shipped examples."""
+        return cls(beta=0.5, alpha_per_s=0.25)
+
+    def trigger_policy(self, model: ModelMatrices) -> "DecayingTrigger":
+        """Return the behaviour."""
+        return DecayingTrigger(self.beta, self.alpha_per_s, self.floor, self.weight_matrix)
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
+
+    @property
+    def largest_threshold(self) -> float:
+        """The larger of β and ε."""
+        return max(self.beta, self.floor)
+
+    @property
+    def least_threshold(self) -> float:
+        """ε."""
+        return self.floor
+
+
+def decaying_text(beta: float, alpha_per_s: float, floor: float) -> str:
+    """Return max(β e^{−αt}, ε) with its numbers."""
+    decay = f"{beta:g} e^(−{alpha_per_s:g} t)"
+    return f"max({decay}, {floor:g})" if floor else decay
+
+
+@dataclass(frozen=True)
 class DecayingTrigger:
     """The paper's policy.
 
@@ -23,15 +71,11 @@ class DecayingTrigger:
         weight: W, shape (n, n), or None for the identity.
     """
 
+    beta: float
+    alpha_per_s: float
+    floor: float = 0.0
+    weight: Matrix | None = None
     initial_dynamic_variable = 0.0
-
-    def __init__(
-        self, beta: float, alpha_per_s: float, floor: float = 0.0, weight: Matrix | None = None
-    ) -> None:
-        self.beta = beta
-        self.alpha_per_s = alpha_per_s
-        self.floor = floor
-        self.weight = weight
 
     def trigger_rule(self, n: int) -> TriggerRule:
         """The same after every event: eq:thre counts from the run's start."""

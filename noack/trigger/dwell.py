@@ -4,32 +4,40 @@ The minimum inter-event time is τ_min by construction. What the rule would have
 threshold may exceed it for as long.
 """
 
-from dataclasses import dataclass
+from typing import Literal, Self
 
-from noack.core.linear_systems import Matrix
-from noack.trigger.trigger_policy import Policy
+from noack.trigger.combined import CombinedSettings, CombinedTrigger
+from noack.trigger.lyapunov import LyapunovSettings
+from noack.trigger.policy_settings import ModelMatrices, nanoseconds
 from noack.trigger.trigger_rule import TriggerRule
 
 
-@dataclass(frozen=True)
-class DwellTrigger:
+class DwellSettings(CombinedSettings):
+    """Any rule, but not earlier than so long after the last event."""
+
+    policy: Literal["dwell"]
+    """The event-triggering policy."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A dwell time for the Lyapunov rule, whose events would accumulate under losses."""
+        return cls(policy="dwell", rule=LyapunovSettings.example(n), interval_s=0.1)
+
+    def trigger_policy(self, model: ModelMatrices) -> "DwellTrigger":
+        """Return the behaviour."""
+        return DwellTrigger(self.rule.trigger_policy(model), nanoseconds(self.interval_s))
+
+    @property
+    def description(self) -> str:
+        """The rule's condition, and the dwell time."""
+        return f"{self.rule.description}, not within {self.interval_s:g} s of the last event"
+
+
+class DwellTrigger(CombinedTrigger):
     """A rule with a dwell time."""
 
-    rule: Policy
-    interval_ns: int
-
-    @property
-    def weight(self) -> Matrix | None:
-        """That of the rule."""
-        return self.rule.weight
-
-    @property
-    def initial_dynamic_variable(self) -> float:
-        """That of the rule."""
-        return self.rule.initial_dynamic_variable
-
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The rule's, after the dwell time; what is due before then is due at its end."""
+        """The rule's, after the dwell time; an event that is due before happens at its end."""
         rule = self.rule.trigger_rule(n)
         return rule._replace(
             idle_ns=max(rule.idle_ns, self.interval_ns),

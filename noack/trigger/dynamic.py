@@ -1,21 +1,62 @@
-"""Dynamic triggering: what the relative rule would have saved may be spent later.
+"""Dynamic triggering: a margin that the relative rule leaves unused postpones later events.
 
     η̇ = −λη + w,   w = σ xᵀQx − 2 xᵀPBK e_s,   transmit when η + θw ≤ 0
 
 with AᵀP+PA = −Q of the closed loop A = Â+B̂K (Girard, IEEE TAC 60(7), 2015). θ = 0 transmits when
-η is used up; θ → ∞ is the static rule w < 0, which ensures V̇ ≤ −(1−σ) xᵀQx where every update
-arrives. Events are never earlier than those of the static rule from the same state on. When
-updates are lost, the same holds as of the relative rule.
+η reaches 0; θ → ∞ is the static rule w < 0, which ensures V̇ ≤ −(1−σ) xᵀQx where every update
+arrives. From the same state on, events are never earlier than those of the static rule. When
+updates are lost, the same holds as for the relative rule.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
+from pydantic import Field, FiniteFloat
 
 from noack.core.linear_systems import Matrix
+from noack.trigger.policy_settings import LyapunovFunctionSettings, ModelMatrices
 from noack.trigger.trigger_condition import DynamicVariable, QuadraticForm, quadratic_form
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class DynamicSettings(LyapunovFunctionSettings):
+    """Transmit when η + θw ≤ 0, η̇ = −λη + w, w = σxᵀQx − 2xᵀPBKe_s (Girard 2015)."""
+
+    at_start_only: ClassVar = ("eta_0",)
+
+    policy: Literal["dynamic"]
+    """The event-triggering policy."""
+    sigma: Annotated[FiniteFloat, Field(gt=0, lt=1)]
+    """σ."""
+    theta_s: Annotated[FiniteFloat, Field(gt=0, le=1e9)]
+    """θ, in seconds."""
+    decay_per_s: Annotated[FiniteFloat, Field(ge=0, le=1e4)]
+    """λ. η decays with the time constant 1/λ, which exact simulation must resolve."""
+    eta_0: Annotated[FiniteFloat, Field(ge=0, le=1e15)] = 0.0
+    """η at the start."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A rule that starts with a margin."""
+        return cls(policy="dynamic", sigma=0.5, theta_s=0.5, decay_per_s=0.5, eta_0=1.0)
+
+    def trigger_policy(self, model: ModelMatrices) -> "DynamicTrigger":
+        """Return the behaviour."""
+        P, Q = self.lyapunov_function(model)
+        return DynamicTrigger(
+            self.sigma, self.theta_s, self.decay_per_s, P, Q, model.B @ model.K, self.eta_0,
+            self.weight_matrix,
+        )  # fmt: skip
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        return (
+            f"η + {self.theta_s:g} w ≤ 0, dη/dt = −{self.decay_per_s:g} η + w, "
+            f"w = {self.sigma:g} xᵀQx − 2 xᵀPBK e_s"
+        )
 
 
 @dataclass(frozen=True)
@@ -30,7 +71,7 @@ class DynamicTrigger:
         Q: its decrease, (n, n).
         BK: B̂K, (n, n).
         initial_dynamic_variable: η at the start, ≥ 0.
-        weight: only for showing errors.
+        weight: W of the norm in which errors are shown.
     """
 
     sigma: float
@@ -53,6 +94,6 @@ class DynamicTrigger:
         return quadratic_form(-self.theta_s * w), quadratic_form(w)
 
     def trigger_rule(self, n: int) -> TriggerRule:
-        """The same after every event; η goes on."""
-        spent, gained = self._forms
-        return TriggerRule(spent, dynamic_variable=DynamicVariable(self.decay_per_s, gained))
+        """The same after every event; η is not reset."""
+        compared, gain = self._forms
+        return TriggerRule(compared, dynamic_variable=DynamicVariable(self.decay_per_s, gain))

@@ -1,19 +1,56 @@
-"""Transmit when the sensor error is large beside the state: ‖e_s‖_W² > σ²‖x‖_W² + ε².
+"""Transmit when the sensor error is large relative to the state: ‖e_s‖_W² > σ²‖x‖_W² + ε².
 
 ε = 0 is the relative rule (Tabuada, IEEE TAC 52(9), 2007): where every update arrives, and σ is
 small enough, the loop is asymptotically stable and the minimum inter-event time positive. When
-updates are lost e_c no longer follows e_s, and the state's smallness no longer says that little is
-to be sent: near the origin events may accumulate. σ = 0 is send-on-delta. With ε > 0 stability is
-practical, and the minimum inter-event time positive for bounded states.
+updates are lost, e_c no longer follows e_s: a small state then does not mean a small e_c, and
+events may accumulate near the origin. σ = 0 is send-on-delta. With ε > 0 stability is practical,
+and the minimum inter-event time positive for bounded states.
 """
 
 from dataclasses import dataclass
+from typing import Literal, Self
 
 import numpy as np
 
 from noack.core.linear_systems import Matrix
+from noack.trigger.policy_settings import ModelMatrices, Share, Size, WeightedSettings
 from noack.trigger.trigger_condition import QuadraticForm, error_map, state_map
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class MixedSettings(WeightedSettings):
+    """Transmit when ‖e_s‖_W² > σ²‖x‖_W² + ε²."""
+
+    policy: Literal["mixed"]
+    """The event-triggering policy."""
+    sigma: Share
+    """σ."""
+    epsilon: Size
+    """ε, in the units of ‖W x‖."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A small constant."""
+        return cls(policy="mixed", sigma=0.1, epsilon=0.05)
+
+    def trigger_policy(self, model: ModelMatrices) -> "MixedTrigger":
+        """Return the behaviour."""
+        return MixedTrigger(self.sigma, self.epsilon, self.weight_matrix)
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        return f"‖e_s‖² > {self.sigma:g}² ‖x‖² + {self.epsilon:g}²"
+
+    @property
+    def largest_threshold(self) -> float:
+        """ε."""
+        return self.epsilon
+
+    @property
+    def least_threshold(self) -> float:
+        """ε."""
+        return self.epsilon
 
 
 @dataclass(frozen=True)

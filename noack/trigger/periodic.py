@@ -1,10 +1,35 @@
 """Time-triggered control: transmit every period, whatever is measured."""
 
 from dataclasses import dataclass
+from typing import Literal, Self
 
 from noack.core.linear_systems import Matrix
+from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_condition import QuadraticForm, empty_map
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class PeriodicSettings(WeightedSettings):
+    """Time-triggered: transmit every period."""
+
+    policy: Literal["periodic"]
+    """The event-triggering policy."""
+    period_s: Interval
+    """Period."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """Once a second."""
+        return cls(policy="periodic", period_s=1.0)
+
+    def trigger_policy(self, model: ModelMatrices) -> "PeriodicTrigger":
+        """Return the behaviour."""
+        return PeriodicTrigger(nanoseconds(self.period_s), self.weight_matrix)
+
+    @property
+    def description(self) -> str:
+        """The period."""
+        return f"every {self.period_s:g} s"
 
 
 @dataclass(frozen=True)

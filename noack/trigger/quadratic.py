@@ -6,12 +6,74 @@ period by construction. A heartbeat transmits after so many periods without an e
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
+from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix
+from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import NonNegative
+from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.trigger_condition import NEVER_NS, QuadraticForm, quadratic_form
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class QuadraticSettings(WeightedSettings):
+    """Periodic event-triggered control: at sampling times, transmit when zᵀQz > ε, z = (x, e_s)."""
+
+    policy: Literal["quadratic"]
+    """The event-triggering policy."""
+    Q: Rows
+    """Q by rows, 2n x 2n, symmetric."""
+    epsilon: NonNegative = 0.0
+    """ε."""
+    period_s: Interval
+    """Sampling period; a whole number of the time between measurements."""
+    heartbeat: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    """Transmit after so many periods at the latest; 0: only when the rule says so."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """The mixed rule, sampled."""
+        diagonal = np.diag([-0.04] * n + [1.0] * n).tolist()
+        Q = tuple(map(tuple, diagonal))
+        return cls(policy="quadratic", Q=Q, epsilon=0.0025, period_s=0.05)
+
+    def trigger_policy(self, model: ModelMatrices) -> "QuadraticTrigger":
+        """Return the behaviour."""
+        return QuadraticTrigger(
+            np.array(self.Q), nanoseconds(self.period_s), self.epsilon, self.heartbeat,
+            self.weight_matrix,
+        )  # fmt: skip
+
+    @property
+    def description(self) -> str:
+        """The condition, its period and the heartbeat."""
+        heartbeat = f", or after {self.heartbeat} periods" if self.heartbeat else ""
+        return f"zᵀQz > {self.epsilon:g}, sampled every {self.period_s:g} s{heartbeat}"
+
+    @property
+    def largest_threshold(self) -> float:
+        """ε."""
+        return self.epsilon
+
+    def check(self, n: int, why: str) -> None:
+        """Require matrices of the right shapes, and a symmetric Q."""
+        super().check(n, why)
+        require_shape(self.Q, "trigger.Q", (2 * n, 2 * n), f"{why}, and z = (x, e_s)")
+        Q = np.array(self.Q)
+        if not np.allclose(Q, Q.T, rtol=1e-12, atol=0.0):
+            raise ValueError("trigger.Q: must be symmetric")
+
+    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
+        """Require a whole number of the time between measurements."""
+        if nanoseconds(self.period_s) % measured_ns:
+            raise ValueError(
+                f"{key}.period_s: must be a whole number of the {measured_ns / NS_PER_S} s "
+                "between measurements"
+            )
 
 
 @dataclass(frozen=True)
@@ -23,7 +85,7 @@ class QuadraticTrigger:
         period_ns: sampling period.
         epsilon: ε ≥ 0.
         heartbeat: transmit after so many periods at the latest; 0 for none.
-        weight: only for showing errors.
+        weight: W of the norm in which errors are shown.
     """
 
     Q: Matrix

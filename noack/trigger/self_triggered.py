@@ -1,21 +1,92 @@
-"""Self-triggered control: at each event the sensor says when the next one is, and sleeps.
+"""Self-triggered control: at each event the sensor computes the time of the next one.
 
 It assumes d‖e_s‖_W/dt ≤ L‖e_s‖_W + a‖x(t_k)‖_W + b between events, so that
 
     ‖e_s(t_k + τ)‖_W ≤ (a‖x(t_k)‖_W + b) (e^{Lτ} − 1)/L,
 
-and transmits when this bound reaches max(βe^{−α(t_k+τ)}, ε), though within [τ_min, τ_max]. Where
+and it transmits when this bound reaches max(βe^{−α(t_k+τ)}, ε), within [τ_min, τ_max]. Where
 the assumption holds, and τ_min has not delayed it, ‖e_s‖_W stays below the paper's threshold
-without being watched. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010; the bound is
+without being tested. (The idea is that of Anta & Tabuada, IEEE TAC 55(9), 2010; the bound is
 Gronwall's.)
 """
 
 from dataclasses import dataclass
+from typing import Literal, Self
+
+from pydantic import model_validator
 
 from noack.core.linear_systems import Matrix
+from noack.settings.section import NonNegative, Positive
+from noack.trigger.decaying import decaying_text
+from noack.trigger.policy_settings import Interval, ModelMatrices, WeightedSettings, nanoseconds
 from noack.trigger.self_triggered_interval import Forecast
 from noack.trigger.trigger_condition import QuadraticForm, empty_map
 from noack.trigger.trigger_rule import TriggerRule
+
+
+class SelfTriggeredSettings(WeightedSettings):
+    """At each event the sensor decides when the next one is.
+
+    It is when ‖e_s‖_W could reach the paper's threshold, given
+    d‖e_s‖_W/dt ≤ L‖e_s‖_W + a‖x(t_k)‖_W + b.
+    """
+
+    policy: Literal["self_triggered"]
+    """The event-triggering policy."""
+    beta: Positive
+    """β, in the units of ‖W x‖."""
+    alpha_per_s: Positive
+    """α, per second."""
+    floor: NonNegative = 0.0
+    """ε."""
+    growth_per_s: NonNegative
+    """L."""
+    mismatch_per_s: NonNegative
+    """a."""
+    disturbance_per_s: NonNegative = 0.0
+    """b, in the units of ‖W x‖ per second."""
+    shortest_s: Interval
+    """The next event is not earlier."""
+    longest_s: Interval
+    """It is not later."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.longest_s < self.shortest_s:
+            raise ValueError("longest_s: must not be less than shortest_s")
+        return self
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A forecast that is pessimistic for the shipped loops."""
+        return cls(
+            policy="self_triggered", beta=0.5, alpha_per_s=0.25, growth_per_s=1.0,
+            mismatch_per_s=1.0, shortest_s=0.1, longest_s=5.0,
+        )  # fmt: skip
+
+    def trigger_policy(self, model: ModelMatrices) -> "SelfTrigger":
+        """Return the behaviour."""
+        return SelfTrigger(
+            self.beta, self.alpha_per_s, self.floor, self.growth_per_s, self.mismatch_per_s,
+            self.disturbance_per_s, nanoseconds(self.shortest_s), nanoseconds(self.longest_s),
+            self.weight_matrix,
+        )  # fmt: skip
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        threshold = decaying_text(self.beta, self.alpha_per_s, self.floor)
+        return f"‖e_s‖ could reach {threshold}, as forecast at the last event"
+
+    @property
+    def largest_threshold(self) -> float:
+        """The larger of β and ε."""
+        return max(self.beta, self.floor)
+
+    @property
+    def least_threshold(self) -> float:
+        """ε."""
+        return self.floor
 
 
 @dataclass(frozen=True)

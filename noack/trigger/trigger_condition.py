@@ -1,11 +1,15 @@
-"""When a sensor transmits next, as data: what every policy comes down to between two events.
+"""When a sensor transmits next, as data: the form that every policy has between two events.
 
 With z = (x, e_s), the sensor transmits at the first time t at which
 
     ‖P z‖² > max(c e^{−ρ(t−t₀)}, f)² + ‖N z‖² + η(t),    η̇ = −λη + ‖P_η z‖² − ‖N_η z‖²,
 
-though not before ``earliest_ns`` and, on a grid, at its points only; and at ``latest_ns`` anyhow.
-The live sensor evaluates this at its measurements; exact simulation finds the first t between them.
+but not before ``earliest_ns`` and, on a grid, at its points only; and at ``latest_ns`` in any case.
+A condition that integrates compares ∫‖P z‖dτ, from the last event to t, instead of ‖P z‖.
+
+η and the integral are the *auxiliary variable* of a condition. The live sensor evaluates the
+condition at its measurements: between two of them it takes ‖P_η z‖² − ‖N_η z‖² as it was at the
+first, and integrates ‖P z‖ by the trapezoidal rule. Exact simulation finds the first t.
 """
 
 import math
@@ -27,20 +31,16 @@ class QuadraticForm(NamedTuple):
     down: Matrix
     """N, shape (q, 2n); q = 0 for none."""
 
-    def value(self, z: Vector) -> float:
-        """‖P z‖² − ‖N z‖² of a z of shape (2n,)."""
-        up, down = norm(self.up @ z), norm(self.down @ z)
-        return up * up - down * down  # where a float's power would raise, its product is infinite
-
+    @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
     def values(self, z: Matrix) -> Vector:
-        """The same of k z, shape (k, 2n) → (k,)."""
+        """‖P z‖² − ‖N z‖² of k z, shape (k, 2n) → (k,)."""
         up, down = (np.einsum("ij,ij->i", part, part) for part in (z @ self.up.T, z @ self.down.T))
         values: Vector = up - down
         return values
 
 
 class DynamicVariable(NamedTuple):
-    """What a dynamic rule has saved up: η̇ = −λη + ψ(z)."""
+    """Girard's dynamic variable: η̇ = −λη + ψ(z)."""
 
     decay_per_s: float
     """λ."""
@@ -69,57 +69,86 @@ class TriggerCondition(NamedTuple):
     earliest_ns: float = -math.inf
     latest_ns: float = NEVER_NS
     grid_ns: float = 0.0
-    """Distance of the points at which the rule is looked at, from t = 0 on; 0: it always is."""
+    """Period of the times at which the comparison counts, from t = 0 on; 0: it always counts."""
     dynamic_variable: DynamicVariable | None = None
+    integrates: bool = False
+    """Whether ∫‖P z‖dτ since the last event is compared; then N is empty, and there is no η."""
+
+    @property
+    def has_auxiliary(self) -> bool:
+        """Whether there is an auxiliary variable: η or the integral."""
+        return self.integrates or self.dynamic_variable is not None
+
+    def auxiliary_rates(self, z: Matrix) -> Vector:
+        """What drives the auxiliary variable, per second, at k z, shape (k, 2n) → (k,)."""
+        if self.dynamic_variable is not None:
+            return self.dynamic_variable.gain.values(z)
+        rates: Vector = np.linalg.norm(z @ self.form.up.T, axis=1)
+        return rates
+
+    def auxiliary_after(self, dt_s: float, auxiliary: float, first: float, last: float) -> float:
+        """The auxiliary variable one measurement later.
+
+        Args:
+            dt_s: time between the measurements.
+            auxiliary: its value at the first of them.
+            first: its rate at the first, of :meth:`auxiliary_rates`.
+            last: its rate at the second.
+        """
+        if self.dynamic_variable is not None:
+            return self.dynamic_variable.after(dt_s, auxiliary, first)
+        return auxiliary + dt_s * (first + last) / 2
 
     def threshold(self, t_ns: float) -> float:
         """max(c e^{−ρ(t−t₀)}, f)."""
-        faded = self.level * math.exp(-self.rate_per_s * (t_ns - self.since_ns) * 1e-9)
-        return max(faded, self.floor)
+        decayed = self.level * math.exp(-self.rate_per_s * (t_ns - self.since_ns) * 1e-9)
+        return max(decayed, self.floor)
 
     def sides(
-        self, t_ns: float, x: Vector, e_s: Vector, dynamic_variable: float = 0.0
+        self, t_ns: float, x: Vector, e_s: Vector, auxiliary: float = 0.0
     ) -> "ComparisonSides":
-        """Both sides of the rule's comparison, as square roots.
+        """Both sides of the comparison; of one without an integral as square roots.
 
         Args:
             t_ns: time.
             x: the plant's state, shape (n,).
             e_s: the sensor's error, shape (n,).
-            dynamic_variable: η.
+            auxiliary: η, or the integral.
         """
+        right = self.threshold(t_ns)
+        if self.integrates:
+            return ComparisonSides(auxiliary, right)
         z = np.concatenate([x, e_s])
-        left, right = norm(self.form.up @ z), self.threshold(t_ns)
-        if len(self.form.down) or dynamic_variable > 0:
-            right = math.hypot(
-                right, norm(self.form.down @ z), math.sqrt(max(dynamic_variable, 0.0))
-            )
-        return ComparisonSides(left, right)
+        if len(self.form.down) or auxiliary > 0:
+            right = math.hypot(right, norm(self.form.down @ z), math.sqrt(max(auxiliary, 0.0)))
+        return ComparisonSides(norm(self.form.up @ z), right)
 
     def exceeds(
-        self, t_ns: NDArray[Any], z: Matrix, dynamic_variable: Vector | float = 0.0
+        self, t_ns: NDArray[Any], z: Matrix, auxiliary: Vector | float = 0.0
     ) -> NDArray[np.bool_]:
         """Whether the comparison holds at k times, whether it counts there or not.
 
         Args:
             t_ns: times, shape (k,).
             z: (x, e_s) at them, shape (k, 2n).
-            dynamic_variable: η at them.
+            auxiliary: η or the integral at them.
         """
-        faded = self.level * np.exp(-self.rate_per_s * 1e-9 * (t_ns - self.since_ns))
-        down = np.linalg.norm(z @ self.form.down.T, axis=1)
-        right = np.hypot(np.maximum(faded, self.floor), down)
-        right = np.hypot(right, np.sqrt(np.maximum(dynamic_variable, 0.0)))
+        decayed = self.level * np.exp(-self.rate_per_s * 1e-9 * (t_ns - self.since_ns))
+        right = np.maximum(decayed, self.floor)
+        if self.integrates:
+            return np.asarray(auxiliary > right)
+        right = np.hypot(right, np.linalg.norm(z @ self.form.down.T, axis=1))
+        right = np.hypot(right, np.sqrt(np.maximum(auxiliary, 0.0)))
         found: NDArray[np.bool_] = np.linalg.norm(z @ self.form.up.T, axis=1) > right
         return found
 
-    def is_looked_at(self, t_ns: int) -> bool:
-        """Whether the comparison counts at a time; what is due at the latest does anyhow."""
+    def counts_at(self, t_ns: int) -> bool:
+        """Whether the comparison counts at a time."""
         return t_ns >= self.earliest_ns and (self.grid_ns == 0 or t_ns % self.grid_ns == 0)
 
 
 class ComparisonSides(NamedTuple):
-    """What is compared: the sensor transmits if ``left`` exceeds ``right``."""
+    """The two sides of a comparison: the sensor transmits if ``left`` exceeds ``right``."""
 
     left: float
     right: float
@@ -136,7 +165,7 @@ def state_map(n: int, weight: Matrix | None = None) -> Matrix:
 
 
 def empty_map(n: int) -> Matrix:
-    """No rows, for an N that is not there."""
+    """No rows: the N of a form without one."""
     return np.zeros((0, 2 * n))
 
 

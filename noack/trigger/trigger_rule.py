@@ -1,7 +1,6 @@
-"""All guards of a policy, as data: how the rule that follows an event depends on that event.
+"""A policy's trigger rule, as data: from each event it makes the condition of the next one.
 
-A policy is this and nothing else, so that it can be interpreted, sampled, followed exactly and
-compiled, with one meaning.
+The live sensor, exact simulation and the compiled batch engine all read this one description.
 """
 
 import math
@@ -33,23 +32,24 @@ class TriggerRule(NamedTuple):
     """Instead, t₀ is the event's time, and c is ‖P z‖ just after it."""
     grid_ns: float = 0.0
     dynamic_variable: DynamicVariable | None = None
+    integrates: bool = False
     idle_ns: float = -math.inf
-    """For so long after an event the comparison does not count."""
+    """The comparison does not count before this time after an event."""
     longest_ns: float = NEVER_NS
-    """So long after an event the next one is due; with a forecast, at the latest."""
+    """The next event is due this time after an event; with a forecast, at the latest."""
     shortest_ns: float = 0.0
-    """With a forecast: it is not due before."""
+    """With a forecast: the next event is not due before this time after an event."""
     forecast: Forecast | None = None
     weight: Matrix | None = None
     """W of the ‖x‖_W that the forecast begins with, (n, n); None is the identity."""
 
     @property
     def fading_per_s(self) -> float:
-        """α of a threshold that decays from the run's start on; of others 0."""
+        """α of a threshold that decays from the run's start on; 0 for other thresholds."""
         return 0.0 if self.from_event else self.rate_per_s
 
     def after(self, t_ns: float, x: Vector) -> TriggerCondition:
-        """The guard after an event, or from the start on.
+        """The condition after an event, or from the start on.
 
         Args:
             t_ns: time of the event.
@@ -57,7 +57,7 @@ class TriggerRule(NamedTuple):
         """
         level, since_ns, due_ns = self.level, 0.0, self.longest_ns
         if self.from_event:
-            # To the last bit what it is compared with, so that the event itself is not above it.
+            # The same bits as the compared norm, so that the event itself does not exceed it.
             level, since_ns = norm(self.form.up @ np.concatenate([x, np.zeros_like(x)])), t_ns
         if self.forecast is not None:
             size = norm(x if self.weight is None else self.weight @ x)
@@ -67,4 +67,5 @@ class TriggerRule(NamedTuple):
         return TriggerCondition(
             self.form, level, self.rate_per_s, since_ns, self.floor,
             t_ns + self.idle_ns, t_ns + due_ns, self.grid_ns, self.dynamic_variable,
+            self.integrates,
         )  # fmt: skip

@@ -178,7 +178,7 @@ def test_the_doctor_says_what_is_wrong_with_the_folder(shared: Path) -> None:
 def test_without_a_folder_there_is_no_run(shared: Path) -> None:
     with pytest.raises(PeerError, match="no run to join"):
         join()
-    with pytest.raises(CallerError, match="no run goes on"):
+    with pytest.raises(CallerError, match="no run is active"):
         run_registry.find()
     assert emulator_session.running() == []
     assert not (shared / OWN).exists()

@@ -1,4 +1,4 @@
-"""The flood's process, and what is read off a flooded run's record."""
+"""The flood's process, and the figures of a flooded run."""
 
 import socket
 import subprocess
@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks import _flood
+from benchmarks._faulted_run import FaultedRun, recovery_s
 from benchmarks._flood import Flood, flood
-from benchmarks.flood import CASES, Measured, measured, recovery_s, rows_of
+from benchmarks.flood import figures_of
 from cosim.cli import find_scenario
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
@@ -64,34 +65,26 @@ def record() -> RunRecord:
     return simulate(resolve(load(find_scenario("lane_following"), settings)))
 
 
-def test_what_a_flood_did_is_read_off_the_record(record: RunRecord) -> None:
+def test_the_effects_of_a_flood_are_read_from_the_record(record: RunRecord) -> None:
     rows = {table: record[table].copy() for table in record.tables}
     for table in (PLANT_STEP, CONTROLLER_STEP, SENSOR_MEASUREMENT):
         rows[table]["now_ns"] = rows[table]["t_ns"] + 50_000
-    steps, heard = rows[PLANT_STEP], rows[SENSOR_MEASUREMENT]
+    steps, received = rows[PLANT_STEP], rows[SENSOR_MEASUREMENT]
     during = (steps["t_ns"] > 1_000_000_000) & (steps["t_ns"] < 2_000_000_000)
     steps["now_ns"][during] += 7_000_000
     after = (steps["t_ns"] >= 2_000_000_000) & (steps["t_ns"] < 2_040_000_000)
     steps["now_ns"][after] += 3_000_000
-    rows[SENSOR_MEASUREMENT] = np.delete(heard, [600, 601, 602])
+    rows[SENSOR_MEASUREMENT] = np.delete(received, [600, 601, 602])
     flooded = RunRecord(record.scenario, rows, [], {})
-    found = measured(flooded, 5, Flood(101.0, 102.0, 12_345), epoch_s=100.0)
-    assert (found.rate_hz, found.missed, found.lost) == (12_345.0, 3.0, 5.0)
-    assert found.late_before_us == pytest.approx(50.0)
-    assert found.late_us == pytest.approx(7050.0)
+    run = FaultedRun(flooded, {"unintended_losses": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
     last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
-    assert found.back_ms == pytest.approx(1e-6 * last_late_ns - 2000.0)
+    assert figures_of(run) == pytest.approx({
+        "rate_hz": 12_345.0, "missed": 3, "lost": 5, "late_before_us": 50.0,
+        "late_during_us": 7050.0, "back_ms": 1e-6 * last_late_ns - 2000.0,
+    })  # fmt: skip
 
 
-def test_a_late_step_long_after_the_flood_is_not_its_doing() -> None:
+def test_a_late_step_long_after_the_flood_does_not_count() -> None:
     assert recovery_s(np.array([]), 2.0) == 0.0
     assert recovery_s(np.array([1.9, 2.1, 2.3, 3.0]), 2.0) == pytest.approx(0.3)
     assert recovery_s(np.array([1.9, 2.5]), 2.0) == 0.0
-
-
-def test_each_figure_stands_beside_the_one_without_the_shield() -> None:
-    ours, peers = Measured(4e5, 0, 0, 90.0, 100.0, 0.0), Measured(1e5, 3, 4, 90.0, 6000.0, 20.0)
-    rows = rows_of(CASES[0], [ours] * 3, [peers] * 3)
-    assert {row.peer.name for row in rows if row.peer} == {"without the shield"}
-    late = next(row for row in rows if "during" in row.name)
-    assert (late.value, late.ratio) == (100.0, pytest.approx(1 / 60))

@@ -23,7 +23,7 @@ from benchmarks._relay_process import (
     socat,
     start_all,
 )
-from benchmarks._report import MeasurementError
+from benchmarks._report import MeasurementError, Rounds
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="the load is Linux's"),
@@ -131,7 +131,7 @@ def test_a_peer_forwards_everything_in_order(name: str, tools: Built) -> None:
         pytest.skip(kind)
     assert kind.name == name
     with running(kind, tools) as relay:
-        assert relay.burst().cpu_us > 0  # a burst of which anything is missing raises
+        assert relay.burst()["cpu_us"] > 0  # a burst of which anything is missing raises
         state = Soak()
         relay.ends.soak(state, 1, 0, 1000)
         assert state.received == 0
@@ -155,26 +155,26 @@ def test_our_relays_counts_are_what_sender_and_sink_saw(tools: Built) -> None:
     assert 198 <= found.decided <= 200
 
 
-def test_a_relay_that_does_not_start_or_fails_is_said_and_left_out(tools: Built) -> None:
+def test_a_relay_that_does_not_start_or_fails_is_reported_and_omitted(tools: Built) -> None:
     kinds: dict[str, Kind | str] = {
         "absent": "not installed",
         "broken": Kind("broken", lambda to, port: [sys.executable, "-c", "exit('no reason')"]),
         "C relay": c_relay(tools),
     }
-    rounds: dict[str, list[int]] = {}
+    rounds = Rounds()
     with ExitStack() as stack:
-        relays, missing = start_all(kinds, tools, stack)
-        assert missing["absent"] == "not installed"
-        assert "said 'no reason'" in missing["broken"]
-        in_turn(relays, missing, rounds, lambda relay: relay.pid)
+        relays = start_all(kinds, tools, stack, rounds)
+        assert rounds.missing["absent"] == "not installed"
+        assert "said 'no reason'" in rounds.missing["broken"]
+        in_turn(relays, rounds, lambda relay: {"pid": relay.pid})
 
-        def fail(relay: object) -> int:
+        def fail(relay: object) -> None:
             raise MeasurementError("lost")
 
-        in_turn(relays, missing, rounds, fail)
+        in_turn(relays, rounds, fail)
         assert relays == []
-    assert missing["C relay"] == "lost"
-    assert len(rounds["C relay"]) == 1
+    assert rounds.missing["C relay"] == "lost"
+    assert len(rounds.of("C relay", "pid")) == 1
 
 
 def test_without_a_compiler_there_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:

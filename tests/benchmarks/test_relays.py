@@ -1,6 +1,6 @@
 import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,51 +10,14 @@ from benchmarks import relay_delay, relay_flows, relay_soak, relays
 from benchmarks._relay_decisions import Decide, LossRuns, compiled, plain, predicted_loss
 from benchmarks._relay_load import Burst, Soak
 from benchmarks._relay_ours import Ours, Totals, command_of, totals_of
-from benchmarks._relay_process import Sample, sample_of
-from benchmarks._report import Goal, MeasurementError, Row
-from benchmarks._rounds import Comparison, paired
-from benchmarks.relay_delay import Quantiles
-from benchmarks.relay_flows import Costs
+from benchmarks._relay_process import figures_of
+from benchmarks._report import MeasurementError, Rounds, Row
 from noack.protocol.record_tables import Fate
-
-HALF = Comparison("ours", "theirs", Goal("<=", 0.5))
-
-
-def named(rows: Sequence[Row]) -> Mapping[tuple[str, str | None], Row]:
-    return {(row.name, None if row.peer is None else row.peer.name): row for row in rows}
-
-
-def test_a_disturbed_round_disturbs_both_sides_and_leaves_the_ratio_alone() -> None:
-    rounds = {"ours": [1.0, 30.0, 3.0], "theirs": [2.0, 60.0, 8.0]}
-    row = paired("cost", "µs", HALF, rounds, {})
-    assert row.name == "ours: cost"
-    assert row.peer is not None
-    assert (row.value, row.peer.value) == (3.0, 8.0)
-    assert row.ratio == 0.5  # and not 3 / 8
-    assert row.holds is True
-
-
-@pytest.mark.parametrize(
-    ("rounds", "missing"),
-    [
-        ({"ours": [1.0]}, {"theirs": "not installed"}),
-        ({"theirs": [1.0]}, {"ours": "not built"}),
-        ({"ours": [1.0, 2.0], "theirs": [1.0]}, {"theirs": "lost a datagram"}),
-    ],
-)
-def test_a_comparison_with_nobody_is_not_judged_and_says_why(
-    rounds: dict[str, list[float]], missing: dict[str, str]
-) -> None:
-    row = paired("cost", "µs", HALF, rounds, missing)
-    assert row.holds is None
-    ((who, why),) = missing.items()
-    assert f"{who}: {why}" in row.as_json()["note"]
 
 
 def test_what_a_relay_decided_counts_and_not_what_it_forwarded() -> None:
-    sample = sample_of("ours", Burst(wall_s=0.01, decided=998, received=950), 1000, 16, 0.003)
-    assert sample.per_s == pytest.approx(99_800)
-    assert sample.cpu_us == pytest.approx(3.0)
+    figures = figures_of("ours", Burst(wall_s=0.01, decided=998, received=950), 1000, 16, 0.003)
+    assert figures == pytest.approx({"per_s": 99_800, "cpu_us": 3.0})
 
 
 @pytest.mark.parametrize(
@@ -62,7 +25,7 @@ def test_what_a_relay_decided_counts_and_not_what_it_forwarded() -> None:
 )
 def test_a_burst_that_did_not_come_through_is_no_figure(burst: Burst, slack: int) -> None:
     with pytest.raises(MeasurementError, match=f"only {burst.received} arrived"):
-        sample_of("relay", burst, 1000, slack, 0.003)
+        figures_of("relay", burst, 1000, slack, 0.003)
 
 
 def test_the_goals_of_the_rates() -> None:
@@ -71,29 +34,20 @@ def test_the_goals_of_the_rates() -> None:
         "socat": 120e3, "socat, connected": 135e3, "C relay": 330e3, "C relay, segments": 890e3,
         "asyncio relay": 50e3, relays.DIRECT: 420e3,
     }  # fmt: skip
-    samples = {name: [Sample(rate, 1e6 / rate)] * 3 for name, rate in per_s.items()}
-    rows = named(relays.rows_of(samples, {}))
-    verdicts = {key: row.holds for key, row in rows.items() if row.goal is not None}
-    assert verdicts == {
-        ("ours: drained", "socat"): True,
-        ("ours: drained", "C relay"): False,
-        ("ours, segments: drained", "socat"): True,
-    }
-    cost = rows["ours: cost", "C relay"]
-    assert cost.ratio == pytest.approx(330 / 260)
-
-
-def test_the_rates_without_socat_say_that_it_is_missing() -> None:
-    names = {row.peer for row in (*relays.RATES, *relays.COSTS)} | set(relays.OURS)
-    samples = {name: [Sample(1e5, 10.0)] for name in names if name != "socat"}
-    for (_, peer), row in named(relays.rows_of(samples, {"socat": "not installed"})).items():
-        assert (row.ratio is None) is (peer == "socat")
-        assert ("not installed" in row.as_json().get("note", "")) is (peer == "socat")
+    rounds = Rounds()
+    for name, rate in per_s.items():
+        rounds.add(name, {"per_s": rate, "cpu_us": 1e6 / rate})
+    judged = [row for row in relays.rows_of(rounds) if row.goal is not None]
+    assert [(row.name, row.peer.name, row.holds) for row in judged if row.peer is not None] == [
+        ("ours: drained", "socat", True),
+        ("ours: drained", "C relay", False),
+        ("ours, segments: drained", "socat", True),
+    ]
 
 
 def test_delays_are_counted_beyond_the_base() -> None:
     delays_ns = np.arange(1, 102) * 1000  # 1, 2, ..., 101 µs
-    assert relay_delay.quantiles_of("relay", delays_ns, 3.0) == Quantiles(48.0, 97.0)
+    assert relay_delay.quantiles_of("relay", delays_ns, 3.0) == {"p50": 48.0, "p99": 97.0}
 
 
 def test_a_missing_datagram_has_no_delay() -> None:
@@ -101,53 +55,45 @@ def test_a_missing_datagram_has_no_delay() -> None:
         relay_delay.quantiles_of("relay", np.array([-1, 5, -1]))
 
 
+def delays(**p50_p99: tuple[float, float]) -> Rounds:
+    rounds = Rounds()
+    for side, (p50, p99) in p50_p99.items():
+        rounds.add(side, {"p50": p50, "p99": p99})
+    return rounds
+
+
 def test_only_the_median_of_the_added_delay_is_judged() -> None:
-    rounds = {
-        relay_delay.OURS: [Quantiles(9.0, 30.0)],
-        relay_delay.DIRECT: [Quantiles(3.0, 4.0)],
-        "socat": [Quantiles(12.0, 15.0)],
-        "C relay": [Quantiles(7.0, 8.0)],
-        "asyncio relay": [Quantiles(25.0, 50.0)],
-    }
-    rows = relay_delay.added_rows(rounds, {})
+    rounds = delays(ours=(9.0, 30.0), socat=(12.0, 15.0), **{relay_delay.DIRECT: (3.0, 4.0)})
+    rounds.missing |= {"C relay": "not built", "asyncio relay": "ended"}
+    rows = relay_delay.added_rows(rounds)
     assert rows[0].value == 3.0
     (judged,) = [row for row in rows if row.goal is not None]
     assert (judged.name, judged.ratio, judged.holds) == ("ours: added one way, p50", 0.75, True)
 
 
-LATE = {
-    relay_delay.OURS: [Quantiles(20.0, 50.0)],
-    relay_delay.KERNEL: [Quantiles(15.0, 30.0)],
-    "asyncio relay": [Quantiles(500.0, 1000.0)],
-}
-
-
-def test_only_the_99th_percentile_of_the_lateness_is_judged() -> None:
-    (judged,) = [row for row in relay_delay.lateness_rows(LATE, {}, None) if row.goal is not None]
-    assert judged.name == "ours: lateness behind 10 ms, p99"
+@pytest.mark.parametrize("refused", [None, "SCHED_FIFO is refused"])
+def test_only_the_99th_percentile_of_the_lateness_is_judged(refused: str | None) -> None:
+    rounds = delays(ours=(20.0, 50.0), cyclictest=(15.0, 30.0))
+    rounds.missing["asyncio relay"] = "ended"
+    if refused:
+        rounds.add(relay_delay.KERNEL, refused)
+    (judged,) = [row for row in relay_delay.lateness_rows(rounds) if row.goal is not None]
+    assert (judged.name, judged.value) == ("ours: lateness behind 10 ms, p99", 50.0)
     assert judged.ratio == pytest.approx(5 / 3)
-    assert judged.holds is True
+    assert judged.holds is (None if refused else True)
 
 
-def test_lateness_is_not_judged_where_the_settings_are_refused() -> None:
-    rows = relay_delay.lateness_rows(LATE, {}, "SCHED_FIFO is refused")
-    (judged,) = [row for row in rows if row.goal is not None]
-    assert judged.holds is None
-    assert "SCHED_FIFO is refused" in judged.as_json()["note"]
-    assert judged.value == 50.0
-
-
-def test_the_cost_of_many_flows_is_compared_with_one_flows() -> None:
-    rounds = {"ours": [Costs(3.0, 4.2), Costs(6.0, 7.2)], "C relay": [Costs(2.8, 2.8)] * 2}
-    rows = named(relay_flows.flow_rows(rounds, {"ours, with a way back": "no such option"}))
-    ours = rows["ours, 10,000 flows: cost", "ours, one flow"]
+def test_the_cost_of_many_flows_is_compared_with_that_of_one() -> None:
+    rounds = Rounds()
+    for one, many in ((3.0, 4.2), (6.0, 7.2)):
+        rounds.add("ours, one flow", {"cpu_us": one})
+        rounds.add("ours, 10,000 flows", {"cpu_us": many})
+    rounds.missing["ours, with the reverse direction"] = "no such option"
+    ours, reverse, _ = relay_flows.flow_rows(rounds)
     assert ours.ratio == pytest.approx(1.3)
     assert ours.holds is True
-    kernel = rows["C relay, 10,000 flows: cost", "C relay, one flow"]
-    assert (kernel.ratio, kernel.goal) == (1.0, None)
-    back = rows["ours, with a way back, 10,000 flows: cost", "ours, with a way back, one flow"]
-    assert back.holds is None
-    assert "no such option" in back.as_json()["note"]
+    assert reverse.holds is None
+    assert "no such option" in reverse.as_json()["note"]
 
 
 @pytest.mark.parametrize("batch", [1, 3, 7, 50])
@@ -242,7 +188,7 @@ def test_a_load_that_came_through_reaches_all_goals() -> None:
         ({"arrived": 999}, "sent but not counted as arrived"),
         ({"received": 949}, "forwarded but not received"),
         ({"lost_in_kernel": 1}, "lost in the relay's receive buffer"),
-        ({"longest_gap": 5}, "longest run not received"),
+        ({"longest_gap": 5}, "longest loss burst"),
     ],
 )
 def test_each_unintended_loss_misses_its_goal(changes: dict[str, int], row: str) -> None:

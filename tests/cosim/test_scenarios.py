@@ -19,15 +19,15 @@ from cosim.analysis.run_summary import summarise
 from cosim.output.certificate_report import with_weight
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
-from noack.config.plant_systems import FourTankSettings, QuadrotorSettings
 from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import load
 from noack.core.linear_systems import Matrix
+from noack.plants.four_tank import FourTankSettings
+from noack.plants.quadrotor import QuadrotorSettings
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
 from noack.protocol.record_tables import PLANT_STEP
-from plant_server.plant_linearisation import linearise
-from plant_server.systems.four_tank import four_tank
-from plant_server.systems.quadrotor_plant import quadrotor
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NAMES = sorted(path.stem for path in SCENARIOS.glob("*.toml"))
@@ -77,7 +77,7 @@ def closed(found: LoopMatrices) -> Matrix:
 
 def linear_tanks(**given: Any) -> tuple[Matrix, Matrix]:
     settings = FourTankSettings(kind="four_tank", **given)
-    return linearise(lambda x0: four_tank(settings, x0), 4, 2)
+    return linearise(lambda x0: OdeSystem(settings.equations(), x0), 4, 2)
 
 
 def zeros(A: Matrix, B: Matrix) -> list[float]:
@@ -117,7 +117,7 @@ def test_the_four_tank_scenarios_model_is_the_linearisation_of_its_plant() -> No
 
 def test_a_tank_that_runs_dry_stays_empty() -> None:
     settings = FourTankSettings(kind="four_tank")
-    system = four_tank(settings, np.array([0.0, 0.0, -1.0, -1.0]))
+    system = OdeSystem(settings.equations(), np.array([0.0, 0.0, -1.0, -1.0]))
     for step in range(600):
         system.advance(np.array([-5.0, -5.0]), step * 10**9, 10**9)  # a pump does not draw
     assert (system.z < 1e-3).all()
@@ -165,7 +165,7 @@ def test_the_double_integrators_regulator_is_the_textbooks() -> None:
 
 def linear_quadrotor() -> tuple[Matrix, Matrix]:
     settings = QuadrotorSettings(kind="quadrotor")
-    return linearise(lambda x0: quadrotor(settings, x0), 12, 4)
+    return linearise(lambda x0: OdeSystem(settings.equations(), x0), 12, 4)
 
 
 def test_the_quadrotor_scenarios_model_is_the_linearisation_of_its_plant() -> None:
@@ -190,7 +190,9 @@ def test_luukkonens_gains_level_the_quadrotor_within_the_five_seconds_that_he_re
     for axis, inertia in enumerate(settings.inertia_kg_m2):
         K[1 + axis, [3 + axis, 9 + axis]] = np.array([-6.0, -1.75]) * inertia
     aslant = math.radians(10)
-    system = quadrotor(settings, np.array([0.0, 0, 1, aslant, aslant, aslant, 0, 0, 0, 0, 0, 0]))
+    system = OdeSystem(
+        settings.equations(), np.array([0.0, 0, 1, aslant, aslant, aslant, 0, 0, 0, 0, 0, 0])
+    )
     h_ns = 2_000_000
     for step in range(2500):
         system.advance(K @ system.x, step * h_ns, h_ns)
@@ -203,7 +205,7 @@ def test_a_quadrotor_in_free_fall_without_drag_keeps_its_energy_and_its_angular_
     settings = QuadrotorSettings(kind="quadrotor", drag_kg_per_s=(0.0, 0.0, 0.0))
     inertia = np.array(settings.inertia_kg_m2)
     start = np.array([0, 0, 0, 0.3, -0.2, 0.1, 1.0, -2.0, 3.0, 1.0, 1.5, -0.7])
-    system = quadrotor(settings, start)
+    system = OdeSystem(settings.equations(), start)
     weight = settings.mass_kg * settings.gravity_m_per_s2
 
     def energy(x: Matrix) -> float:

@@ -71,8 +71,8 @@ class FakePlane:
         self.instance = "fake"
         self.answers: list[Any] = []
         self.announced: list[Any] = []
-        self.kept: dict[str, Any] = {}
-        """What each process was told last that is on disk."""
+        self.acknowledged: dict[str, Any] = {}
+        """The newest confirmation to each process."""
         self._channels: dict[str, _Channel] = {}
 
     def __enter__(self) -> "FakePlane":
@@ -108,11 +108,11 @@ class FakePlane:
     def dismiss(self, query: Query) -> None:
         query.dismissed = True
 
-    def announce(self, content: Any) -> None:
+    def announce_change(self, content: Any) -> None:
         self.announced.append(json.loads(json.dumps(content)))
 
     def acknowledge_rows(self, role: str, content: Any) -> None:
-        self.kept[role] = json.loads(json.dumps(content))
+        self.acknowledged[role] = json.loads(json.dumps(content))
 
     def request_stop(self, reason: str) -> None:
         pass

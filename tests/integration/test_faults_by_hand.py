@@ -52,7 +52,10 @@ def test_who_waits_for_one_that_never_comes_may_interrupt(
         _, stderr = ended(process)
         assert process.returncode == 1
         why = stderr.splitlines()[-1].removeprefix(f"noack {role}: ")
-        assert why in ("stopped by the user (SIGINT)", "the run's coordinator is gone"), stderr
+        assert why in (
+            "stopped by the user (SIGINT)",
+            "lost the connection to the run's coordinator",
+        ), stderr
     assert psutil.wait_procs(children, timeout=PATIENCE_S)[1] == []
     assert private_files(tmp_path) == []
 

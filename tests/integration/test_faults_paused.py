@@ -77,7 +77,7 @@ def test_a_recorder_that_stands_still_for_long_is_named_and_nothing_is_lost(star
     running.child("recorder").send_signal(signal.SIGSTOP)
     finished = running.finish()
     assert finished.status == 1
-    assert finished.summary["exit"]["reason"] == "recorder stopped answering"
+    assert finished.summary["exit"]["reason"] == "recorder stopped responding"
     assert finished.summary["missing_samples"] == 0
     assert finished.summary["unintended_losses"] == 0
     assert finished.summary["replay"]["bit_exact"]

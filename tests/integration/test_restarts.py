@@ -111,11 +111,11 @@ def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None
     assert restarts.keys() == set(RESTARTED)
     for role, one in restarts.items():
         assert one["generation"] == 1
-        assert one["what"] == f"started anew: {role} died: killed by SIGKILL"
+        assert one["what"] == f"restarted: {role} died: killed by SIGKILL"
         assert role == "recorder" or one["last_s"] < one["first_s"]
     for role in RESTARTED:
         assert f"{role} died: killed by SIGKILL at " in restarted.stderr
-        assert f"{role} is back at " in restarted.stderr
+        assert f"{role} runs again at " in restarted.stderr
 
 
 def test_nothing_recorded_is_lost_and_everything_is_replayed(restarted: Finished) -> None:
@@ -201,7 +201,6 @@ def test_a_process_that_fails_at_its_restart_ends_the_run(start: Start, tmp_path
         finished = running.finish()
     assert finished.status != 0
     assert (
-        "sensor died: killed by SIGKILL; started anew, sensor: "
-        in finished.summary["exit"]["reason"]
+        "sensor died: killed by SIGKILL; restarted, sensor: " in finished.summary["exit"]["reason"]
     )
     assert f"127.0.0.1:{port} is already taken" in finished.summary["exit"]["reason"]

@@ -24,7 +24,7 @@ def test_a_run_is_changed_twice_from_another_process(
     running.wait_started()
     run = run_registry.find()
 
-    def said(*words: str) -> dict[str, Any]:
+    def set_parameters(*words: str) -> dict[str, Any]:
         done = subprocess.run(
             noack_command("set", "--json", *words), capture_output=True, text=True, check=False,
             timeout=PATIENCE_S,
@@ -33,14 +33,14 @@ def test_a_run_is_changed_twice_from_another_process(
         assert done.returncode == answer.get("exit", {"status": 0})["status"], done.stderr
         return answer
 
-    wait_for(lambda: run_registry.ask(run, {})["t_s"] > 0)
-    first = said("loss.p", "0.5", "mansd=2")
-    second = said("setpoint", "[0.0, 0.0, 0.0, 1.0]")
+    wait_for(lambda: run_registry.request_change(run, {})["t_s"] > 0)
+    first = set_parameters("loss.p", "0.5", "mansd=2")
+    second = set_parameters("setpoint", "[0.0, 0.0, 0.0, 1.0]")
     assert second["runtime_parameters"]["network.mansd"] == 2
-    refused = said("loss.p", "1.5")
+    refused = set_parameters("loss.p", "1.5")
     assert refused["exit"]["status"] == 2
     assert "should be less than or equal to 1" in refused["error"]
-    wait_for(lambda: run_registry.ask(run, {})["t_s"] > second["from_s"] + 1)
+    wait_for(lambda: run_registry.request_change(run, {})["t_s"] > second["from_s"] + 1)
     running.process.send_signal(signal.SIGINT)
     finished = running.finish()
     assert finished.status == 130, finished.stderr
@@ -52,9 +52,9 @@ def test_a_run_is_changed_twice_from_another_process(
     assert summary["identity_residual_relative"] < 1e-9
     record = load_record(finished.run_dir)
     assert record.scenario.network.mansd == 4  # as it was at the start
-    told = [one["text"] for one in record.notices if one["level"] == "change"]
-    assert len(told) == 2
-    assert all("asked for at" in text for text in told)
+    changes = [one["text"] for one in record.notices if one["level"] == "change"]
+    assert len(changes) == 2
+    assert all("; requested at " in text for text in changes)
     if not any(one.late for one in changes_of(record)):  # else the machine was, and that is said
         causes = {one["cause"] for one in summary["assumption_violations"]}
         assert not causes & {"dropouts", "change"}

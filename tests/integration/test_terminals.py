@@ -67,16 +67,16 @@ def test_who_ends_a_process_may_start_another_in_its_place(
     assert processes["sensor"].wait(PATIENCE_S) == 130
     again = by_hand("sensor")
     assert again.stderr is not None
-    said = "takes the place of one before (sensor ended early: SIGINT)"
+    said = "replaces a process (sensor ended early: SIGINT)"
     assert any(said in line for line in iter(again.stderr.readline, ""))
     processes["plant"].send_signal(signal.SIGINT)  # without it there is no run
     finished = recording.finish()
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == "plant ended early: SIGINT"
     assert "sensor ended early: SIGINT at " in finished.stderr
-    assert "the run goes on, start it again: noack sensor" in finished.stderr
+    assert "the run goes on, restart it with: noack sensor" in finished.stderr
     (restart,) = finished.summary["restarts"]
-    assert restart["what"] == "started anew: sensor ended early: SIGINT"
+    assert restart["what"] == "restarted: sensor ended early: SIGINT"
     assert finished.summary["replay"]["bit_exact"]
     assert finished.summary["replay"]["complete"]  # who is asked to end hands everything over
     assert finished.summary["missing_samples"] == 0
@@ -98,7 +98,7 @@ def test_a_process_that_a_person_ends_and_nobody_starts_again_is_named(
     processes["sensor"].send_signal(signal.SIGINT)
     finished = recording.finish()
     assert finished.status == 1
-    reason = "sensor ended early: SIGINT; no other came within 0.5 s"
+    reason = "sensor ended early: SIGINT; not restarted within 0.5 s"
     assert finished.summary["exit"]["reason"] == reason
     for process in processes.values():
         process.communicate(timeout=PATIENCE_S)

@@ -11,11 +11,11 @@ from scipy.integrate import solve_ivp
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix, Vector
+from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import PLANT_ACTUATION, PLANT_STEP, tables
 from noack.protocol.wire_format import Flow, Message
 from plant_server.plant import Plant, plant_of
-from plant_server.systems.linear_plant import LinearSystem
 from plant_server.watchdog import Watchdog
 
 H_NS = 2_000_000

@@ -26,7 +26,6 @@ from cosim.record.run_record import Rows, RunRecord
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.runtime_parameters import text_of
 from noack.config.scenario import Scenario
-from noack.config.triggers import DecayingSettings
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Vector, row_norms
 from noack.protocol.record_tables import (
@@ -38,6 +37,7 @@ from noack.protocol.record_tables import (
     SETTINGS,
 )
 from noack.theory.scenario_certificates import BOX, OWN_PLANT
+from noack.trigger.decaying import DecayingSettings
 
 _TIMES = ("t_ns", "now_ns", "model_t_ns", "release_ns", "copy_ns")
 _STATES = ("x", "x_s", "x_c", "x_c_before", "x_s_before")

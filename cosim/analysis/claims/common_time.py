@@ -15,7 +15,7 @@ from noack.protocol.record_tables import (
     SENSOR_MEASUREMENT,
 )
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.process_life import HORIZON
+from noack.runtime.life_cycle import HORIZON
 
 _PACES = {
     "plant": (PLANT_STEP, "t_ns"),

@@ -22,6 +22,7 @@ from cosim.analysis.claims.observed_conditions import (
 )
 from cosim.record.align import AlignedRun, in_common, join_all
 from cosim.record.run_record import RunRecord
+from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
@@ -30,7 +31,6 @@ from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.paper_bounds import Theorem2, theorem_2
 from noack.theory.run_conditions import allowed_conditions, ideal_conditions, nominal_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify, certify_box
-from noack.trigger.policy_from_settings import policy_of
 
 _LONG_S = 1e300  # finite, because an input that never came took an infinite time
 _ANY = NetworkConditions(sys.maxsize, *[_LONG_S] * 5)

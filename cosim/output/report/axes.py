@@ -124,13 +124,38 @@ def legend(axes: Axes, shown: Sequence[Shown]) -> None:
 
 
 def finite(values: Reals, *, positive: bool = False) -> Reals:
-    """Values with NaN for what no axis can show: infinite or immense, or on a log axis not > 0."""
+    """Return values with NaN for what no axis can show: infinite or immense; if asked, not > 0."""
     values = np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         shown = np.abs(values) < _LARGEST
         if positive:
             shown &= values > 0
     return np.where(shown, values, np.nan)
+
+
+def for_log_axis(values: Reals) -> Reals:
+    """Return values for a curve on a logarithmic axis.
+
+    A zero, to which an error is reset, becomes a value far below every axis: the curve falls there
+    vertically, where a NaN would leave a gap. Values that are all zero become NaN.
+    """
+    shown = finite(values, positive=True)
+    if np.isfinite(shown).any():
+        shown[np.asarray(values) == 0] = 1 / _LARGEST
+    return shown
+
+
+def limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
+    """Show all curves, but at most so many decades below and above the largest measured value."""
+    measured = finite(measured, positive=True)
+    if not np.isfinite(measured).any():
+        return
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines])
+    values = values[values > 1 / _LARGEST]  # without zeros
+    decade = 10.0 ** math.floor(math.log10(np.nanmax(measured)))
+    low, high = max(values.min(), decade / 10**decades), min(values.max(), decade * 10**decades)
+    margin = max((high / low) ** 0.05, 1.1)
+    axes.set_ylim(low / margin, high * margin)
 
 
 def plain(name: str, longest: int = _LONGEST_NAME) -> str:

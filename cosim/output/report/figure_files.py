@@ -9,6 +9,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from cosim.output.report.figure_style import GRID, INK, PAPER, settings
+from noack.core.errors import CallerError
+from noack.core.whole_file import write_whole
 
 _UNDATED: dict[str, dict[str, str | None]] = {
     "svg": {"Date": None, "Creator": None, "Format": None, "Type": None},
@@ -20,13 +22,16 @@ _TAIL = re.compile(r"(\.\d\d)\d+")
 _BY_PAGE = {INK: "var(--ink)", GRID: "var(--grid)", PAPER: "var(--paper)"}
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as SVG or PNG, by the name's ending: the same bytes for the same figure.
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as SVG or PNG, by the file's ending; the same figure gives the same bytes.
 
     Raises:
-        ValueError: another ending.
+        CallerError: another ending.
+        MachineError: the file cannot be written.
     """
-    path.write_bytes(_drawn(figure, path.suffix.removeprefix(".")))
+    if path.suffix not in (".svg", ".png"):
+        raise CallerError(f"{path}: a figure is saved as .svg or .png")
+    write_whole(path, _drawn(figure, path.suffix.removeprefix(".")))
 
 
 def inline(figure: Figure, name: str, description: str) -> str:
@@ -46,8 +51,6 @@ def inline(figure: Figure, name: str, description: str) -> str:
 
 
 def _drawn(figure: Figure, kind: str) -> bytes:
-    if kind not in _UNDATED:
-        raise ValueError(f"a figure is saved as .svg or .png, not as .{kind}")
     buffer = io.BytesIO()
     with settings():
         figure.savefig(buffer, format=kind, metadata=_UNDATED[kind])

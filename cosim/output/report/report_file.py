@@ -1,7 +1,6 @@
 """Writes ``report.html`` into a run directory."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from cosim.output.report.report_page import Embedded, page
 from cosim.output.report.run_figures import Envelope, run_figures
 from cosim.record.run_directory import ENVIRONMENT_FILE, REPORT_FILE, SCENARIO_FILE, read_object
 from cosim.record.run_record import RunRecord
-from noack.core.errors import MachineError, why
+from noack.core.whole_file import write_whole
 
 
 def write_report(
@@ -42,16 +41,7 @@ def write_report(
         )
         for found in run_figures(record, envelopes, timed=timed)
     ]
-    path = run_dir / REPORT_FILE
-    scratch = path.with_suffix(".partial")
-    try:
-        scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
-        environment = read_object(run_dir / ENVIRONMENT_FILE)
-        html = page(record.scenario, summary, figures, scenario_toml, environment)
-        scratch.write_text(html, encoding="utf-8")
-        scratch.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
-        raise MachineError(f"{path}: the report cannot be written: {why(error)}") from None
-    return path
+    scenario_toml = (run_dir / SCENARIO_FILE).read_text(encoding="utf-8")
+    environment = read_object(run_dir / ENVIRONMENT_FILE)
+    html = page(record.scenario, summary, figures, scenario_toml, environment)
+    return write_whole(run_dir / REPORT_FILE, html)

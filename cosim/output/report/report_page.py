@@ -13,7 +13,6 @@ from cosim.output.remarks import remarks
 from cosim.output.report.report_findings import findings
 from cosim.output.run_tables import interval_of, key_numbers
 from noack.config.scenario import Scenario
-from noack.trigger.policy_description import trigger_text
 
 _NONE = "–"
 _TONES = {
@@ -116,7 +115,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     model = loss.pop("model").replace("_", "-")
     details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
     yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
-    yield "trigger", trigger_text(trigger)
+    yield "trigger", trigger.description
     yield "norm", "‖v‖₂" if trigger.weight is None else "‖W v‖₂, W in the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model

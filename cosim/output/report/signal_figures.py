@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from cosim.analysis.fidelity import Fidelity
 from cosim.output import palette
 from cosim.output.report.axes import (
     BELOW_IN,
@@ -28,8 +29,10 @@ from cosim.output.report.axes import (
     bounds,
     finish,
     finite,
+    for_log_axis,
     head_in,
     legend,
+    limit_log_axis,
     line,
     logarithmic,
     marks,
@@ -210,7 +213,7 @@ def error_figure(
         strict=True,
     ):
         style = {"color": colour, "linewidth": width}
-        shown += line(axes, t_s, finite(values, positive=True), label, **style)
+        shown += line(axes, t_s, for_log_axis(values), label, **style)
     shown += bounds(axes, envelopes)
     measured = np.concatenate([e_s_norm, e_c_norm, threshold])
     return _norms(figure, axes, t_s, measured, "Error norms", shown)
@@ -228,7 +231,7 @@ def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()
     figure, (axes,) = single(2.1, [_STATE, *(label for label, *_ in envelopes)])
     logarithmic(axes, "y")
     style = {"color": _PLANT, "linewidth": 2.4}
-    shown = line(axes, t_s, finite(x_norm, positive=True), _STATE, **style)
+    shown = line(axes, t_s, for_log_axis(x_norm), _STATE, **style)
     shown += bounds(axes, envelopes)
     return _norms(figure, axes, t_s, x_norm, "Norm of the state", shown)
 
@@ -236,16 +239,11 @@ def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()
 def _norms(
     figure: Figure, axes: Axes, t_s: Reals, measured: Reals, title: str, shown: list[Any]
 ) -> Figure:
-    """Label a figure of norms; near what was measured, for a reset goes down to rounding."""
+    """Label a figure of norms; its axis stays near the largest: a reset goes down to rounding."""
     legend(axes, shown)
     axes.set(title=title, xlabel=TIME, ylabel="norm")
     finish(axes, t_s)
-    seen = finite(measured, positive=True)
-    seen = seen[np.isfinite(seen)]
-    if len(seen):
-        decade = math.floor(math.log10(seen.max()))
-        low, high = axes.get_ylim()
-        axes.set_ylim(max(low, 10.0 ** (decade - _DECADES)), min(high, 10.0 ** (decade + _DECADES)))
+    limit_log_axis(axes, measured, _DECADES)
     return figure
 
 
@@ -330,6 +328,20 @@ def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) 
     figure, axes = _over_time(t_s, latency_us, _CONTROLLER, [], until_s)
     axes.set(title="Latency, event to update", ylabel="latency [wall µs]")
     return figure
+
+
+@styled
+def fidelity_figure(found: Fidelity) -> Figure:
+    """How much each effect changes x, over time: ‖x_(with the effect) − x_(without)‖."""
+    names = [stage.name for stage in found.stages]
+    figure, (axes,) = single(2.7, names)
+    logarithmic(axes, "y")
+    shown = []
+    for i, (name, norms) in enumerate(zip(names, found.stage_norms, strict=True)):
+        style = {"color": printed(palette.SERIES[i]), "linestyle": _DASHES[i], "linewidth": 1.6}
+        shown += line(axes, found.t_s, for_log_axis(norms), name, **style)
+    title = f"{plain(found.scenario, _LONGEST_TITLE)}: effects on x"
+    return _norms(figure, axes, found.t_s, found.stage_norms, title, shown)
 
 
 @styled

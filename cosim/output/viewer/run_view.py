@@ -13,7 +13,6 @@ from cosim.record.run_record import RunRecord
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.protocol.topology import LOOP_ROLES
-from noack.trigger.policy_description import trigger_text
 
 _INDEXED_S = 120.0
 """Wall time of a run whose view has an index; that of a longer one would take too much memory."""
@@ -73,7 +72,7 @@ def about(scenario: Scenario, kind: Kind = "live") -> str:
 {scenario.description}
 
 Sensor and controller run **{hold}** between updates. The sensor transmits when
-{trigger_text(scenario.trigger)}.
+{scenario.trigger.description}.
 The network ({network.loss.model.replace("_", "-")} loss) drops at most
 M − 1 = {network.mansd} packets in a row. {protocol}
 

@@ -20,7 +20,7 @@ from cosim.record.align import (
 from cosim.record.estimation_error import true_states
 from cosim.record.recorded_changes import claimed_until_s, model_flow
 from cosim.record.run_record import Rows, updates_in
-from noack.config.resolution import loop_of, tables_of
+from noack.config.resolution import loop_of, policy_of, tables_of
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
@@ -38,7 +38,6 @@ from noack.protocol.wire_format import Flow
 from noack.theory.error_bounds import ErrorMonitor
 from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify
-from noack.trigger.policy_from_settings import policy_of
 
 _LAG_S = 0.2
 """Wall time by which the joined view trails, so that all processes' batches are in."""

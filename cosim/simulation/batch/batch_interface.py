@@ -18,13 +18,12 @@ from netem.link_machine import UPDATE_LINK
 from netem.rule_program import empty_state, program_of, stream_names
 from netem.rule_records import PacketDecision, dtype_of
 from noack.config.impairments import LinkSettings
-from noack.config.resolution import loop_of
+from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
 from noack.trigger import self_triggered_interval
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_policy import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
@@ -225,6 +224,7 @@ def _compiled() -> Any:
         batch_rule,
         batch_run,
         batch_status,
+        integral_crossing,
         level_crossing,
         norm_crossing,
         piece_measures,
@@ -236,7 +236,8 @@ def _compiled() -> Any:
 
     modules: tuple[ModuleType, ...] = (
         self_triggered_interval, batch_status, vector_lanes, taylor, norm_crossing,
-        level_crossing, batch_rule, quadratic_crossing, piece_measures, batch_run,
+        integral_crossing, level_crossing, batch_rule, quadratic_crossing, piece_measures,
+        batch_run,
     )  # fmt: skip
     return compile_kept(batch_run.run_many, prepare("batch", modules))
 
@@ -251,6 +252,8 @@ def _columns(matrices: NDArray[Any] | None) -> NDArray[np.float64]:
 
 
 def _check(setting: Setting, population: Population) -> None:
+    from cosim.simulation.batch.quadratic_crossing import squares_of
+
     k, n, m = len(population.loss_seeds), len(setting.H), len(setting.K)
     wanted = {
         "H": (setting.H, (n, n)),
@@ -278,6 +281,8 @@ def _check(setting: Setting, population: Population) -> None:
         for part in form:
             if part.shape[1] != 2 * n:
                 raise ValueError(f"trigger: expected {2 * n} columns, found {part.shape[1]}")
+    if rule.integrates and squares_of(setting.trigger, n) is not None:
+        raise ValueError("trigger: a batch integrates ‖W e_s‖ only, without a grid")
     if rule.from_event or rule.rate_per_s == 0 or rule.floor >= _SMALLEST_THRESHOLD:
         return
     vanishes_s = math.log(rule.level / _SMALLEST_THRESHOLD) / rule.rate_per_s

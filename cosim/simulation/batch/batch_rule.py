@@ -20,6 +20,7 @@ class Rule(NamedTuple):
 
     compares: bool
     """Whether there is a form."""
+    integrates: bool
     level: float
     rate_per_s: float
     floor: float
@@ -36,6 +37,7 @@ def rule_of(rule: TriggerRule) -> Rule:
     """Return the numbers of a policy's guards."""
     return Rule(
         compares=len(rule.form.up) > 0,
+        integrates=rule.integrates,
         level=float(rule.level),
         rate_per_s=float(rule.rate_per_s),
         floor=float(rule.floor),

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from cosim.simulation.batch.batch_rule import Rule, Span, phase_at, span_after
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
+from cosim.simulation.batch.integral_crossing import first_excess
 from cosim.simulation.batch.norm_crossing import MOST_STEPS, NONE, UNRESOLVED, first_exit
 from cosim.simulation.batch.piece_measures import (
     CERTAINTY,
@@ -224,9 +225,9 @@ def follow(
     cost, best, above = 0.0, 0.0, start > settled
     fresh, looked, agree = True, False, True
     span, point = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0
-    dynamic_variable, scale, level, degree, first_degree = 0.0, 1.0, 0.0, 0, 1
+    auxiliary, scale, level, degree, first_degree = 0.0, 1.0, 0.0, 0, 1
     if squares is not None:
-        dynamic_variable, first_degree = squares.initial_dynamic_variable, 2
+        auxiliary, first_degree = squares.initial_dynamic_variable, 2
         if squares.decay_per_s > 0.0:
             farthest_s = min(farthest_s, SLOWEST / squares.decay_per_s)
     if not system.known_start:
@@ -272,6 +273,8 @@ def follow(
                 length = math.sqrt(dot(w, w))
             span = span_after(rule, t_s, left, length)
             point, fresh, looked = span.point, False, False
+            if rule.integrates:
+                auxiliary = 0.0
         phase = phase_at(rule, span, t_s)
         until_s = min(phase.until_s, system.horizon_s)
         threshold, rate = phase.threshold, phase.rate_per_s
@@ -279,7 +282,7 @@ def follow(
         window_s = farthest_s
         if squares is not None:
             size_now = dot(x_c, x_c) + dot(e_c, e_c) + dot(d, d)
-            scale = scale_of(math.sqrt(size_now), threshold, dynamic_variable)
+            scale = scale_of(math.sqrt(size_now), threshold, auxiliary)
             level = (threshold / scale) * (threshold / scale)
         expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, 0, first_degree)
         if phase.compares and not looked:
@@ -289,10 +292,13 @@ def follow(
             if squares is None:
                 first = load(space.error, size, n)
                 speed = math.sqrt(dot(first, first))
-                if speed * window_s > _AHEAD * threshold:
+                if rule.integrates:  # an error of constant speed: its integral is ½ speed s²
+                    left_s = math.sqrt(2.0 * max(threshold - auxiliary, 0.0) / max(speed, 1e-300))
+                    window_s = min(window_s, _AHEAD * left_s)
+                elif speed * window_s > _AHEAD * threshold:
                     window_s = _AHEAD * threshold / speed
             else:
-                soon_s = first_look(squares, level, 2.0 * rate, dynamic_variable / (scale * scale))
+                soon_s = first_look(squares, level, 2.0 * rate, auxiliary / (scale * scale))
                 window_s = min(window_s, max(_AHEAD * soon_s, point * rule.grid_s - t_s))
             looked = True
         closes = window_s >= until_s - t_s
@@ -302,8 +308,13 @@ def follow(
         expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, first_degree + 1, p)
         found_s = NONE
         if squares is not None and (phase.compares or len(squares.gain) > 0):
-            degree = compare(squares, p, dynamic_variable / (scale * scale))
-        if phase.compares:
+            degree = compare(squares, p, auxiliary / (scale * scale))
+        if rule.integrates:
+            found_s, auxiliary = first_excess(
+                space.error, p, auxiliary, threshold if phase.compares else math.inf, rate,
+                window_s, n,
+            )  # fmt: skip
+        elif phase.compares:
             if squares is None:
                 found_s = first_exit(
                     space.error, p, threshold, rate, window_s, False, MOST_STEPS, n
@@ -318,7 +329,7 @@ def follow(
         event = found_s != NONE
         spent_s = found_s if event else window_s
         if squares is not None:
-            dynamic_variable = reserve_at(squares, p, spent_s) * (scale * scale)
+            auxiliary = reserve_at(squares, p, spent_s) * (scale * scale)
         p = degree_for(space.reach_s, spent_s)
         x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
         d = value(space.d, p, spent_s, n)
@@ -344,7 +355,7 @@ def follow(
         best = max(best, math.sqrt(dot(weighted, weighted)) * grown)
         # While both models agree, e_c is e_s, which is below a threshold that meets it at an event.
         ceiling = math.inf
-        if agree and phase.compares and squares is None:
+        if agree and phase.compares and squares is None and not rule.integrates:
             ceiling = threshold * (grown if rate == 0.0 else growth)
         if not ceiling <= best * (1.0 + CERTAINTY):
             best = raised(

@@ -35,16 +35,17 @@ from cosim.simulation.continuous.event_detector import (
     LARGEST,
     DetectedEvent,
     DivergedError,
+    EventDetector,
     NormEventDetector,
     QuadraticEventDetector,
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
-from noack.config.resolution import LoopMatrices, loop_of
+from cosim.simulation.continuous.integral_detector import IntegralEventDetector
+from noack.config.resolution import LoopMatrices, loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.policy_from_settings import policy_of
 from noack.trigger.trigger_condition import QuadraticForm, TriggerCondition
 from noack.trigger.trigger_policy import Policy
 
@@ -113,7 +114,7 @@ class ContinuousLoop:
         if condition.dynamic_variable is not None:
             rate_per_s = max(rate_per_s, condition.dynamic_variable.decay_per_s)
         self.flow = ExactFlow(self.generator, 1.0 / max(rate_per_s, 1.0 / _LONGEST_CELL_S))
-        self._watches: dict[tuple[bytes, float], NormEventDetector | QuadraticEventDetector] = {}
+        self._detectors: dict[tuple[bytes, float], EventDetector] = {}
 
     @property
     def decaying(self) -> DecayingTrigger:
@@ -168,21 +169,21 @@ class ContinuousLoop:
         state: LoopState,
         until_s: float,
         condition: TriggerCondition,
-        dynamic_variable: float = 0.0,
+        auxiliary: float = 0.0,
     ) -> tuple[LoopState, float] | None:
-        """The same as :meth:`next_event`, with the η that a dynamic policy has there.
+        """The same as :meth:`next_event`, with the condition's auxiliary variable.
 
         Args:
             state: where the loop is.
             until_s: how far to look.
             condition: the rule until then.
-            dynamic_variable: η at ``state``.
+            auxiliary: η or the integral at ``state``.
 
         Raises:
             DivergedError: with the time of the passing.
         """
         try:
-            found = self._next_crossing(state, until_s, condition, dynamic_variable)
+            found = self._next_crossing(state, until_s, condition, auxiliary)
         except DivergedError as error:
             raise DivergedError(self._passed_s(state, error.t_s, condition)) from None
         end = self.propagate(state, max(until_s, state.t_s)) if found is None else found[0]
@@ -212,7 +213,7 @@ class ContinuousLoop:
         return high_s
 
     def _next_crossing(
-        self, state: LoopState, until_s: float, condition: TriggerCondition, dynamic_variable: float
+        self, state: LoopState, until_s: float, condition: TriggerCondition, auxiliary: float
     ) -> tuple[LoopState, float] | None:
         t_s, z = state.t_s, np.concatenate(state[1:])
         latest_s = condition.latest_ns * 1e-9
@@ -221,27 +222,22 @@ class ContinuousLoop:
         if begin_s > t_s:
             if begin_s > until_s:
                 return None
-            z, dynamic_variable = self._advance(z, begin_s - t_s, condition, dynamic_variable)
+            z, auxiliary = self._advance(z, begin_s - t_s, condition, auxiliary)
             t_s = begin_s
         if len(condition.form.up):
             if condition.grid_ns:
                 found = self._on_grid(z, t_s, state.t_s, end_s, condition)
             else:
-                found = self._exit(z, t_s, end_s, condition, dynamic_variable)
+                found = self._exit(z, t_s, end_s, condition, auxiliary)
             if found.exceeds:
-                return self._state(t_s + found.after_s, found.z), found.dynamic_variable
-            z, dynamic_variable = found.z, found.dynamic_variable
+                return self._state(t_s + found.after_s, found.z), found.auxiliary
+            z, auxiliary = found.z, found.auxiliary
         else:
-            z, dynamic_variable = self._advance(z, end_s - t_s, condition, dynamic_variable)
-        return (self._state(end_s, z), dynamic_variable) if latest_s <= until_s else None
+            z, auxiliary = self._advance(z, end_s - t_s, condition, auxiliary)
+        return (self._state(end_s, z), auxiliary) if latest_s <= until_s else None
 
     def _exit(
-        self,
-        z: Vector,
-        t_s: float,
-        end_s: float,
-        condition: TriggerCondition,
-        dynamic_variable: float,
+        self, z: Vector, t_s: float, end_s: float, condition: TriggerCondition, auxiliary: float
     ) -> DetectedEvent:
         """Follow the loop until the comparison holds, or to ``end_s``; first decay, then floor."""
         begin_s, since_s = t_s, condition.since_ns * 1e-9
@@ -253,16 +249,10 @@ class ContinuousLoop:
                 floor_from_s = since_s + math.log(condition.level / condition.floor) / rate
             vanishes_s = since_s + max(math.log(condition.level / _SMALLEST_THRESHOLD) / rate, 0.0)
         if t_s < floor_from_s:
-            phase_s = min(end_s, floor_from_s, vanishes_s)
-            found = self._watched(
-                z,
-                t_s,
-                condition.threshold(t_s * 1e9),
-                phase_s - t_s,
-                condition.rate_per_s,
-                condition,
-                dynamic_variable,
-            )
+            span_s = min(end_s, floor_from_s, vanishes_s) - t_s
+            threshold = condition.threshold(t_s * 1e9)
+            detector = self._detector(condition, condition.rate_per_s, threshold)
+            found = detector.first_exit(z, t_s, threshold, span_s, auxiliary)
             if found.exceeds or end_s <= min(floor_from_s, vanishes_s):
                 return found
             if vanishes_s < floor_from_s:
@@ -271,66 +261,58 @@ class ContinuousLoop:
                     f"{_SMALLEST_THRESHOLD:g}, where no error can be told from rounding; "
                     "give trigger.floor or a shorter horizon"
                 )
-            z, dynamic_variable, t_s = found.z, found.dynamic_variable, floor_from_s
+            z, auxiliary, t_s = found.z, found.auxiliary, floor_from_s
         level = (
             condition.floor if condition.rate_per_s > 0 else max(condition.floor, condition.level)
         )
-        found = self._watched(z, t_s, level, end_s - t_s, 0.0, condition, dynamic_variable)
+        detector = self._detector(condition, 0.0, level)
+        found = detector.first_exit(z, t_s, level, end_s - t_s, auxiliary)
         return found._replace(after_s=found.after_s + t_s - begin_s)
 
-    def _watched(
-        self,
-        z: Vector,
-        t_s: float,
-        threshold: float,
-        span_s: float,
-        rate_per_s: float,
-        condition: TriggerCondition,
-        dynamic_variable: float,
-    ) -> DetectedEvent:
-        form = condition.form
-        plain = threshold > 0 and not len(form.down) and condition.dynamic_variable is None
-        if not plain and threshold == 0:
-            rate_per_s = 0.0
-        key = (form.up.tobytes() + form.down.tobytes() + bytes([plain]), rate_per_s)
-        watch = self._watches.get(key)
-        if watch is None:
-            watch = self._watches[key] = self._watch(condition, rate_per_s, plain=plain)
-        if isinstance(watch, QuadraticEventDetector):
-            return watch.first_exit(z, t_s, threshold, span_s, dynamic_variable)
-        exit_at = watch.first_exit(z, t_s, threshold, span_s)
-        if exit_at is not None:
-            return DetectedEvent(exit_at[0], exit_at[1], dynamic_variable, exceeds=True)
-        return DetectedEvent(span_s, self.flow.advance(z, span_s), dynamic_variable, exceeds=False)
+    def _detector(
+        self, condition: TriggerCondition, rate_per_s: float, threshold: float
+    ) -> EventDetector:
+        """The detector of a condition, made once; with η, the threshold does not decay."""
+        form, plain = condition.form, not len(condition.form.down)
+        if not condition.integrates:
+            plain = plain and threshold > 0 and condition.dynamic_variable is None
+            rate_per_s = rate_per_s if plain or threshold > 0 else 0.0
+        kind = bytes([plain, condition.integrates])
+        key = (form.up.tobytes() + form.down.tobytes() + kind, rate_per_s)
+        if key not in self._detectors:
+            self._detectors[key] = self._new_detector(condition, rate_per_s, plain=plain)
+        return self._detectors[key]
 
-    def _watch(
+    def _new_detector(
         self, condition: TriggerCondition, rate_per_s: float, *, plain: bool
-    ) -> NormEventDetector | QuadraticEventDetector:
+    ) -> EventDetector:
         if plain:
             output = np.zeros((len(condition.form.up), len(self.generator)))
             output[:, : condition.form.up.shape[1]] = condition.form.up
-            return NormEventDetector(self.flow, self.generator, output, rate_per_s)
-        gain = None if condition.dynamic_variable is None else condition.dynamic_variable.gain
-        decay = (
-            0.0 if condition.dynamic_variable is None else condition.dynamic_variable.decay_per_s
-        )
+            made = IntegralEventDetector if condition.integrates else NormEventDetector
+            return made(self.flow, self.generator, output, rate_per_s)
+        variable = condition.dynamic_variable
         return QuadraticEventDetector(
-            self.flow, self.generator, condition.form, rate_per_s, gain, decay
-        )
+            self.flow, self.generator, condition.form, rate_per_s,
+            None if variable is None else variable.gain,
+            0.0 if variable is None else variable.decay_per_s,
+        )  # fmt: skip
 
     def _advance(
-        self, z: Vector, dt_s: float, condition: TriggerCondition, dynamic_variable: float
+        self, z: Vector, dt_s: float, condition: TriggerCondition, auxiliary: float
     ) -> tuple[Vector, float]:
-        """State and η after a time in which the comparison does not count."""
-        if condition.dynamic_variable is None:
-            return self.flow.advance(z, dt_s), dynamic_variable
-        nothing = np.zeros((0, condition.form.up.shape[1]))
-        idle = QuadraticEventDetector(
-            self.flow, self.generator, QuadraticForm(nothing, nothing), 0.0,
-            condition.dynamic_variable.gain, condition.dynamic_variable.decay_per_s,
-        )  # fmt: skip
-        found = idle.first_exit(z, 0.0, 0.0, dt_s, dynamic_variable)
-        return found.z, found.dynamic_variable
+        """The state and the auxiliary variable after a time in which the comparison is off."""
+        if not condition.has_auxiliary:
+            return self.flow.advance(z, dt_s), auxiliary
+        if condition.integrates:
+            found = self._detector(condition, 0.0, math.inf).first_exit(
+                z, 0.0, math.inf, dt_s, auxiliary
+            )
+        else:
+            nothing = np.zeros((0, condition.form.up.shape[1]))
+            idle = condition._replace(form=QuadraticForm(nothing, nothing))
+            found = self._detector(idle, 0.0, 0.0).first_exit(z, 0.0, 0.0, dt_s, auxiliary)
+        return found.z, found.auxiliary
 
     def _on_grid(
         self, z: Vector, t_s: float, event_s: float, end_s: float, condition: TriggerCondition
@@ -347,8 +329,8 @@ class ContinuousLoop:
             states = self.flow.sample(z, np.maximum(points_s - t_s, 0.0))
             beyond = np.flatnonzero(~(np.linalg.norm(states, axis=1) < LARGEST))
             known = len(states) if not len(beyond) else int(beyond[0])
-            seen = states[:known, : 2 * n]
-            exceeds = np.flatnonzero(condition.exceeds(points_s[:known] * 1e9, seen))
+            z_known = states[:known, : 2 * n]
+            exceeds = np.flatnonzero(condition.exceeds(points_s[:known] * 1e9, z_known))
             if len(exceeds):
                 k = int(exceeds[0])
                 return DetectedEvent(float(points_s[k]) - t_s, states[k], 0.0, exceeds=True)

@@ -122,18 +122,19 @@ def simulate_continuous(
     fates: list[bool] = []
     diverged_at_s = None
     event = None if known_start else start
-    dynamic_variable = system.trigger.initial_dynamic_variable
+    auxiliary = system.trigger.initial_dynamic_variable
     while True:
         if event is not None:
             fates.append(bool(arrives(len(before))))
             state = reset(event, fates[-1])
             before.append(event)
             after.append(state)
+        condition = system.condition(state)
+        if condition.integrates:
+            auxiliary = 0.0
         try:
-            crossing = system.next_crossing(
-                state, horizon_s, system.condition(state), dynamic_variable
-            )
-            event, dynamic_variable = (None, 0.0) if crossing is None else crossing
+            crossing = system.next_crossing(state, horizon_s, condition, auxiliary)
+            event, auxiliary = (None, 0.0) if crossing is None else crossing
         except DivergedError as error:
             diverged_at_s = error.t_s
             break

@@ -6,7 +6,7 @@ polynomial are isolated in the Bernstein basis (:mod:`cosim.simulation.continuou
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -26,6 +26,38 @@ class DivergedError(ArithmeticError):
     def __init__(self, t_s: float) -> None:
         super().__init__(f"the loop diverges: the state passes 1e100 at {t_s:g} s")
         self.t_s = t_s
+
+
+class DetectedEvent(NamedTuple):
+    """The end of a search for an event."""
+
+    after_s: float
+    z: Vector
+    auxiliary: float
+    """η, or the integral."""
+    exceeds: bool
+    """Whether the comparison holds from there on for a while; else it is the end of the span."""
+
+
+class EventDetector(Protocol):
+    """Finds when the comparison of a trigger condition first holds."""
+
+    def first_exit(
+        self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float
+    ) -> DetectedEvent:
+        """Follow the loop until the comparison holds, or to the end of a span.
+
+        Args:
+            z: state at ``t_s``, shape (N,).
+            t_s: time.
+            threshold: at ``t_s``.
+            span_s: length of the span.
+            auxiliary: η or the integral at ``t_s``.
+
+        Raises:
+            DivergedError: the state outgrows what can be computed with.
+        """
+        ...
 
 
 class NormEventDetector:
@@ -57,22 +89,13 @@ class NormEventDetector:
         self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=1).max()), 1.0)
 
     def first_exit(
-        self, z: Vector, t_s: float, threshold: float, span_s: float
-    ) -> tuple[float, Vector] | None:
-        """Time and state of the first exit in [0, ``span_s``] after ``t_s``, or None.
-
-        Args:
-            z: state at ``t_s``, shape (N,).
-            t_s: time.
-            threshold: at ``t_s``.
-            span_s: how far to look.
-
-        Raises:
-            DivergedError: the state outgrows what can be computed with.
-        """
+        self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float = 0.0
+    ) -> DetectedEvent:
+        """As :meth:`EventDetector.first_exit`."""
+        start = z
         width_s, window_s = self._flow.width_s, self._flow.window_s
         rows, window = len(self._control) // CELLS, 0
-        while True:
+        while window == 0 or window * window_s < span_s:
             begin_s = window * window_s
             scale = math.exp(self._rate_per_s * begin_s) / threshold
             largest = float(np.linalg.norm(z))
@@ -82,28 +105,15 @@ class NormEventDetector:
             control = (self._control[: cells * rows] @ (z * scale)).reshape(self._shape)
             reach = np.einsum("cki,cki->ck", control, control).max(axis=1)
             for cell in np.flatnonzero(reach > 1.0 - self._slack * (1.0 + largest * scale)):
-                start = self._flow.powers[cell] @ z
-                u = self._basis.first_exit(self._taylor @ (start * (scale * self._growth[cell])))
-                if u is not None:
-                    after_s = begin_s + (cell + u) * width_s
-                    if after_s > span_s:
-                        return None
-                    return float(after_s), self._flow.within_cell(start, u)
+                in_cell = self._flow.powers[cell] @ z
+                u = self._basis.first_exit(self._taylor @ (in_cell * (scale * self._growth[cell])))
+                after_s = math.inf if u is None else float(begin_s + (cell + u) * width_s)
+                if u is not None and after_s <= span_s:
+                    found = self._flow.within_cell(in_cell, u)
+                    return DetectedEvent(after_s, found, auxiliary, exceeds=True)
             window += 1
-            if window * window_s >= span_s:
-                return None
             z = self._flow.powers[CELLS] @ z
-
-
-class DetectedEvent(NamedTuple):
-    """Where a watch has come to."""
-
-    after_s: float
-    z: Vector
-    dynamic_variable: float
-    """η."""
-    exceeds: bool
-    """Whether the comparison holds from there on for a while; else it is the end of the span."""
+        return DetectedEvent(span_s, self._flow.advance(start, span_s), auxiliary, exceeds=False)
 
 
 class QuadraticEventDetector:
@@ -115,7 +125,7 @@ class QuadraticEventDetector:
     Args:
         flow: of the state z, with cells of at most 1/(λ + ρ).
         generator: G, shape (N, N).
-        form: P and N, on the first 2n entries of z; without P nothing is looked at, and η goes on.
+        form: P and N, on the first 2n entries of z; without P, η alone is followed.
         rate_per_s: ρ of the threshold c e^{−ρt}; 0 where there is an η.
         gain: P_η and N_η, if there is an η.
         decay_per_s: λ.
@@ -131,7 +141,7 @@ class QuadraticEventDetector:
         decay_per_s: float = 0.0,
     ) -> None:
         if gain is not None and rate_per_s:
-            raise ValueError("a threshold that decays goes without a reserve")
+            raise ValueError("a threshold that decays cannot be combined with η")
         size = len(generator)
         self._flow, self._rate_per_s = flow, rate_per_s
         self._basis = curve_basis(DEGREE)
@@ -140,60 +150,47 @@ class QuadraticEventDetector:
         self._cells = terms[None] @ (flow.powers[:CELLS] * self._growth[:, None, None])[:, None]
         """Taylor coefficients of the scaled z in all cells of a window, (cells, p + 1, N, N)."""
         self._form = _Squares(form, self._cells)
-        self._looks = len(form.up) > 0
+        self._compares = len(form.up) > 0
         self._gain = None if gain is None else _Squares(gain, self._cells)
-        self._faded, self._gathered = _reserve_series(decay_per_s, flow.width_s)
+        self._by_start, self._by_gain = _dynamic_variable_series(decay_per_s, flow.width_s)
 
     def first_exit(
-        self, z: Vector, t_s: float, threshold: float, span_s: float, dynamic_variable: float = 0.0
+        self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float = 0.0
     ) -> DetectedEvent:
-        """Follow the loop until the comparison holds, or to the end of a span.
-
-        Args:
-            z: state at ``t_s``, shape (N,).
-            t_s: time.
-            threshold: c at ``t_s``, or 0.
-            span_s: how far to look.
-            dynamic_variable: η at ``t_s``.
-
-        Raises:
-            DivergedError: the state outgrows what can be computed with.
-        """
+        """As :meth:`EventDetector.first_exit`; the threshold may be 0."""
         width_s, begin_s = self._flow.width_s, 0.0
         while True:
             largest = float(np.linalg.norm(z))
             level = threshold * math.exp(-self._rate_per_s * begin_s)
             if not largest < LARGEST or (level > 0 and not largest / level < LARGEST):
                 raise DivergedError(t_s + begin_s)
-            scale = 1.0 / max(
-                level if level > 0 else largest, math.sqrt(abs(dynamic_variable)), 1e-300
-            )
+            scale = 1.0 / max(level if level > 0 else largest, math.sqrt(abs(auxiliary)), 1e-300)
             inside = (level * scale) ** 2 - self._form.bernstein(z * scale)
-            saved = self._saved(z * scale, dynamic_variable * scale**2)
-            if saved is not None:
-                inside += saved @ curve_basis(2 * DEGREE).from_taylor.T
+            eta = self._eta_series(z * scale, auxiliary * scale**2)
+            if eta is not None:
+                inside += eta @ curve_basis(2 * DEGREE).from_taylor.T
             last = min(int((span_s - begin_s) / width_s), CELLS)
-            for cell in np.flatnonzero(inside.min(axis=1) < 0) if self._looks else ():
+            for cell in np.flatnonzero(inside.min(axis=1) < 0) if self._compares else ():
                 u = self._basis.first_negative(inside[cell]) if cell <= last else None
                 if u is not None and begin_s + (cell + u) * width_s <= span_s:
-                    return self._reached(begin_s, z, int(cell), u, saved, scale, exceeds=True)
+                    return self._reached(begin_s, z, int(cell), u, eta, scale, exceeds=True)
             if last < CELLS:
                 u = min((span_s - begin_s) / width_s - last, 1.0)
-                return self._reached(begin_s, z, last, u, saved, scale, exceeds=False)
-            if saved is not None:
-                dynamic_variable = float(saved[-1].sum()) / scale**2
+                return self._reached(begin_s, z, last, u, eta, scale, exceeds=False)
+            if eta is not None:
+                auxiliary = float(eta[-1].sum()) / scale**2
             z = self._flow.powers[CELLS] @ z
             begin_s += self._flow.window_s
 
-    def _saved(self, z: Vector, dynamic_variable: float) -> Matrix | None:
+    def _eta_series(self, z: Vector, auxiliary: float) -> Matrix | None:
         """Taylor coefficients of η in all cells of a window, scaled, shape (cells, 2p + 1)."""
         if self._gain is None:
             return None
-        saved = self._gain.taylor(z) @ self._gathered.T
+        eta = self._gain.taylor(z) @ self._by_gain.T
         for cell in range(CELLS):
-            saved[cell] += dynamic_variable * self._faded
-            dynamic_variable = float(saved[cell].sum())
-        return saved
+            eta[cell] += auxiliary * self._by_start
+            auxiliary = float(eta[cell].sum())
+        return eta
 
     def _reached(
         self,
@@ -201,18 +198,18 @@ class QuadraticEventDetector:
         z: Vector,
         cell: int,
         u: float,
-        saved: Matrix | None,
+        eta: Matrix | None,
         scale: float,
         *,
         exceeds: bool,
     ) -> DetectedEvent:
-        dynamic_variable = 0.0
-        if saved is not None:
-            dynamic_variable = float(u ** np.arange(saved.shape[1]) @ saved[cell]) / scale**2
+        auxiliary = 0.0
+        if eta is not None:
+            auxiliary = float(u ** np.arange(eta.shape[1]) @ eta[cell]) / scale**2
         return DetectedEvent(
             begin_s + (cell + u) * self._flow.width_s,
             self._flow.within_cell(self._flow.powers[cell] @ z, u),
-            dynamic_variable,
+            auxiliary,
             exceeds,
         )
 
@@ -256,7 +253,7 @@ def _convolution(degree: int) -> Matrix:
     return np.asarray(orders[None] == np.arange(2 * degree + 1)[:, None], dtype=np.float64)
 
 
-def _reserve_series(decay_per_s: float, width_s: float) -> tuple[Vector, Matrix]:
+def _dynamic_variable_series(decay_per_s: float, width_s: float) -> tuple[Vector, Matrix]:
     """How the Taylor coefficients of η on a cell follow from η at its start and from its gain's.
 
     η_{k+1} = d (w_k − λη_k)/(k + 1).
@@ -265,10 +262,10 @@ def _reserve_series(decay_per_s: float, width_s: float) -> tuple[Vector, Matrix]
         (2p + 1,) for a start of 1, and (2p + 1, 2p + 1) by the gain's coefficients.
     """
     size = 2 * DEGREE + 1
-    faded, gathered = np.zeros(size), np.zeros((size, size))
-    faded[0] = 1.0
+    by_start, by_gain = np.zeros(size), np.zeros((size, size))
+    by_start[0] = 1.0
     for k in range(size - 1):
-        faded[k + 1] = -decay_per_s * width_s * faded[k] / (k + 1)
-        gathered[k + 1] = -decay_per_s * width_s * gathered[k] / (k + 1)
-        gathered[k + 1, k] += width_s / (k + 1)
-    return faded, gathered
+        by_start[k + 1] = -decay_per_s * width_s * by_start[k] / (k + 1)
+        by_gain[k + 1] = -decay_per_s * width_s * by_gain[k] / (k + 1)
+        by_gain[k + 1, k] += width_s / (k + 1)
+    return by_start, by_gain

@@ -11,7 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, FiniteFloat, JsonValue, model_validator
+from pydantic import BeforeValidator, Field, FiniteFloat, JsonValue, model_validator
 
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.metrics import METRICS, Metric
@@ -25,7 +25,31 @@ MOST_SERIES = 12
 
 Identifier = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 Settings = Annotated[dict[str, JsonValue], Field(min_length=1)]
-Value = str | int | float | bool
+
+
+def _require_scalars(given: Any) -> Any:
+    """Check that a value, or each of a list, is a number, a text, true or false.
+
+    Raises:
+        ValueError: one is a list or a table.
+    """
+    values = given if isinstance(given, list | tuple) else (given,)
+    if any(isinstance(one, list | tuple | dict) for one in values):
+        raise ValueError(
+            "should be numbers, texts, true or false; for matrices and tables use variants, "
+            'e.g. variants = { "small" = { "trigger.weight" = [[1, 0], [0, 1]] } }'
+        )
+    return tuple(given) if isinstance(given, list) else given
+
+
+def _require_scalar(given: Any) -> Any:
+    if isinstance(given, list | dict):
+        raise ValueError("should be a number, a text, true or false")
+    return given
+
+
+Value = Annotated[str | int | float | bool, BeforeValidator(_require_scalar)]
+Values = Annotated[tuple[Value, ...], Field(min_length=1), BeforeValidator(_require_scalars)]
 
 
 def label_of(value: JsonValue) -> str:
@@ -60,7 +84,7 @@ class Axis(ScenarioSection):
     """What figures and tables call it; the name unless given."""
     key: str | None = None
     """A key of the scenario, e.g. network.mansd; goes with values."""
-    values: Annotated[tuple[Value, ...], Field(min_length=1)] | None = None
+    values: Values | None = None
     """Its values."""
     variants: Annotated[dict[str, Settings], Field(min_length=1)] | None = None
     """Instead of key and values: names, each with the settings that it stands for."""

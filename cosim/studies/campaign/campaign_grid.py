@@ -15,6 +15,7 @@ from cosim.shipped_files import find_shipped
 from cosim.simulation.batch.batch_interface import Setting, run_batch, setting_of
 from cosim.simulation.continuous.network_fates import timeless
 from cosim.studies.campaign.campaign_file import Campaign, Value
+from cosim.studies.campaign.campaign_workers import Work
 from cosim.studies.campaign.metrics import certified_error
 from cosim.studies.campaign.random_draws import Box, box_of
 from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
@@ -44,7 +45,7 @@ class Point:
     """Its plant and initial state not yet drawn."""
     certified_error: float | None
     """Δβ, or None."""
-    work: "Work"
+    work: Work
     """Runs its draws."""
 
 
@@ -59,14 +60,6 @@ class ContinuousWork:
     def run(self, draws: range) -> NDArray[np.void]:
         """Run some successive draws; one row each."""
         return run_batch(self.setting, self.box.population(self.seed, draws))
-
-
-Work = ContinuousWork | SampledWork
-
-
-def run_draws(work: Work, draws: range) -> NDArray[np.void]:
-    """Run some successive draws; one row of ``batch_interface.ROW`` each, (k,)."""
-    return work.run(draws)
 
 
 def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:

@@ -74,7 +74,7 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
         )
 
     try:
-        for chunk, rows in runner(store.points, missing):
+        for chunk, rows in runner([point.work for point in store.points], missing):
             try:
                 store.write(chunk, rows)
             except OSError as error:

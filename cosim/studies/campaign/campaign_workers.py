@@ -12,21 +12,40 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-import numpy as np
 from numpy.typing import NDArray
 
-from cosim.studies.campaign.campaign_grid import Point, Work, run_draws
-from cosim.studies.campaign.chunk_store import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from cosim.studies.process_pool import interrupts_held, processes
 from noack.core.errors import CallerError, PeerError
 
-Finished = tuple[Chunk, NDArray[np.void]]
-Runner = Callable[[Sequence[Point], Iterable[Chunk]], Iterator[Finished]]
-"""Runs chunks and gives their results as they come, in any order."""
+
+class Work(Protocol):
+    """Computes the draws of a grid point; sent to another process with each chunk."""
+
+    def run(self, draws: range) -> NDArray[Any]:
+        """Compute successive draws; one row each."""
+        ...
+
+
+class Chunk(NamedTuple):
+    """Successive draws at a grid point."""
+
+    point: int
+    start: int
+    stop: int
+
+    @property
+    def draws(self) -> range:
+        """Their numbers."""
+        return range(self.start, self.stop)
+
+
+Finished = tuple[Chunk, NDArray[Any]]
+Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
+"""Computes chunks, given the work of each grid point; yields results in any order."""
 
 _AHEAD = 2
 """Chunks under way for each worker: one that runs, one that waits."""
@@ -44,10 +63,15 @@ class LostWorkersError(PeerError):
     """Workers have died, or cannot be reached any more."""
 
 
-def alone(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
-    """Run chunks in this process."""
+def alone(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    """Compute chunks in this process."""
     for chunk in chunks:
-        yield chunk, run_draws(points[chunk.point].work, chunk.draws)
+        yield chunk, works[chunk.point].run(chunk.draws)
+
+
+def run_draws(work: Work, draws: range) -> NDArray[Any]:
+    """Compute successive draws in another process of this machine."""
+    return work.run(draws)
 
 
 @contextmanager
@@ -58,9 +82,9 @@ def local(workers: int) -> Iterator[Runner]:
         return
     with processes(workers) as pool:
 
-        def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+        def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
             try:
-                yield from _windowed(pool, points, chunks, lambda: _AHEAD * workers)
+                yield from _windowed(pool, works, chunks, lambda: _AHEAD * workers)
             except BrokenProcessPool:
                 raise LostWorkersError(
                     "a worker process was killed (was there not enough memory?)"
@@ -93,7 +117,7 @@ def _client(connect: Any, address: str) -> Any:
         ) from None
 
 
-def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np.void]:
+def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[Any]:
     """Run some draws on another machine.
 
     Raises:
@@ -103,7 +127,7 @@ def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[np
         raise OtherArithmeticError(
             f"a worker on {socket.gethostname()} would give other results: {other}"
         )
-    return run_draws(work, draws)
+    return work.run(draws)
 
 
 @contextmanager
@@ -133,11 +157,11 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
     except (OSError, TimeoutError):
         raise PeerError(f"--scheduler {address}: no Dask scheduler answers there") from None
 
-    def run(points: Sequence[Point], chunks: Iterable[Chunk]) -> Iterator[Finished]:
+    def run(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
         watch = _Watch(client, address, say)
         executor: Executor = client.get_executor(pure=False)
         try:
-            yield from _windowed(executor, points, chunks, watch, arithmetic())
+            yield from _windowed(executor, works, chunks, watch, arithmetic())
         except OtherArithmeticError as error:
             raise OtherArithmeticError(f"{address}: {error}") from None
         except (ImportError, RuntimeError) as error:
@@ -199,17 +223,17 @@ class _Watch:
 
 def _windowed(
     executor: Executor,
-    points: Sequence[Point],
+    works: Sequence[Work],
     chunks: Iterable[Chunk],
     most: Callable[[], int],
     wanted: Mapping[str, str] | None = None,
 ) -> Iterator[Finished]:
     """Keep so many chunks under way, so that memory does not grow with the campaign."""
     rest = iter(chunks)
-    in_flight: dict[Future[NDArray[np.void]], Chunk] = {}
+    in_flight: dict[Future[NDArray[Any]], Chunk] = {}
     while True:
         for chunk in islice(rest, max(most() - len(in_flight), 0)):
-            task = (points[chunk.point].work, chunk.draws)
+            task = (works[chunk.point], chunk.draws)
             with interrupts_held():
                 future = (
                     executor.submit(run_draws, *task) if wanted is None

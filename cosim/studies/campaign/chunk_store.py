@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from cosim.simulation.batch.batch_interface import ROW
 from cosim.studies.campaign.campaign_file import Campaign
 from cosim.studies.campaign.campaign_grid import Point
+from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from noack.core.errors import CallerError, MachineError
 
@@ -29,19 +30,6 @@ _LOCK = ".lock"
 _FORMAT = 1
 _PARTIAL = ".partial"
 MOST_FILES = 1_000_000
-
-
-class Chunk(NamedTuple):
-    """Some successive draws at a grid point."""
-
-    point: int
-    start: int
-    stop: int
-
-    @property
-    def draws(self) -> range:
-        """Their numbers."""
-        return range(self.start, self.stop)
 
 
 class Store:

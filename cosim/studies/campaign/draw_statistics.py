@@ -6,6 +6,7 @@ distribution) and counts what is infinite: a run that never settles is later tha
 """
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from noack.core.linear_systems import Vector
 
 CONFIDENCE = 0.95
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Each is the smallest value that at least this share of the draws does not exceed."""
 
 
 class Estimate(NamedTuple):
@@ -51,7 +53,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
             deviation = float(finite.std(ddof=1))
         halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
     ordered = np.sort(values)
-    q05, q25, median, q75, q95 = (float(ordered[_rank(len(values), share)]) for share in QUANTILES)
+    q05, q25, median, q75, q95 = _quantiles(values, QUANTILES)
     low, high = _median_ranks(len(values))
     return Estimate(
         len(values),
@@ -69,6 +71,25 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
     )
 
 
+class Quartiles(NamedTuple):
+    """Quartiles of a metric; each is the value of a draw, possibly infinite."""
+
+    lower: float
+    median: float
+    upper: float
+
+
+def quartiles(values: Vector) -> Quartiles:
+    """Lower quartile, median and upper quartile of k ≥ 1 draws, (k,)."""
+    return Quartiles(*_quantiles(values, (0.25, 0.5, 0.75)))
+
+
+def paired(values: Vector, reference: Vector) -> Vector:
+    """``values`` − ``reference`` draw by draw; 0 where both are infinite."""
+    with np.errstate(invalid="ignore"):
+        return np.where(values == reference, 0.0, values - reference)
+
+
 class PairedDifference(NamedTuple):
     """A metric at one grid point minus at another, draw by draw."""
 
@@ -84,8 +105,7 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
 
     Where both are infinite the difference is 0 for quantiles, and does not count for the mean.
     """
-    with np.errstate(invalid="ignore"):
-        differences = np.where(values == reference, 0.0, values - reference)
+    differences = paired(values, reference)
     both = np.isfinite(values) & np.isfinite(reference)
     return PairedDifference(
         estimate(differences, differences[both]),
@@ -102,9 +122,8 @@ def _student(count: int) -> float:
     return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
 
 
-def _rank(count: int, share: float) -> int:
-    """Rank, from 0, of the smallest value that so large a share does not exceed."""
-    return max(math.ceil(share * count) - 1, 0)
+def _quantiles(values: Vector, shares: Sequence[float]) -> list[float]:
+    return [float(value) for value in np.quantile(values, shares, method="inverted_cdf")]
 
 
 def _median_ranks(count: int) -> tuple[int | None, int | None]:

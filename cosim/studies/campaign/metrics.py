@@ -90,8 +90,11 @@ def certified_error(resolved: Scenario) -> float | None:
     hold does not), a threshold without a floor within the horizon, and a network that keeps to
     the cap.
     """
-    trigger, network = resolved.trigger, resolved.network
-    if trigger.policy != "decaying" or trigger.floor > 0 or not network.enforce_mansd:
+    network = resolved.network
+    if not resolved.coverage.is_decaying or not network.enforce_mansd:
+        return None
+    trigger = resolved.decaying
+    if trigger.floor > 0:
         return None
     models = error_gains(loop_of(resolved), trigger.alpha_per_s)
     try:

@@ -21,6 +21,7 @@ from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
+from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
@@ -31,7 +32,6 @@ from noack.protocol.record_tables import (
     PLANT_STEP,
     SENSOR_MEASUREMENT,
 )
-from noack.trigger.policy_from_settings import policy_of
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,6 @@
 """Runs overlaid: their states, errors and transmissions in one figure, and a page with it."""
 
-import math
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +19,10 @@ from cosim.output.report.axes import (
     Shown,
     finish,
     finite,
+    for_log_axis,
     head_in,
     legend,
+    limit_log_axis,
     line,
     logarithmic,
     marks,
@@ -30,13 +30,14 @@ from cosim.output.report.axes import (
     plain,
 )
 from cosim.output.report.decimate import Reals
-from cosim.output.report.figure_files import inline, save
+from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import NotebookFigure, printed, styled
 from cosim.output.report.report_page import templates
 from cosim.record.align import AlignedRun, join_all
 from cosim.studies.comparison.run_comparison import ComparedRun, RunComparison
 from noack.core.clock import NS_PER_S
-from noack.core.errors import CallerError, MachineError, why
+from noack.core.errors import CallerError
+from noack.core.whole_file import write_whole
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, NO_SEQUENCE, SENSOR_MEASUREMENT
 
 _MOST_STATES = 6
@@ -70,7 +71,7 @@ def overlay_figure(runs: Sequence[ComparedRun]) -> Figure:
         top_in += head + height
     shown = [_state(axes, i, joined)[: len(runs)] for i, axes in enumerate(panels[:states])]
     for i, axes in enumerate(panels[:states]):
-        axes.set_ylabel(f"{plain(runs[0].record.loop.state_names[i])}\n[model units]")
+        axes.set_ylabel(plain(runs[0].record.loop.state_names[i]))
     legend(panels[0], [(artist, name) for (artist, _), name in zip(shown[0], names, strict=True)])
     _norms(panels[states], r"Sensor's error $\|e_s\|$ and threshold (dashed)", [
         (_times(one), one.e_s_norm, one.threshold) for one in joined
@@ -108,23 +109,18 @@ def _state(axes: Axes, entry: int, joined: Sequence[AlignedRun]) -> list[Shown]:
 def _norms(axes: Axes, title: str, curves: Sequence[tuple[Reals, Reals, Reals | None]]) -> None:
     """Draw norms on a logarithmic axis, the first run on top; a reset goes down to rounding."""
     logarithmic(axes, "y")
-    largest = 0.0
     for number, (t_s, values, threshold) in enumerate(curves):
-        values = finite(values, positive=True)
         style = _style(number) | {"linewidth": _NORM_WIDTH, "zorder": 3 - 0.1 * number}
-        line(axes, t_s, values, **style)
-        largest = max(largest, float(np.nan_to_num(values).max(initial=0.0)))
+        line(axes, t_s, for_log_axis(values), **style)
         if threshold is not None:
             dashed = style | {"linestyle": (0, (5, 2))}
             line(axes, t_s, finite(threshold, positive=True), **dashed)
-    if largest:
-        low, high = axes.get_ylim()
-        axes.set_ylim(max(low, 10.0 ** (math.floor(math.log10(largest)) - _DECADES)), high)
-    axes.set(title=title, ylabel="norm, model units")
+    limit_log_axis(axes, np.concatenate([values for _, values, _ in curves]), _DECADES)
+    axes.set(title=title, ylabel="norm")
 
 
 def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
-    """One row of marks per run: a stroke for a transmission that was delivered, a cross if lost."""
+    """One row of marks per run: a bar for a delivered transmission, a cross for a lost one."""
     rows = range(len(runs) - 1, -1, -1)
     shown: list[Shown] = []
     for number, (run, row) in enumerate(zip(runs, rows, strict=True)):
@@ -133,13 +129,13 @@ def _events(axes: Axes, runs: Sequence[ComparedRun]) -> None:
         delivered = np.isin(sent["event"], run.record[CONTROLLER_DELIVERY]["sequence"])
         t_s = sent["t_ns"] / NS_PER_S
         colour = _style(number)["color"]
-        stroke: dict[str, Any] = {"color": colour, "marker": "|", "markeredgewidth": 1.6}
-        marks(axes, t_s[delivered], np.full(int(delivered.sum()), row), size=13.0, **stroke)
+        bar: dict[str, Any] = {"color": colour, "marker": "|", "markeredgewidth": 1.6}
+        marks(axes, t_s[delivered], np.full(int(delivered.sum()), row), size=13.0, **bar)
         lost: dict[str, Any] = {"color": printed(palette.LOST), "marker": "x"}
         crosses = marks(axes, t_s[~delivered], np.full(int((~delivered).sum()), row), "lost",
                         size=4.5, **lost)  # fmt: skip
         shown = shown or crosses
-    axes.set(title="Transmissions (stroke: delivered)", ylim=(-0.6, len(runs) - 0.4))
+    axes.set(title="Transmissions (bar: delivered, cross: lost)", ylim=(-0.6, len(runs) - 0.4))
     axes.set_yticks(list(rows), [run.label for run in runs])
     axes.grid(visible=False, axis="y")
     legend(axes, shown)
@@ -150,17 +146,9 @@ def write_overlay(comparison: RunComparison, path: Path) -> None:
     if path.suffix not in (".html", ".svg", ".png"):
         raise CallerError(f"{path}: a comparison is written as .html, .svg or .png")
     figure = overlay_figure(comparison.runs)
-    scratch = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".html":
-            markup = Markup(inline(figure, "overlay", _DESCRIPTION))
-            template = templates().get_template("overlay.html.jinja")
-            scratch.write_text(template.render(found=comparison, figure=markup), encoding="utf-8")
-        else:
-            save(figure, scratch)
-        scratch.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            scratch.unlink(missing_ok=True)
-        raise MachineError(f"{path}: cannot be written: {why(error)}") from None
+    if path.suffix == ".html":
+        markup = Markup(inline(figure, "overlay", _DESCRIPTION))
+        template = templates().get_template("overlay.html.jinja")
+        write_whole(path, template.render(found=comparison, figure=markup))
+    else:
+        save_figure(figure, path)

@@ -1,7 +1,8 @@
 """What is measured of one draw: both loops, exact in continuous time, on the same plant."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -13,13 +14,16 @@ from cosim.simulation.continuous.continuous_run import (
 )
 from cosim.simulation.continuous.exact_flow import ExactFlow, growth_rate
 from cosim.simulation.continuous.network_fates import network_fates
-from cosim.studies.paper.paper_conditions import MODES, resolved_draw
-from noack.config.resolution import LoopMatrices, loop_of
+from noack.config.resolution import LoopMatrices, loop_of, resolve
 from noack.config.scenario import Scenario
+from noack.config.sections.run_sections import SeedsSection
 from noack.core.linear_systems import Matrix, Vector, spectral_abscissa
 
+Mode = Literal["model", "zoh"]
+MODES: Mapping[Mode, str] = {"model": "MB-ET", "zoh": "ZOH-ET"}
+"""The paper's names of the loops."""
 STEP_S = 0.01
-"""Norms are looked at so often; the loops' fastest mode is slower than 5 /s."""
+"""Sampling period of the norms; the loops' fastest mode is slower than 5 /s."""
 LEVELS = (0.05, 0.01)
 """Shares of ‖x(0)‖ below which a run counts as settled."""
 _MAX_EVENTS = 10_000
@@ -70,11 +74,17 @@ class Draw(NamedTuple):
     zoh: Measures
 
 
+def resolved_draw(scenario: Scenario, draw: int, mode: Mode) -> Scenario:
+    """A draw of a scenario, resolved: its number is the seed of every random stream."""
+    seeds = SeedsSection(plant=draw, initial_state=draw, loss=draw)
+    return resolve(scenario.model_copy(update={"mode": mode, "seeds": seeds}))
+
+
 def measure_draw(scenario: Scenario, draw: int) -> Draw:
     """Simulate both loops of a draw and measure them.
 
     Args:
-        scenario: of a condition; its seeds and mode play no part.
+        scenario: of a variation; its seeds and mode are replaced.
         draw: the draw's number.
     """
     resolved = {mode: resolved_draw(scenario, draw, mode) for mode in MODES}

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from cosim.studies.paper.paper_conditions import resolved_draw
+from cosim.studies.paper.draw_measures import resolved_draw
 from noack.config.resolution import loop_of
 from noack.config.scenario import Scenario
 from noack.theory.certificate import Constants

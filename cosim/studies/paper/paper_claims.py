@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.studies.paper.ensemble_statistics import number, percent, quartiles, share
-from cosim.studies.paper.paper_conditions import BASE, CONDITIONS, Condition
+from cosim.studies.campaign.draw_statistics import quartiles
+from cosim.studies.paper.paper_campaign import BASE, EXACT_MODEL, OTHER_EXAMPLES, WIDE_BOX
+from cosim.studies.paper.paper_numbers import number, percent
 from cosim.studies.paper.paper_results import Results
 from noack.core.linear_systems import Vector
 
@@ -41,7 +42,7 @@ class PaperClaim(NamedTuple):
 
 Flags = NDArray[np.bool_]
 Column = Callable[[str], Vector]
-"""Gives a column of a condition by its name."""
+"""Returns a column of a variation by its name."""
 
 
 class Judgement(NamedTuple):
@@ -71,26 +72,20 @@ class Judgement(NamedTuple):
         return str(self)[0].upper() + str(self)[1:]
 
 
-def judge(
-    results: Results,
-    holds: Callable[[Column], Flags],
-    conditions: tuple[Condition, ...] = CONDITIONS,
-) -> Judgement:
-    """How often something holds.
+def judge(results: Results, holds: Callable[[Column], Flags]) -> Judgement:
+    """In which share of the draws a statement holds: of the base and, at least, of the variations.
 
     Args:
         results: the draws.
-        holds: from a condition's columns to one truth value per draw.
-        conditions: those of them that vary what the paper leaves open count.
+        holds: from a variation's columns to one truth value per draw.
     """
 
-    def in_condition(condition: Condition) -> float:
-        return share(holds(lambda name: results.column(name, condition.name)))
+    def share(variation: str) -> float:
+        return float(holds(lambda name: results.column(name, variation)).mean())
 
-    shares = {c.title: in_condition(c) for c in conditions if c.left_open}
-    least_in = min(shares, key=shares.__getitem__, default=BASE.title)
-    base = in_condition(BASE)
-    return Judgement(base, shares.get(least_in, base), least_in)
+    shares = {name: share(name) for name in results.variations if name not in OTHER_EXAMPLES}
+    least_in = min(shares, key=shares.__getitem__)
+    return Judgement(shares[BASE], shares[least_in], least_in)
 
 
 def claims(results: Results) -> Iterator[PaperClaim]:
@@ -217,7 +212,7 @@ def _inter_event(results: Results) -> Iterator[PaperClaim]:
     )
     medians = [
         quartiles(results.column("model.gap_median_s", name)).median
-        for name in ("exact_model", BASE.name, "wide_box")
+        for name in (EXACT_MODEL, BASE, WIDE_BOX)
     ]
     ordered = medians[0] > medians[1] > medians[2]
     yield PaperClaim(

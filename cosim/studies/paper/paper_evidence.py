@@ -5,7 +5,6 @@ Each function returns numbers for the page, each from the exact simulator or fro
 
 import math
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,15 @@ from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
 from cosim.simulation.virtual_time import simulate
-from cosim.studies.paper.draw_measures import open_loop_eigenvalues, simulate_draw
-from cosim.studies.paper.paper_conditions import BASE, MODES, load_condition, resolved_draw
+from cosim.studies.paper.draw_measures import (
+    MODES,
+    open_loop_eigenvalues,
+    resolved_draw,
+    simulate_draw,
+)
 from noack.config.named_models import lane_following
 from noack.config.resolution import LoopMatrices, loop_of
-from noack.config.scenario_file import load
+from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
 from noack.core.linear_systems import Matrix, spectral_abscissa
 from noack.protocol.record_tables import SENSOR_MEASUREMENT, entry_names
@@ -39,27 +42,26 @@ _ZERO = 1e-6
 """Eigenvalues below it in magnitude are 0: the lane's double eigenvalue 0 is defective."""
 
 
-def evidence(path: Path, representative: int) -> Numbers:
-    """Everything, as JSON knows it.
+def evidence(scenario: Scenario, representative: int) -> Numbers:
+    """All numbers of the page's sections on assumptions and slips, as JSON.
 
     Args:
-        path: the paper's scenario.
-        representative: the draw whose plant serves as an example.
+        scenario: of the base ensemble; its seeds and mode are replaced.
+        representative: the draw that serves as an example.
     """
-    scenario = load_condition(path, BASE)
     M, trigger = scenario.network.mansd + 1, scenario.decaying
     return {
         "example": {"M": M, "beta": trigger.beta, "alpha_per_s": trigger.alpha_per_s},
         "eigenvalues": _eigenvalues(),
         "loss": _loss(M),
-        "exact_model": _exact_model(path),
-        "trapped": _trapped(path),
+        "exact_model": _exact_model(scenario),
+        "trapped": _trapped(scenario),
         "slow_model": _slow_model(M),
-        "standstill": _standstill(path),
-        "overshoot": _overshoot(path, representative),
-        "theorem_1": _theorem_1(path, representative),
-        "theorem_3": _theorem_3(path, representative),
-        "sampled": _sampled(path, representative),
+        "standstill": _standstill(scenario),
+        "overshoot": _overshoot(scenario, representative),
+        "theorem_1": _theorem_1(scenario, representative),
+        "theorem_3": _theorem_3(scenario, representative),
+        "sampled": _sampled(scenario, representative),
     }
 
 
@@ -93,10 +95,9 @@ def _loss(M: int) -> Numbers:
     }
 
 
-def _exact_model(path: Path) -> Numbers:
+def _exact_model(scenario: Scenario) -> Numbers:
     """Proposition 1 fails for an exact model: the nominal lane, only the first packet delivered."""
-    settings = ("plant.draw=nominal", f"horizon_s={_LONG_S}")
-    resolved = resolved_draw(load(path, settings), 0, "model")
+    resolved = resolved_draw(_nominal(scenario, _LONG_S), 0, "model")
     run = simulate_continuous(
         continuous_loop_of(resolved),
         horizon_s=_LONG_S,
@@ -120,12 +121,11 @@ def _exact_model(path: Path) -> Numbers:
     }
 
 
-def _trapped(path: Path) -> Numbers:
+def _trapped(scenario: Scenario) -> Numbers:
     """The dimensions of the x whose pair (x, x) lies in the span of Γ's stable modes.
 
     "model" and "zoh" count eigenvalues 0 as stable (no exponential growth), "strictly" does not.
     """
-    scenario = load_condition(path, BASE)
     draw = 0
     while True:
         loop = loop_of(resolved_draw(scenario, draw, "model"))
@@ -189,13 +189,12 @@ def _slow_model(M: int) -> Numbers:
     }
 
 
-def _standstill(path: Path) -> Numbers:
+def _standstill(scenario: Scenario) -> Numbers:
     """A hold without growth: the nominal lane comes to rest beside the lane, and stays there.
 
     K x(0) = 0, and (V, r) decays along A's stable direction until ψ = 0: nothing moves any more.
     """
-    settings = ("plant.draw=nominal", "mode=zoh", "horizon_s=40")
-    resolved = resolved_draw(load(path, settings), 0, "zoh")
+    resolved = resolved_draw(_nominal(scenario, scenario.horizon_s), 0, "zoh")
     loop, trigger = loop_of(resolved), resolved.decaying
     eigenvalues, vectors = np.linalg.eig(loop.A[:2, :2])
     slowest = int(np.argmin(eigenvalues))
@@ -224,10 +223,10 @@ def _standstill(path: Path) -> Numbers:
     }
 
 
-def _overshoot(path: Path, representative: int) -> Numbers:
+def _overshoot(scenario: Scenario, representative: int) -> Numbers:
     """Sup ‖x‖ / ‖x(0)‖ for ever smaller x(0)."""
     scales = (1.0, 1e-2, 1e-4)
-    scenario = load_condition(path, BASE).model_copy(update={"horizon_s": 100.0})
+    scenario = scenario.model_copy(update={"horizon_s": 100.0})
     found: Numbers = {"scales": list(scales)}
     for mode in MODES:
         resolved = resolved_draw(scenario, representative, mode)
@@ -247,9 +246,9 @@ def _overshoot(path: Path, representative: int) -> Numbers:
     return found
 
 
-def _theorem_1(path: Path, representative: int) -> Numbers:
+def _theorem_1(scenario: Scenario, representative: int) -> Numbers:
     """Theorem 1's Δ of every stretch between deliveries, from the trajectory; the best γ, η_j."""
-    run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "model"))
+    run = simulate_draw(resolved_draw(scenario, representative, "model"))
     trigger, H = run.system.decaying, run.system.loop.H
     arrived = np.flatnonzero(run.delivered)
     deltas, closest = [], []
@@ -268,14 +267,14 @@ def _longest_s(run: ContinuousRun, event: int) -> float:
     return longest_interval_s(interval, trigger.beta, trigger.alpha_per_s, trigger.alpha_per_s)
 
 
-def _theorem_3(path: Path, representative: int) -> Numbers:
+def _theorem_3(scenario: Scenario, representative: int) -> Numbers:
     """eq:zohnume as printed, and with the factor that its derivation gives, along a run.
 
     With γ of the nominal plant and the largest η_j that the theorem allows, ‖x(t_j)‖.
     """
     from scipy.optimize import brentq
 
-    run = simulate_draw(resolved_draw(load_condition(path, BASE), representative, "zoh"))
+    run = simulate_draw(resolved_draw(scenario, representative, "zoh"))
     beta, alpha_per_s = run.system.decaying.beta, run.system.decaying.alpha_per_s
     gamma = float(open_loop_eigenvalues(_loop(lane_following({}).A)).real.max())
 
@@ -300,9 +299,9 @@ def _theorem_3(path: Path, representative: int) -> Numbers:
     return {"gamma_per_s": gamma, "rows": rows}
 
 
-def _sampled(path: Path, representative: int) -> Numbers:
+def _sampled(scenario: Scenario, representative: int) -> Numbers:
     """The same draw with a trigger that looks at the scenario's sampling rate only."""
-    scenario = load_condition(path, BASE).model_copy(update={"horizon_s": _SAMPLED_S})
+    scenario = scenario.model_copy(update={"horizon_s": _SAMPLED_S})
     resolved = resolved_draw(scenario, representative, "model")
     continuous = simulate_draw(resolved)
     record = simulate(resolved)
@@ -318,6 +317,12 @@ def _sampled(path: Path, representative: int) -> Numbers:
         "beyond": float(beyond.max()),
         "rms": math.sqrt(float(((joined.x - exact.x) ** 2).sum(axis=1).mean())),
     }
+
+
+def _nominal(scenario: Scenario, horizon_s: float) -> Scenario:
+    """The scenario with the nominal plant and its nominal initial state."""
+    plant = scenario.plant.model_copy(update={"draw": "nominal", "initial_state_halfwidth": None})
+    return scenario.model_copy(update={"plant": plant, "horizon_s": horizon_s})
 
 
 def _loop(

@@ -15,7 +15,7 @@ from cosim.output.report.axes import BELOW_IN, RIGHT_IN, WIDTH_IN, Shown, finish
 from cosim.output.report.figure_style import INK, printed, styled
 from cosim.output.report.signal_figures import paper_figure
 from cosim.simulation.continuous.continuous_run import ContinuousRun
-from cosim.studies.paper.paper_conditions import MODES, Mode
+from cosim.studies.paper.draw_measures import MODES, Mode
 from cosim.studies.paper.paper_results import Results
 from netem.link_machine import Datagram, update_link_of
 from noack.config.scenario import Scenario

@@ -8,17 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from cosim.studies.paper.draw_measures import STEP_S
-from cosim.studies.paper.ensemble_statistics import (
-    number,
-    paired,
-    percent,
-    quartiles,
-    share,
-    spread,
-)
+from cosim.studies.campaign.draw_statistics import paired, quartiles
+from cosim.studies.paper.draw_measures import MODES, STEP_S
+from cosim.studies.paper.paper_campaign import BASE, OTHER_EXAMPLES, settings_of
 from cosim.studies.paper.paper_claims import CONFIRMED_FROM, PARTLY_FROM, claims
-from cosim.studies.paper.paper_conditions import BASE, CONDITIONS, HORIZON_S, MODES, settings_of
+from cosim.studies.paper.paper_numbers import HORIZON_S, number, percent, spread
 from cosim.studies.paper.paper_results import Results
 from noack.core.linear_systems import Vector
 
@@ -39,7 +33,7 @@ _MEASURES = (
 
 
 class _Compared(NamedTuple):
-    """A row of the page's main table."""
+    """A row of the page's main table: a measure of both loops."""
 
     what: str
     model: str
@@ -69,7 +63,7 @@ def render(results: Results) -> str:
         .render(
             draws=results.count(),
             representative=results.representative,
-            settings=settings_of(BASE, results.representative),
+            settings=settings_of(results.representative),
             horizon_s=HORIZON_S,
             step_s=STEP_S,
             confirmed_from=CONFIRMED_FROM,
@@ -91,14 +85,14 @@ def _shares(results: Results) -> dict[str, Any]:
     events, settled = _both(results, "events"), _both(results, "settled_5_s")
     finest = _both(results, "settled_1_s")
     return {
-        "fewer": share(events[0] < events[1]),
+        "fewer": (events[0] < events[1]).mean(),
         "times": quartiles(events[1] / events[0]).median,
-        "later": share(settled[1] > settled[0]),
-        "settle": share(np.isfinite(finest[0]) & np.isfinite(finest[1])),
+        "later": (settled[1] > settled[0]).mean(),
+        "settle": np.isfinite(finest).all(axis=0).mean(),
         "unstabilised": int(
             (column("slowest_closed") > -results.evidence["example"]["alpha_per_s"]).sum()
         ),
-        "not_unstable": share(column("fastest_open") <= 0),
+        "not_unstable": (column("fastest_open") <= 0).mean(),
         "stretches": {m: float((column(f"{m}.deliveries") - 1).sum()) for m in MODES},
         "growing": {m: float(column(f"{m}.growing").sum()) for m in MODES},
     }
@@ -111,33 +105,32 @@ def _compared(results: Results) -> Iterator[_Compared]:
             what,
             spread(model),
             spread(zoh),
-            spread(paired(model, zoh)),
-            percent(share(zoh > model)),
+            spread(paired(zoh, model)),
+            percent((zoh > model).mean()),
         )
 
 
 def _varied(results: Results) -> Iterator[_Varied]:
-    for condition in CONDITIONS:
-        name = condition.name
+    for name in results.variations:
         events, settled = _both(results, "events", name), _both(results, "settled_5_s", name)
         lost = [percent(quartiles(values).median) for values in _both(results, _LOST, name)]
         yield _Varied(
-            condition.title + ("" if condition.left_open else " *"),
+            name + (" *" if name in OTHER_EXAMPLES else ""),
             number(results.count(name)),
             _medians(events),
             " / ".join(lost),
             _medians(_both(results, "gap_min_s", name)),
             _medians(settled),
-            percent(share(events[1] > events[0])),
-            percent(share(settled[1] > settled[0])),
+            percent((events[1] > events[0]).mean()),
+            percent((settled[1] > settled[0]).mean()),
         )
 
 
-def _both(results: Results, name: str, condition: str = BASE.name) -> list[Vector]:
+def _both(results: Results, name: str, variation: str = BASE) -> list[Vector]:
     """A measure of MB-ET and of ZOH-ET."""
     if name == _LOST:
-        return [results.lost(mode, condition) for mode in MODES]
-    return [results.column(f"{mode}.{name}", condition) for mode in MODES]
+        return [results.lost(mode, variation) for mode in MODES]
+    return [results.column(f"{mode}.{name}", variation) for mode in MODES]
 
 
 def _medians(both: list[Vector]) -> str:

@@ -1,4 +1,4 @@
-"""What the page is made from: all draws, as they stand in ``paper.json``."""
+"""The page's data: all draws, as in ``paper.json``."""
 
 import json
 import math
@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from cosim.studies.paper.paper_conditions import BASE, CONDITIONS
-from cosim.studies.paper.paper_ensemble import COLUMNS, EnsemblePart, Row
+from cosim.studies.campaign.draw_statistics import quartiles
+from cosim.studies.paper.draw_measures import MODES
+from cosim.studies.paper.paper_campaign import BASE, COLUMNS, EnsemblePart
 from noack.core.linear_systems import Matrix, Vector
 
 DIGITS = 5
@@ -18,35 +19,40 @@ DIGITS = 5
 
 REPRESENTED = tuple(
     f"{mode}.{name}"
-    for mode in ("model", "zoh")
+    for mode in MODES
     for name in ("events", "deliveries", "settled_5_s", "settled_1_s", "gap_min_s")
 )
-"""By these the representative draw is near the medians."""
+"""The measures that choose the representative draw."""
 
 
 @dataclass(frozen=True)
 class Results:
-    """Everything that the page says."""
+    """All numbers of the page."""
 
     tables: Mapping[tuple[str, str], Matrix]
-    """By table and condition: rows are draws, columns those of ``COLUMNS``; NaN has no place here,
-    infinite is what does not happen within the horizon."""
+    """By table and variation: rows are draws, columns those of ``COLUMNS``. An event that does not
+    happen within the horizon has the time infinity; there is no NaN."""
     evidence: Mapping[str, Any]
 
-    def column(self, name: str, condition: str = BASE.name, table: str = "draws") -> Vector:
+    def column(self, name: str, variation: str = BASE, table: str = "draws") -> Vector:
         """A column, one entry per draw."""
-        return np.asarray(self.tables[table, condition][:, COLUMNS[table].index(name)])
+        return np.asarray(self.tables[table, variation][:, COLUMNS[table].index(name)])
 
-    def lost(self, mode: str, condition: str = BASE.name) -> Vector:
+    def lost(self, mode: str, variation: str = BASE) -> Vector:
         """Share of the transmissions that the network lost."""
         deliveries, events = (
-            self.column(f"{mode}.{name}", condition) for name in ("deliveries", "events")
+            self.column(f"{mode}.{name}", variation) for name in ("deliveries", "events")
         )
         return 1 - deliveries / events
 
-    def count(self, condition: str = BASE.name, table: str = "draws") -> int:
+    @property
+    def variations(self) -> list[str]:
+        """Names of the variations, the base first."""
+        return [variation for table, variation in self.tables if table == "draws"]
+
+    def count(self, variation: str = BASE, table: str = "draws") -> int:
         """Number of draws."""
-        return len(self.tables[table, condition])
+        return len(self.tables[table, variation])
 
     @property
     def representative(self) -> int:
@@ -57,19 +63,19 @@ class Results:
         distance = np.zeros(self.count())
         for name in REPRESENTED:
             values = self.column(name)
-            low, middle, high = np.quantile(values, (0.25, 0.5, 0.75), method="inverted_cdf")
+            low, middle, high = quartiles(values)
             if math.isfinite(high) and high > low:
                 distance += ((values - middle) / (high - low)) ** 2
         return int(np.argmin(distance))
 
 
 def results_of(
-    parts: Iterable[tuple[EnsemblePart, list[Row]]], evidence: Mapping[str, Any]
+    parts: Iterable[tuple[EnsemblePart, Matrix]], evidence: Mapping[str, Any]
 ) -> Results:
     """Results, with as many digits as the file keeps."""
     document = {
         "tables": [
-            {"table": part.table, "condition": part.condition.name, "rows": rows}
+            {"table": part.table, "variation": part.variation, "rows": rows.tolist()}
             for part, rows in parts
         ],
         "evidence": evidence,
@@ -83,22 +89,19 @@ def load_results(path: Path) -> Results:
 
 
 def dumps(results: Results) -> str:
-    """The content of ``paper.json``: one draw per line; null is what does not happen."""
+    """The content of ``paper.json``: one draw per line, null for infinity."""
     tables = []
-    for (table, condition), rows in results.tables.items():
-        (settings,) = [c.settings for c in CONDITIONS if c.name == condition]
-        head = {
-            "table": table, "condition": condition, "settings": settings, "columns": COLUMNS[table]
-        }  # fmt: skip
+    for (table, variation), rows in results.tables.items():
+        head = {"table": table, "variation": variation, "columns": COLUMNS[table]}
         lines = ",\n".join(json.dumps(_rounded(row.tolist())) for row in rows)
-        tables.append(f'{json.dumps(head)[:-1]}, "rows": [\n{lines}\n]}}')
+        tables.append(f'{json.dumps(head, ensure_ascii=False)[:-1]}, "rows": [\n{lines}\n]}}')
     evidence = json.dumps(_rounded(results.evidence), indent=1)
     return f'{{"tables": [\n{",".join(tables)}\n],\n"evidence": {evidence}}}\n'
 
 
 def _read(document: Mapping[str, Any]) -> Results:
     tables = {
-        (table["table"], table["condition"]): np.array(
+        (table["table"], table["variation"]): np.array(
             [[math.inf if value is None else value for value in row] for row in table["rows"]],
             dtype=np.float64,
         )

@@ -1,47 +1,53 @@
 """Simulates the ensemble and writes the page, its figures and its numbers."""
 
+import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from cosim.output.report.figure_files import save
-from cosim.studies.paper.draw_measures import simulate_draw
-from cosim.studies.paper.ensemble_statistics import quartiles
+from cosim.output.report.figure_files import save_figure
+from cosim.studies.campaign.campaign_workers import local
+from cosim.studies.campaign.draw_statistics import quartiles
+from cosim.studies.paper.draw_measures import MODES, resolved_draw, simulate_draw
+from cosim.studies.paper.paper_campaign import (
+    BASE,
+    Progress,
+    base_scenario,
+    load_campaign,
+    run_parts,
+)
 from cosim.studies.paper.paper_claims import claims
-from cosim.studies.paper.paper_conditions import BASE, MODES, load_condition, resolved_draw
-from cosim.studies.paper.paper_ensemble import Progress, simulate_ensemble
 from cosim.studies.paper.paper_evidence import evidence
 from cosim.studies.paper.paper_figures import draw_figure, ensemble_figure
 from cosim.studies.paper.paper_page import render
-from cosim.studies.paper.paper_results import Results, dumps, results_of
+from cosim.studies.paper.paper_results import REPRESENTED, Results, dumps, results_of
 from noack.core.errors import CallerError, MachineError, why
 
 PAGE, FIGURES, RESULTS = "paper.md", "figures", "paper.json"
 FEWEST_DRAWS = 4
 
 
-def reproduce(path: Path, draws: int, workers: int, progress: Progress | None = None) -> Results:
-    """Simulate everything that the page says.
+def reproduce(draws: int, workers: int, progress: Progress | None = None) -> Results:
+    """Compute everything that the page shows.
 
     Args:
-        path: the paper's scenario.
         draws: of the base ensemble.
         workers: processes.
-        progress: is told how far the work is.
+        progress: called after each chunk of draws.
 
     Raises:
         CallerError: too few draws.
     """
     if draws < FEWEST_DRAWS:
         raise CallerError(f"--draws {draws}: quartiles need at least {FEWEST_DRAWS} draws")
-    parts = simulate_ensemble(path, draws, workers, progress)
+    _, scenarios = load_campaign()
+    with local(workers) as runner:
+        parts = run_parts(scenarios, draws, runner, progress)
     representative = results_of(parts, {}).representative
-    return results_of(parts, evidence(path, representative))
+    return results_of(parts, evidence(scenarios[BASE], representative))
 
 
 def make_folder(folder: Path) -> None:
-    """Make the page's folder, before there is anything to lose.
+    """Make the page's folder before the simulations start.
 
     Raises:
         MachineError: it cannot be made.
@@ -52,7 +58,7 @@ def make_folder(folder: Path) -> None:
         raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
 
 
-def write_page(path: Path, results: Results, folder: Path) -> list[Path]:
+def write_page(results: Results, folder: Path) -> list[Path]:
     """Write page, figures and numbers into the folder made for them; return their paths.
 
     Raises:
@@ -63,28 +69,28 @@ def write_page(path: Path, results: Results, folder: Path) -> list[Path]:
     try:
         written[0].write_text(render(results), encoding="utf-8")
         written[1].write_text(dumps(results), encoding="utf-8")
-        scenario = load_condition(path, BASE)
+        scenario = base_scenario()
         for mode, name in MODES.items():
             resolved = resolved_draw(scenario, results.representative, mode)
             figure = draw_figure(simulate_draw(resolved), resolved, results.representative)
             written.append(figures / f"paper-{name.lower()}.svg")
-            save(figure, written[-1])
+            save_figure(figure, written[-1])
         written.append(figures / "paper-ensemble.png")
-        save(ensemble_figure(results), written[-1])
+        save_figure(ensemble_figure(results), written[-1])
     except OSError as error:
         raise MachineError(f"{folder}: the page cannot be written: {why(error)}") from None
     return written
 
 
 def document(results: Results, written: list[Path]) -> dict[str, Any]:
-    """What was found, as JSON: quartiles of the base ensemble, claims, files."""
-    found: dict[str, Any] = {}
-    for mode in MODES:
-        for name in ("events", "deliveries", "settled_5_s", "settled_1_s", "gap_min_s"):
-            values = quartiles(results.column(f"{mode}.{name}"))._asdict()
-            found[f"{mode}.{name}"] = {
-                key: value if np.isfinite(value) else None for key, value in values.items()
-            }
+    """The results as JSON: quartiles of the base ensemble, claims, files."""
+    found = {
+        name: {
+            key: value if math.isfinite(value) else None
+            for key, value in quartiles(results.column(name))._asdict().items()
+        }
+        for name in REPRESENTED
+    }
     return {
         "draws": results.count(),
         "representative": results.representative,

@@ -5,11 +5,12 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, FiniteFloat, model_validator
 
 from noack.config.disturbances import AnyDisturbance, variance_at
-from noack.config.plant_systems import AnySystem, LinearSettings
+from noack.config.plants import AnyPlant
 from noack.config.sections.matrix_file_section import require_read
 from noack.config.sections.measurement_section import MeasurementSection
 from noack.config.sections.rates import RateHz, require_whole_period
 from noack.observers.estimation_model import NoiseVariances
+from noack.plants.linear import LinearSettings
 from noack.settings.matrices import Row, Rows, require_non_negative
 from noack.settings.section import ScenarioSection
 
@@ -28,7 +29,7 @@ class WatchdogSection(ScenarioSection):
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
-    system: AnySystem = LinearSettings()
+    system: AnyPlant = LinearSettings()
     """What it is: a table with ``kind``; a linear system unless given."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at

@@ -108,8 +108,7 @@ def test_a_recorder_that_lacks_rows_says_that_it_cannot_tell(
     recorder.show()
     recorder.show()
     assert plane.accounts[-1]["void"] == [
-        "whether claims are void is told after the run only: "
-        "telemetry is missing, or came out of turn"
+        "claims are checked after the run only: telemetry is missing or arrived out of order"
     ]
     assert recorder.finish().notices == []
 
@@ -136,10 +135,10 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
     recorder = recorder_of(run.scenario, tmp_path, plane)
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
-    recorder.confirm()
+    recorder.acknowledge()
     (tmp_path / "spool" / "plant_step.recorder").unlink()
     with pytest.raises(MachineError, match=r"plant_step\.recorder: was deleted or moved"):
-        recorder.confirm()
+        recorder.acknowledge()
     record = recorder.finish()  # what is left of it is kept
     assert not len(record["plant_step"])
     assert len(record["sensor_measurement"]) == len(run["sensor_measurement"])
@@ -149,7 +148,7 @@ def test_rows_whose_file_is_deleted_are_not_confirmed(run: RunRecord, tmp_path: 
 def test_after_the_stop_nothing_more_is_said(run: RunRecord, tmp_path: Path) -> None:
     plane = Told()
     recorder = recorder_of(run.scenario, tmp_path, plane)
-    recorder.judge_no_more()
+    recorder.end_monitoring()
     send(plane, run, 1_200_000_000, {})
     recorder.poll()
     recorder.show()

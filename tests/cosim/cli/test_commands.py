@@ -37,7 +37,9 @@ def test_check_refuses_a_policy_that_needs_a_stable_loop_where_there_is_none(
     assert result.stdout == ""
 
 
-def test_check_says_which_defaults_are_in_force(tmp_path: Path, content: dict[str, Any]) -> None:
+def test_check_prints_the_defaults_that_depend_on_other_keys(
+    tmp_path: Path, content: dict[str, Any]
+) -> None:
     path = tmp_path / "small.toml"
 
     def said() -> str:
@@ -49,10 +51,10 @@ def test_check_says_which_defaults_are_in_force(tmp_path: Path, content: dict[st
         return " ".join(done.stdout.replace("\n# ", "\n").split())
 
     silent = said()
-    assert "plant.watchdog: hold when no actuation has come for 0.1 s" in silent
-    assert "controller.safe_input: 0, while" in silent
-    assert "recovery.rejoin_within_s: 0, who dies ends the run; 60 for processes" in silent
-    assert "start_within_s: 30, longer under load" in silent
+    assert "plant.watchdog: policy hold, after 0.1 s without an actuation" in silent
+    assert "controller.safe_input: 0, the input before the first update" in silent
+    assert "recovery.rejoin_within_s: 0: a process that dies ends the run;" in silent
+    assert "start_within_s: 30, longer on a busy machine" in silent
     content["plant"]["watchdog"] = {"timeout_s": 0.2}
     content["controller"] = {"safe_input": [0.1]}
     content["recovery"] = {"rejoin_within_s": 5.0}

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-import cosim.cli  # noqa: F401 - registers the commands
-from cosim.cli.command import app
-from cosim.cli.set_command import parsed
+from cosim.cli import app
+from cosim.cli.commands.set_command import parsed
 from cosim.live.coordinator import Coordinator
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
@@ -53,7 +52,7 @@ def test_words_are_keys_and_values() -> None:
     ("words", "why"),
     [
         (["loss.p"], "loss.p: needs a value, e.g."),
-        (["loss.p", "1", "network.loss.probability=2"], "is there twice"),
+        (["loss.p", "1", "network.loss.probability=2"], "is given twice"),
         (["mansd", "9" * 5000], "mansd: not valid TOML"),
     ],
 )
@@ -65,7 +64,7 @@ def test_mistaken_words_are_told(words: list[str], why: str) -> None:
 def test_without_a_run_that_is_said(ticket: Ticket) -> None:
     done = CliRunner().invoke(app, ["set", "loss.p", "0.5"])
     assert done.exit_code == 2
-    assert "no run goes on" in done.stderr
+    assert "no run is active" in done.stderr
 
 
 def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ticket) -> None:
@@ -81,7 +80,7 @@ def test_a_run_is_found_by_its_session_its_directory_or_as_the_newest(ticket: Ti
         assert run_registry.find().run_dir == ticket.run_dir
         assert run_registry.find(session="lab").run_dir == "elsewhere"
         assert run_registry.find(run_dir=Path(ticket.run_dir)).run_dir == ticket.run_dir
-        with pytest.raises(CallerError, match="no run goes on in session 'none'; there is "):
+        with pytest.raises(CallerError, match="no run is active in session 'none'; active: "):
             run_registry.find(session="none")
     assert list(path.parent.iterdir()) == []
 

@@ -30,7 +30,7 @@ def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
 ) -> None:
     plane = FakePlane()
     ticket = new_ticket(resolve(validate(content, "")), "tcp/127.0.0.1:1", tmp_path, launched=True)
-    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+    with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(ticket)
     plane.put("progress", Sample("progress", junk))
     assert barrier.progress() is None
@@ -60,16 +60,16 @@ def test_the_recorder_keeps_what_is_good(
     scenario, plane = resolve(validate(content, "")), FakePlane()
     (tmp_path / SCENARIO_FILE).write_text(dumps(scenario))
     recorder = Recorder(scenario, tmp_path, plane, view=None)  # type: ignore[arg-type]
-    row = np.zeros(1, recorder._types[PLANT_STEP]).tobytes()
+    row = np.zeros(1, recorder._store.types[PLANT_STEP]).tobytes()
     header = b'{"first": 0, "rows": 1}'
     plane.put("telemetry", Sample("t/plant/plant_step", junk, header))
     plane.put("telemetry", Sample("t/plant/plant_step", row, junk))
     plane.put("telemetry", Sample("t/sensor/plant_step", row, header))
     plane.put("telemetry", Sample("t/plant/notices", junk, header))
     plane.put("telemetry", Sample("t/plant/plant_step", row, header))
-    bad = Query("goodbye/plant", junk)
-    plane.put("goodbye", bad)
+    bad = Query("report/plant", junk)
+    plane.put("report", bad)
     recorder.poll()
     assert bad.error is not None
     assert len(recorder.finish()[PLANT_STEP]) == 1
-    assert capsys.readouterr().err.count("ignored what is no telemetry") == 1
+    assert capsys.readouterr().err.count("ignored an invalid telemetry message") == 1

@@ -1,21 +1,24 @@
-"""Whom the launcher starts anew, and when it ends the run instead."""
+"""Which processes a launcher restarts, when it ends the run instead, and with which reason."""
 
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from cosim.live.child_processes import ChildProcesses, Failure
 from cosim.live.launcher import Watcher, _Run, longest_s
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
 from noack.core.errors import ExitStatus, MachineError
-from noack.protocol.topology import ROLES
+from noack.protocol.topology import RECORDER, ROLES
 from noack.runtime.join_ticket import new_ticket
 from noack.runtime.signals import Signals
 
+KILLED = "sensor died: killed by SIGKILL"
+
 
 class Child:
-    """A process that has ended, or has not."""
+    """A process that has exited with a status, or runs."""
 
     stdin = None
 
@@ -28,71 +31,93 @@ class Child:
     wait = poll
 
 
-class Barrier:
+class FakeCoordinator:
     """What the launcher asks the coordinator."""
 
     epoch_ns = 0
 
-    def __init__(self, now_s: float) -> None:
-        self._now_s = now_s
-        self.expected: list[str] = []
+    def __init__(self, now_s: float, exiting: str = "", **failures: str) -> None:
+        self._now_s, self._exiting, self._failures = now_s, exiting, failures
+        self._running: tuple[str, ...] = ROLES
+        self.restarts: list[str] = []
 
     def now_ns(self) -> int:
         return round(self._now_s * 1e9)
 
-    def gone(self) -> dict[str, str]:
-        return {}
+    def failures(self) -> dict[str, str]:
+        return self._failures
 
-    def generation(self, role: str) -> None:
+    def running_generation(self, role: str) -> None:
         return None
 
-    def is_leaving(self, role: str) -> bool:
-        return False
+    def is_over(self, role: str) -> bool:
+        return role not in self._running
 
-    def last_words(self, role: str) -> str | None:
+    def is_exiting(self, role: str) -> bool:
+        return role == self._exiting
+
+    def reported_failure(self, role: str) -> str | None:
         return "the disk is full"
 
-    def expect(self, role: str, after: str, *, dead: bool) -> None:
-        self.expected.append(role)
+    def allow_restart(self, role: str, failure: str, *, dead: bool) -> None:
+        self.restarts.append(role)
 
 
-class Run(_Run):
-    """A run of a second in which the sensor has ended; starts processes in name only."""
+class FakeChildren(ChildProcesses):
+    """All processes run, but for the sensor, which has exited."""
 
-    def __init__(self, content: dict[str, Any], run_dir: Path, code: int) -> None:
-        resolved = resolve(validate(content | {"recovery": {"rejoin_within_s": 60}}, ""))
-        ticket = new_ticket(resolved, "tcp/127.0.0.1:1", run_dir, launched=True)
-        super().__init__(ticket, run_dir, ROLES, Watcher())
+    def __init__(self, ticket: Any, run_dir: Path, code: int | None) -> None:
+        super().__init__(ticket, run_dir, ROLES)
         self._children = cast(Any, {role: Child() for role in ROLES} | {"sensor": Child(code)})
-        (run_dir / "logs").mkdir()
-        (run_dir / "logs" / "sensor.log").write_text("noack sensor: no room\n")
-        self.fails = False
+        self.can_start = True
 
     def _start(self, role: str, *, live: bool) -> Any:
-        if self.fails:
+        if not self.can_start:
             raise MachineError(f"{role} cannot be started: no more processes")
         return Child()
 
-    def verdict(self, now_s: float = 0.5) -> tuple[ExitStatus, str] | None:
-        barrier = Barrier(now_s)
-        found = self._trouble(cast(Any, barrier))
-        assert barrier.expected == ["sensor"] or found is not None
+    def exit(self, role: str, code: int) -> None:
+        cast(Any, self._children[role]).code = code
+
+
+class Case:
+    """A run of one second whose scenario allows restarts."""
+
+    def __init__(self, content: dict[str, Any], run_dir: Path) -> None:
+        resolved = resolve(validate(content | {"recovery": {"rejoin_within_s": 60}}, ""))
+        self.ticket = new_ticket(resolved, "tcp/127.0.0.1:1", run_dir, launched=True)
+        self.run_dir = run_dir
+        (run_dir / "logs").mkdir()
+        self.log = run_dir / "logs" / "sensor.log"
+        self.log.write_text("noack sensor: no room\n")
+
+    def children(self, code: int | None) -> FakeChildren:
+        return FakeChildren(self.ticket, self.run_dir, code)
+
+    def run(self, children: FakeChildren, coordinator: FakeCoordinator, **watch: Any) -> _Run:
+        watcher = Watcher(**watch)
+        return _Run(self.ticket, self.run_dir, cast(Any, coordinator), children, watcher)
+
+    def result(self, code: int | None, now_s: float = 0.5, **failures: str) -> Failure | None:
+        coordinator = FakeCoordinator(now_s, **failures)
+        found = self.run(self.children(code), coordinator)._policy.check()
+        assert found is not None or coordinator.restarts == ["sensor"] * bool(code)
         return found
 
 
+@pytest.fixture
+def case(content: dict[str, Any], tmp_path: Path) -> Case:
+    return Case(content, tmp_path)
+
+
 @pytest.mark.parametrize("code", [-9, -11, 130, 143])
-def test_whom_something_ended_is_started_anew(
-    content: dict[str, Any], tmp_path: Path, code: int
-) -> None:
-    assert Run(content, tmp_path, code).verdict() is None
+def test_a_killed_process_is_restarted(case: Case, code: int) -> None:
+    assert case.result(code) is None
 
 
 @pytest.mark.parametrize("code", [1, 2])
-def test_who_says_why_it_cannot_go_on_is_not(
-    content: dict[str, Any], tmp_path: Path, code: int
-) -> None:
-    """Another would fail as it did, and be started anew until the end of the run."""
-    assert Run(content, tmp_path, code).verdict() == (code, "sensor: no room")
+def test_a_process_that_reported_an_error_is_not_restarted(case: Case, code: int) -> None:
+    assert case.result(code) == (code, "sensor: no room")
 
 
 @pytest.mark.parametrize(
@@ -100,93 +125,89 @@ def test_who_says_why_it_cannot_go_on_is_not(
     [
         ("noack sensor: no room\nERROR of a library\n", "no room"),
         ("ERROR of a library\n", "the disk is full"),
-        ("", "the disk is full"),
         (None, "the disk is full"),
     ],
 )
-def test_why_a_process_ended_is_what_it_said_itself(
-    content: dict[str, Any], tmp_path: Path, log: str | None, why: str
+def test_the_reason_is_from_the_log_or_else_from_the_report(
+    case: Case, log: str | None, why: str
 ) -> None:
-    """On a full disk it cannot log it."""
-    run = Run(content, tmp_path, 1)
-    path = tmp_path / "logs" / "sensor.log"
-    path.unlink()
+    case.log.unlink()
     if log is not None:
-        path.write_text(log)
-    assert run.verdict() == (ExitStatus.FAILED, f"sensor: {why}")
+        case.log.write_text(log)
+    assert case.result(1) == (ExitStatus.FAILED, f"sensor: {why}")
 
 
-def test_a_process_that_says_that_it_ends_is_judged_by_its_exit_status(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    class Leaving(Barrier):
-        def is_leaving(self, role: str) -> bool:
-            return role == "sensor"
-
-        def gone(self) -> dict[str, str]:
-            return {"sensor": "sensor ended early: no room"}
-
-    run = Run(content, tmp_path, 0)
-    run._children["sensor"] = cast(Any, Child())
-    assert run._trouble(cast(Any, Leaving(0.5))) is None
-    run._children["sensor"] = cast(Any, Child(2))
-    assert run._trouble(cast(Any, Leaving(0.5))) == (ExitStatus.CALLER, "sensor: no room")
+def test_the_exit_status_of_a_process_counts_more_than_its_report(case: Case) -> None:
+    children = case.children(None)
+    coordinator = FakeCoordinator(0.5, "sensor", sensor="sensor ended early: no room")
+    policy = case.run(children, coordinator)._policy
+    assert policy.check() is None
+    children.exit("sensor", 2)
+    assert policy.check() == (ExitStatus.CALLER, "sensor: no room")
 
 
-def test_after_the_horizon_there_is_nothing_to_take_up(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    verdict = Run(content, tmp_path, -9).verdict(now_s=1.0)
-    assert verdict == (ExitStatus.FAILED, "sensor died: killed by SIGKILL")
+def test_after_the_horizon_nothing_is_restarted(case: Case) -> None:
+    assert case.result(-9, now_s=1.0) == (ExitStatus.FAILED, KILLED)
 
 
-def test_who_cannot_be_started_anew_ends_the_run(content: dict[str, Any], tmp_path: Path) -> None:
-    run = Run(content, tmp_path, -9)
-    run.fails = True
-    reason = "sensor died: killed by SIGKILL; sensor cannot be started: no more processes"
-    assert run.verdict() == (ExitStatus.FAILED, reason)
+def test_a_restart_that_fails_ends_the_run(case: Case) -> None:
+    children = case.children(-9)
+    children.can_start = False
+    reason = f"{KILLED}; sensor cannot be started: no more processes"
+    assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
 
 
-def test_the_recorder_of_a_long_run_has_time_to_put_its_rows_in_order() -> None:
+def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Case) -> None:
+    children = case.children(-9)
+    policy = case.run(children, FakeCoordinator(0.5))._policy
+    assert policy.check() is None
+    assert policy.unfinished() == (ExitStatus.FAILED, f"{KILLED}; not restarted before the end")
+    children.exit("sensor", 2)
+    assert policy.check() == (ExitStatus.CALLER, f"{KILLED}; restarted, sensor: no room")
+
+
+def test_a_long_run_has_more_time_after_its_horizon() -> None:
     assert longest_s(20.0) - 20.0 < 30.0
     assert longest_s(3600.0) - 3600.0 > 300.0
 
 
-def test_a_recorder_that_is_busy_with_a_long_record_s_end_is_not_given_up(
-    content: dict[str, Any], tmp_path: Path
+@pytest.mark.parametrize(
+    ("running", "late"), [(("plant", RECORDER), "plant"), ((RECORDER,), RECORDER)]
+)
+def test_a_run_that_does_not_end_names_the_late_process(
+    case: Case, running: tuple[str, ...], late: str
 ) -> None:
-    """Putting millions of rows in order, on a busy machine, it may not answer its peers in time."""
-
-    class Silent(Barrier):
-        def gone(self) -> dict[str, str]:
-            return {"recorder": "recorder stopped answering"}
-
-    run = Run(content, tmp_path, 0)
-    assert run._trouble(cast(Any, Silent(1.0))) is None
-    run._children["recorder"] = cast(Any, Child(-9))
-    reason = "recorder died: killed by SIGKILL"
-    assert run._trouble(cast(Any, Silent(1.0))) == (ExitStatus.FAILED, reason)
+    coordinator = FakeCoordinator(2.0)
+    coordinator._running = running
+    reason = case.run(case.children(None), coordinator)._overdue()
+    assert reason == f"the run did not end at its horizon: no report from {late}"
 
 
-def test_an_account_that_comes_with_the_end_is_told(
-    content: dict[str, Any], tmp_path: Path
-) -> None:
-    class Ending(Barrier):
-        """All end after the first look, and the recorder's last account arrives after it."""
+def test_a_recorder_that_sorts_a_long_record_need_not_respond(case: Case) -> None:
+    children = case.children(None)
+    coordinator = FakeCoordinator(1.0, recorder="recorder stopped responding")
+    policy = case.run(children, coordinator)._policy
+    assert policy.check() is None
+    children.exit("recorder", -9)
+    assert policy.check() == (ExitStatus.FAILED, "recorder died: killed by SIGKILL")
+
+
+def test_a_progress_report_that_arrives_with_the_end_is_shown(case: Case) -> None:
+    class Ending(FakeCoordinator):
+        """All processes exit after the first look; the last report arrives after it."""
 
         looks = 0
 
         def poll(self) -> None:
-            for child in run._children.values():
-                cast(Any, child).code = 0
+            for role in ROLES:
+                children.exit(role, 0)
 
         def progress(self) -> dict[str, Any] | None:
             self.looks += 1
             return {"void": ["late"]} if self.looks == 2 else None
 
-    told: list[Any] = []
-    run = Run(content, tmp_path, 0)
-    run._watcher = Watcher(progress=told.append)
-    found = run.watch(cast(Any, Ending(1.0)), Signals(), lambda status, reason: None)
-    assert found[0] is ExitStatus.OK
-    assert told == [{"void": ["late"]}]
+    shown: list[Any] = []
+    children = case.children(None)
+    run = case.run(children, Ending(1.0), progress=shown.append)
+    assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
+    assert shown == [{"void": ["late"]}]

@@ -14,13 +14,13 @@ import pytest
 from cosim.live import recorder
 from cosim.live.recorder import Recorder
 from cosim.output.viewer.recording import ViewError
-from cosim.record.run_directory import SCENARIO_FILE, SPOOL
+from cosim.record.run_directory import SCENARIO_FILE
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
 from noack.protocol.machine_interface import BEGINNING, GENERATION, Start
 from noack.protocol.record_tables import OWNER, PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
-from noack.runtime.spool import read_chunks
+from noack.runtime.spool import SPOOL, read_chunks
 from noack.runtime.telemetry import NOTICES
 from tests.fuzz.plane import FakePlane, Query, Sample
 
@@ -51,28 +51,28 @@ class Run:
         self.recorder.abandon()
         self.begin(start, instance, present)
 
-    def say(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
+    def send(self, table: str, first: int, payload: bytes, role: str, generation: int = 0) -> None:
         header = json.dumps({"first": first, "generation": generation}).encode()
         self.plane.put("telemetry", Sample(f"t/{role}/{table}", payload, header))
         self.recorder.poll()
 
     def rows(self, table: str, count: int, generation: int = 0) -> None:
-        rows = np.zeros(count, self.recorder._types[table])
+        rows = np.zeros(count, self.recorder._store.types[table])
         rows["input"] = generation * GENERATION + np.arange(count)
-        self.say(table, 0, rows.tobytes(), OWNER[table], generation)
+        self.send(table, 0, rows.tobytes(), OWNER[table], generation)
 
     def notice(self, role: str, generation: int = 0) -> None:
         line = {"t_ns": 0, "level": "info", "text": role}
-        self.say(NOTICES, 0, json.dumps(line).encode(), role, generation)
+        self.send(NOTICES, 0, json.dumps(line).encode(), role, generation)
 
-    def goodbye(self, role: str, generation: int = 0, **rows: int) -> Any:
+    def report(self, role: str, generation: int = 0, **rows: int) -> Any:
         tables = {table: 0 for table in OWNER if OWNER[table] == role}
         report = {
             "ended": "horizon", "channel": {}, "rows": tables | {NOTICES: 0} | rows,
             "generation": generation, "instance": role,
         }  # fmt: skip
-        query = Query(f"goodbye/{role}", json.dumps(report).encode())
-        self.plane.put("goodbye", query)
+        query = Query(f"report/{role}", json.dumps(report).encode())
+        self.plane.put("report", query)
         self.recorder.poll()
         return json.loads(query.replies[0])["rows"]
 
@@ -89,9 +89,9 @@ def test_it_asks_for_nothing_that_is_on_disk(run: Run) -> None:
     run.notice("plant")
     run.notice("sensor", 1)
     run.follow(Start(1, 0), "a")
-    assert run.goodbye("plant", **{PLANT_STEP: 5, NOTICES: 1}) == {}
-    assert run.goodbye("sensor", 1, **{NOTICES: 1}) == {}
-    assert run.goodbye("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
+    assert run.report("plant", **{PLANT_STEP: 5, NOTICES: 1}) == {}
+    assert run.report("sensor", 1, **{NOTICES: 1}) == {}
+    assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
 
 
 def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run) -> None:
@@ -100,22 +100,25 @@ def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run
     run.rows(SENSOR_MEASUREMENT, 3, generation=1)
     run.follow(Start(2, 0), "a")
     run.rows(PLANT_STEP, 2)
-    run.recorder.confirm()
-    assert run.plane.kept["sensor"] == {"generation": 1, "rows": {SENSOR_MEASUREMENT: [[0, 3]]}}
-    assert run.plane.kept["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
+    run.recorder.acknowledge()
+    assert run.plane.acknowledged["sensor"] == {
+        "generation": 1,
+        "rows": {SENSOR_MEASUREMENT: [[0, 3]]},
+    }
+    assert run.plane.acknowledged["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
 
 
 def test_it_does_not_wait_for_who_has_left(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run.follow(Start(1, 0), "a")
     assert not run.recorder.finished
     for role in LOOP_ROLES:
-        assert run.goodbye(role) == {}
+        assert run.report(role) == {}
     assert run.recorder.finished
     run.follow(Start(2, 0), "b", present=["plant"])
     assert not run.recorder.finished
-    monkeypatch.setattr(recorder, "_TOLD_S", -1.0)
+    monkeypatch.setattr(recorder, "_DISCOVERY_S", -1.0)
     assert not run.recorder.finished
-    assert run.goodbye("plant") == {}
+    assert run.report("plant") == {}
     assert run.recorder.finished
 
 
@@ -129,6 +132,6 @@ def test_a_log_on_a_full_disk_costs_no_record(run: Run, monkeypatch: pytest.Monk
     with monkeypatch.context() as patched:
         patched.setattr("sys.stderr", Full())
         run.recorder._give_up_view(ViewError("no space left"))
-        run.say("junk", 0, b"", "plant")
+        run.send("junk", 0, b"", "plant")
     run.rows(PLANT_STEP, 3)
     assert len(list(read_chunks(run.run_dir / SPOOL, PLANT_STEP))) == 1

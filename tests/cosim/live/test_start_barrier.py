@@ -1,4 +1,4 @@
-"""The start barrier on a busy machine: a process that only seemed to be gone comes back to it."""
+"""The start barrier: a process that loses its connection may join again."""
 
 import json
 from typing import Any
@@ -20,8 +20,8 @@ def plane() -> FakePlane:
 
 @pytest.fixture
 def barrier(plane: FakePlane, monkeypatch: pytest.MonkeyPatch) -> Coordinator:
-    monkeypatch.setattr(coordinator, "Plane", lambda *_, **__: plane)
-    monkeypatch.setattr(coordinator, "_LEAVE_GRACE_S", -1.0)  # a token that is gone, is gone
+    monkeypatch.setattr(coordinator, "ControlPlane", lambda *_, **__: plane)
+    monkeypatch.setattr(coordinator, "_REPORT_GRACE_S", -1.0)  # do not wait for reports
     return Coordinator(_TICKET)
 
 
@@ -39,20 +39,22 @@ def lose(plane: FakePlane, barrier: Coordinator) -> None:
     barrier.poll()
 
 
-def test_who_only_seemed_to_be_gone_may_join_again(plane: FakePlane, barrier: Coordinator) -> None:
+def test_a_process_may_join_again_after_a_lost_connection(
+    plane: FakePlane, barrier: Coordinator
+) -> None:
     ask(plane, barrier, "admit")
     first = ask(plane, barrier, "join")
     assert "sensor" not in barrier.missing()
     lose(plane, barrier)
     assert "sensor" in barrier.missing()
-    assert first.dismissed  # it asks again by itself
+    assert first.dismissed  # the process sends it again
     assert not first.answered
     second = ask(plane, barrier, "join")
     assert second.error is None
     assert barrier.missing() == tuple(role for role in ROLES if role != "sensor")
 
 
-def test_when_another_has_come_in_its_stead_it_may_not(
+def test_a_process_may_not_join_again_once_another_has_its_role(
     plane: FakePlane, barrier: Coordinator
 ) -> None:
     ask(plane, barrier, "admit")
@@ -65,12 +67,11 @@ def test_when_another_has_come_in_its_stead_it_may_not(
     )
 
 
-def test_why_a_process_ended_is_known_from_itself(plane: FakePlane, barrier: Coordinator) -> None:
-    """Also of one that never joined."""
-    assert barrier.last_words("sensor") is None
-    plane.put("left", Sample("noack/0/left/sensor/one", b"the disk is full"))
+def test_the_reason_of_an_end_is_the_reported_one(plane: FakePlane, barrier: Coordinator) -> None:
+    assert barrier.reported_failure("sensor") is None
+    plane.put("ended", Sample("noack/0/ended/sensor/one", b"the disk is full"))
     barrier.poll()
-    assert barrier.last_words("sensor") == "the disk is full"
-    plane.put("left", Sample("noack/0/left/netem/one", b"horizon"))
+    assert barrier.reported_failure("sensor") == "the disk is full"
+    plane.put("ended", Sample("noack/0/ended/netem/one", b"horizon"))
     barrier.poll()
-    assert barrier.last_words("netem") is None
+    assert barrier.reported_failure("netem") is None

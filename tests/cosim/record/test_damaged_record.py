@@ -10,11 +10,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from cosim.analysis.run_summary import summarise
-from cosim.record.run_directory import RECORD, REPORTS_FILE, SPOOL
+from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import finish_record, load_record
 from noack.core.errors import CallerError
 from noack.protocol.record_tables import PLANT_STEP
-from noack.runtime.spool import SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.runtime.telemetry import notices_of
 from tests.fuzz.parsers.record import NOTICE, files
 

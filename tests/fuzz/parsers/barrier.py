@@ -20,7 +20,7 @@ KNOWN = Vocabulary((*HELLO, *PROGRESS), ("127.0.0.1", "", *ROLES))
 def one_input(data: bytes) -> None:
     choices = Choices(data)
     plane = FakePlane()
-    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+    with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         barrier = coordinator.Coordinator(_TICKET)
     queries: dict[str, list[Query]] = {}
     admissions: list[Query] = []
@@ -28,7 +28,7 @@ def one_input(data: bytes) -> None:
         role = choices.one([*ROLES, "nobody", ""])
         match choices.below(6):
             case 0:
-                plane.put("left", Sample(f"noack/0/left/{role}/one", _bytes(choices, "gone")))
+                plane.put("ended", Sample(f"noack/0/ended/{role}/one", _bytes(choices, "gone")))
             case 1:
                 plane.put("progress", Sample("noack/0/progress", _bytes(choices, PROGRESS)))
                 account = barrier.progress()

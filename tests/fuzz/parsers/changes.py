@@ -38,7 +38,7 @@ SETTINGS: dict[str, Any] = {
     "trigger.beta": 0.3,
 }
 ANNOUNCED = {
-    "number": 0, "t_ns": 10**9, "settings": SETTINGS, "said_ns": 0, "said_at": "now",
+    "number": 0, "t_ns": 10**9, "settings": SETTINGS, "requested_ns": 0, "requested_at": "now",
 }  # fmt: skip
 ANSWER = {
     "name": "x",
@@ -64,7 +64,7 @@ def one_input(data: bytes) -> None:
         case 1:
             _announced(_bytes(choices, ANNOUNCED))
         case 2:
-            with refusal("no answer"):
+            with refusal("not a valid change reply"):
                 assert isinstance(
                     parse_message(ChangeReply, _bytes(choices, ANSWER))["run_dir"], str
                 )
@@ -75,10 +75,10 @@ def one_input(data: bytes) -> None:
 def _asked(question: bytes) -> None:
     """The coordinator answers, and what it announces is a change that every process can take."""
     plane = FakePlane()
-    with patch.object(coordinator, "Plane", lambda *_, **__: plane):
+    with patch.object(coordinator, "ControlPlane", lambda *_, **__: plane):
         centre = coordinator.Coordinator(_TICKET)
     centre._clock = RunClock(0, 1.0, lambda: 0)
-    query = Query("noack/0/knobs", question)
+    query = Query("noack/0/runtime_parameters", question)
     plane.put("runtime_parameters", query)
     centre.poll()
     assert query.answered == 1
@@ -98,7 +98,7 @@ def _asked(question: bytes) -> None:
 
 def _announced(said: bytes) -> None:
     """A process takes it, or refuses it in one line and is as it was."""
-    with refusal("no announced"):
+    with refusal("not a valid change announcement"):
         one = parse_message(ChangeAnnouncement, said)
         schedule = ChangeSchedule(_TICKET.scenario)
         change = ParameterChange(one["number"], one["t_ns"], one["settings"])

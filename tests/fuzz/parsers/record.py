@@ -24,7 +24,6 @@ from cosim.record.run_directory import (
     RECORD,
     REPORTS_FILE,
     SCENARIO_FILE,
-    SPOOL,
     SUMMARY_FILE,
 )
 from cosim.record.run_ending import RunEnding
@@ -32,7 +31,7 @@ from cosim.record.run_record import finish_record, load_record, write_record
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, validate
-from noack.runtime.spool import SpoolWriter
+from noack.runtime.spool import SPOOL, SpoolWriter
 from noack.runtime.telemetry import notices_of
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited

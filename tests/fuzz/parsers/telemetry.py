@@ -48,7 +48,7 @@ def one_input(data: bytes) -> None:
         match choices.below(5):
             case 0:
                 queries.append(_goodbye(choices))
-                plane.put("goodbye", queries[-1])
+                plane.put("report", queries[-1])
             case 1:
                 plane.put(
                     "alive", Sample(f"noack/0/alive/{choices.one([*OWNER.values(), ''])}/one")
@@ -59,7 +59,7 @@ def one_input(data: bytes) -> None:
         recorder.poll()
     assert told.getvalue().count("\n") <= 1, "junk must not fill the log"
     recorder.show()
-    recorder.confirm()
+    recorder.acknowledge()
     assert isinstance(recorder.finished, bool)
     assert all(query.answered == 1 for query in queries), "who says goodbye waits for an answer"
     # Whatever came, what was good of it is on record.
@@ -88,4 +88,4 @@ def _batch(choices: Choices) -> Sample:
 def _goodbye(choices: Choices) -> Query:
     report: Any = edited(choices, REPORT, KNOWN)
     payload = None if choices.below(8) == 1 else damaged(choices, json.dumps(report).encode())
-    return Query(f"noack/0/goodbye/{choices.one([*OWNER.values(), 'nobody'])}", payload)
+    return Query(f"noack/0/report/{choices.one([*OWNER.values(), 'nobody'])}", payload)

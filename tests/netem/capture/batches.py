@@ -9,12 +9,17 @@ from hypothesis import strategies as st
 
 from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import PcapngInterface, PcapngSection
+from netem.engine.relay_interface import LinkSpec
 from netem.relay_events import EVENT
+from noack.config.impairments import LinkSettings
 
 T_NS = 1_767_225_600_123_456_789
+SPECS = [
+    LinkSpec("link0", ("127.0.0.1", 1), ("127.0.0.1", 2), LinkSettings(), LinkSettings())
+]  # fmt: skip
 INTERFACES = (
-    PcapngInterface("link0 client", "where the clients are"),
-    PcapngInterface("link0 server"),
+    PcapngInterface("link0 client", "127.0.0.1:1"),
+    PcapngInterface("link0 server", "127.0.0.1:2"),
 )
 USUAL = {
     "t_ns": T_NS, "family": 4, "source_port": 40_001, "destination_port": 40_002,
@@ -52,15 +57,15 @@ def of_family(family: int) -> st.SearchStrategy[dict[str, Any]]:
 events = of_family(4) | of_family(6)
 
 
-def batch(*described: dict[str, Any], snap_bytes: int = 2**18) -> tuple[Events, Bytes]:
-    """Events from their fields, payloads and addresses in words; the rest is as usual."""
+def batch(*described: dict[str, Any]) -> tuple[Events, Bytes]:
+    """Events from their fields, payloads and addresses; other fields have usual values."""
     table = np.zeros(len(described), EVENT)
     data = b"other bytes"
     for row, given in zip(table, described, strict=True):
         fields = USUAL | given
         payload = fields.pop("payload")
         row["size_bytes"], row["offset"] = len(payload), len(data)
-        data += payload[:snap_bytes]
+        data += payload
         for name, value in fields.items():
             if isinstance(value, str):
                 packed = ipaddress.ip_address(value).packed
@@ -70,8 +75,7 @@ def batch(*described: dict[str, Any], snap_bytes: int = 2**18) -> tuple[Events, 
     return table, np.frombuffer(data, np.uint8)
 
 
-def file_of(*described: dict[str, Any], snap_bytes: int = 2**18) -> bytes:
+def file_of(*described: dict[str, Any]) -> bytes:
     """A whole capture file."""
-    section = PcapngSection(INTERFACES, snap_bytes)
-    packets = section.packets(*batch(*described, snap_bytes=snap_bytes))
-    return section.header() + bytes(packets) + section.statistics()
+    section = PcapngSection(INTERFACES)
+    return section.header() + bytes(section.packets(*batch(*described))) + section.statistics()

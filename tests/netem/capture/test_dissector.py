@@ -18,6 +18,7 @@ import pytest
 from noack.protocol.wire_format import HEADER_BYTES, TAG_BYTES, Encoder, Flow, Message
 from tests.netem.capture.batches import file_of
 from tests.netem.capture.conftest import Tshark
+from tests.netem.capture.reader import read
 
 DOCS = Path(__file__).parents[3] / "docs"
 SCRIPT = DOCS / "noack.lua"
@@ -28,24 +29,29 @@ Dissect = Callable[..., list[Fields]]
 
 @pytest.fixture
 def dissect(tshark: Tshark, tmp_path: Path) -> Dissect:
-    """What tshark says of each payload, field by field: ``show`` for people, ``value`` as hex."""
+    """The fields that tshark finds in each payload: ``show`` for people, ``value`` as hex."""
 
-    def run(*payloads: bytes, snap_bytes: int = 2**18) -> list[Fields]:
-        path = tmp_path / "capture.pcapng"
-        path.write_bytes(
-            file_of(*({"payload": payload} for payload in payloads), snap_bytes=snap_bytes)
-        )
-        text = tshark(path, "-X", f"lua_script:{SCRIPT}", "-T", "pdml")
-        packets = []
-        for packet in ET.fromstring(text).iter("packet"):
-            fields: Fields = {}
-            for field in packet.iter("field"):
-                fields.setdefault(field.attrib["name"], []).append(field.attrib)
-            packets.append(fields)
-        assert len(packets) == len(payloads)
-        return packets
+    def run(*payloads: bytes) -> list[Fields]:
+        return fields_of(tshark, capture_of(tmp_path, *payloads))
 
     return run
+
+
+def capture_of(folder: Path, *payloads: bytes) -> Path:
+    path = folder / "capture.pcapng"
+    path.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+    return path
+
+
+def fields_of(tshark: Tshark, path: Path) -> list[Fields]:
+    packets = []
+    text = tshark(path, "-X", f"lua_script:{SCRIPT}", "-T", "pdml")
+    for packet in ET.fromstring(text).iter("packet"):
+        fields: Fields = {}
+        for field in packet.iter("field"):
+            fields.setdefault(field.attrib["name"], []).append(field.attrib)
+        packets.append(fields)
+    return packets
 
 
 def encoded(flow: Flow, sequence: int, t_ns: int, vector: list[float], run_id: int = RUN) -> bytes:
@@ -113,31 +119,20 @@ def test_every_field_is_shown(dissect: Dissect) -> None:
 def test_the_list_tells_flow_number_and_time(
     tshark: Tshark, tmp_path: Path, flow: Flow, sequence: int, t_ns: int, info: str
 ) -> None:
-    path = tmp_path / "capture.pcapng"
     vector = [] if flow is Flow.ACKNOWLEDGEMENT else [1.0, 2.0]
-    path.write_bytes(file_of({"payload": encoded(flow, sequence, t_ns, vector)}))
+    path = capture_of(tmp_path, encoded(flow, sequence, t_ns, vector))
     columns = ("-T", "fields", "-e", "_ws.col.Protocol", "-e", "_ws.col.Info")
     shown = tshark(path, "-X", f"lua_script:{SCRIPT}", *columns)
     assert shown == f"noack\t{info}\n"
 
 
 def test_fields_filter(tshark: Tshark, tmp_path: Path) -> None:
-    path = tmp_path / "capture.pcapng"
     payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0]) for i in range(12)]
-    path.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+    path = capture_of(tmp_path, *payloads)
 
     def found(condition: str) -> list[int]:
-        words = (
-            "-X",
-            f"lua_script:{SCRIPT}",
-            "-Y",
-            condition,
-            "-T",
-            "fields",
-            "-e",
-            "noack.sequence",
-        )
-        return [int(number) for number in tshark(path, *words).split()]
+        columns = ("-Y", condition, "-T", "fields", "-e", "noack.sequence")
+        return [int(n) for n in tshark(path, "-X", f"lua_script:{SCRIPT}", *columns).split()]
 
     assert found("noack.flow == 2") == [1, 4, 7, 10]
     assert found('noack.flow == "update" and noack.sequence > 4') == [7, 10]
@@ -187,8 +182,13 @@ def test_what_is_not_ours_is_left_alone(dissect: Dissect, payload: bytes) -> Non
     assert not any(name.startswith("noack") for name in fields)
 
 
-def test_of_a_truncated_capture_what_is_there_is_shown(dissect: Dissect) -> None:
-    (fields,) = dissect(WHOLE, snap_bytes=HEADER_BYTES + 8 + 7)
+def test_a_truncated_datagram_is_shown_as_far_as_it_goes(tshark: Tshark, tmp_path: Path) -> None:
+    (packet,) = read(capture_of(tmp_path, WHOLE).read_bytes()).packets
+    frame = packet.frame[: 28 + HEADER_BYTES + 8 + 7]
+    head = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 101)  # a pcap file of raw IP
+    path = tmp_path / "truncated.pcap"
+    path.write_bytes(head + struct.pack("<IIII", 0, 0, len(frame), len(packet.frame)) + frame)
+    (fields,) = fields_of(tshark, path)
     assert shown(fields, "sequence") == "7"
     assert [entry["show"] for entry in fields["noack.vector"]] == ["1"]
     assert "noack.tag" not in fields
@@ -200,8 +200,7 @@ def test_the_documented_command_works(tmp_path: Path) -> None:
     (command,) = re.findall(r"^```sh\n(.*?)\n```", (DOCS / "wire.md").read_text(), re.DOTALL | re.M)
     (tmp_path / "docs").symlink_to(DOCS)
     payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0, 0.5]) for i in range(6)]
-    capture = tmp_path / "capture.pcapng"
-    capture.write_bytes(file_of(*({"payload": payload} for payload in payloads)))
+    capture_of(tmp_path, *payloads)
     done = subprocess.run(
         shlex.split(command), cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60
     )

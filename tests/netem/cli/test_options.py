@@ -100,8 +100,12 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--listen", ":9000"], "--listen and --to go together"),
-        (["--to", ":9000"], "--listen and --to go together"),
+        (["--listen", ":9000"], "--listen and --to must be given together"),
+        (["--to", ":9000"], "--listen and --to must be given together"),
+        (
+            ["shwo", "lab"],
+            "shwo: neither a command (show, set, watch) nor a word; did",
+        ),
         (["loss", "5%"], "an emulator on its own needs --listen and --to, or --links"),
         (["--listen", "x", "--to", ":9"], "--listen: expected HOST:PORT, e.g. 127.0.0.1:9000"),
         (["--listen", ":0", "--to", "no such:9"], "--to: no such: no such host"),
@@ -109,8 +113,11 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
         ([*ADDRESSES, "--reverse", "lsos", "5%"], "lsos: no such word; did you mean loss?"),
         ([*ADDRESSES, "--reverse", "seed", "5"], "seed 5: belongs to the link"),
         ([*ADDRESSES, "--seed", "-1"], "--seed -1: must be 0 or more"),
-        ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words say seed 1 already"),
-        ([*ADDRESSES, "--both", "--reverse", "loss", "5%"], "--reverse: goes without --both"),
+        ([*ADDRESSES, "--seed", "1", "seed", "1"], "--seed 1: the words have seed 1 already"),
+        (
+            [*ADDRESSES, "--both", "--reverse", "loss", "5%"],
+            "--reverse and --both exclude each other",
+        ),
         (
             [*ADDRESSES, "--one-way", "--reverse", "loss", "5%"],
             "--one-way: no reverse direction",
@@ -137,11 +144,11 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
             [*ADDRESSES, "loss", "worst_case"],
             "loss worst_case: no such word; here it is loss worst",
         ),
-        (["--session", "x", "loss", "5%"], "--session: joins a run, and goes alone"),
-        (["--session=noack", "--idle", "5s"], "--session: joins a run, and goes alone"),
+        (["--session", "x", "loss", "5%"], "--session joins a run and allows only --json"),
+        (["--session=noack", "--idle", "5s"], "--session joins a run and allows only --json"),
         (["--links", "no.toml"], "no.toml: no such file"),
-        (["--links", "no.toml", "loss", "5%"], "words: stands in the file that --links names"),
-        (["--links", "no.toml", "--one-way"], "--one-way: stands in the file that --links names"),
+        (["--links", "no.toml", "loss", "5%"], "words: with --links, set this in the file"),
+        (["--links", "no.toml", "--one-way"], "--one-way: with --links, set this in the file"),
     ],
 )
 def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
@@ -155,7 +162,10 @@ def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
     ("arguments", "says"),
     [
         ([*ADDRESSES, "lsos", "5%"], "noack netem: lsos: no such word; did you mean loss?\n"),
-        ([*ADDRESSES, "--capture", "-", "--json"], "noack netem: --capture -: the standard output"),
+        (
+            [*ADDRESSES, "--capture", "-", "--json"],
+            "noack netem: --capture -: --json and --stats",
+        ),
         ([*ADDRESSES, "--stats", "0"], "noack netem: --stats 0: must be 0.01 s or more"),
         (
             [*ADDRESSES, "--record-fates", "a.parquet", "--replay-fates", "./a.parquet"],
@@ -163,9 +173,9 @@ def test_a_mistake_gets_one_line(arguments: list[str], says: str) -> None:
         ),
         (
             [*ADDRESSES, "--record-fates", __file__],
-            f"noack netem: --record-fates {__file__}: is there already, and no Parquet file",
+            f"noack netem: --record-fates {__file__}: exists and is not a Parquet file",
         ),
-        (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session: joins a run"),
+        (["--session", "x", "--capture", "x.pcapng"], "noack netem: --session joins a run"),
         (
             [*ADDRESSES, "--replay-fates", "no.parquet"],
             "noack netem: no.parquet: cannot be read",

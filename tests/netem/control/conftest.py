@@ -23,14 +23,14 @@ def relay() -> FakeRelay:
 
 
 @pytest.fixture
-def errands(relay: FakeRelay) -> Iterator[CommandQueue]:
+def commands(relay: FakeRelay) -> Iterator[CommandQueue]:
     """Of a relay that runs."""
-    with running(relay) as errands:
-        yield errands
+    with running(relay) as commands:
+        yield commands
 
 
 @pytest.fixture
-def server(errands: CommandQueue) -> Iterator[ControlServer]:
+def server(commands: CommandQueue) -> Iterator[ControlServer]:
     """Of an emulator named ``lab``."""
-    with ControlServer("lab", errands) as server:
+    with ControlServer("lab", commands) as server:
         yield server

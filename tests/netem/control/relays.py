@@ -100,12 +100,12 @@ _: Relay = FakeRelay()
 @contextmanager
 def running(relay: Relay) -> Iterator[CommandQueue]:
     """Run a relay in a thread of its own."""
-    errands, stopping = CommandQueue(relay), threading.Event()
-    thread = threading.Thread(target=relay.run, args=(stopping.is_set, errands.run))
+    commands, stopping = CommandQueue(relay), threading.Event()
+    thread = threading.Thread(target=relay.run, args=(stopping.is_set, commands.run_pending))
     thread.start()
     try:
-        yield errands
+        yield commands
     finally:
         stopping.set()
         thread.join()
-        errands.close()
+        commands.close()

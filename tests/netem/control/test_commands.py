@@ -67,7 +67,7 @@ def test_a_link_is_set_in_words(
     assert len(out) == 4
     for way in changed:
         assert f"up {way}: loss 5% mansd 4" in out
-    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: nothing is done"]
+    assert out[2:] == ["down forward: loss 10% delay 10ms mansd 2", "down reverse: no impairment"]
 
 
 def test_files_are_read_where_the_command_is_given(
@@ -89,15 +89,15 @@ def test_files_are_read_where_the_command_is_given(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("set", "say what the link shall do, e.g. loss 5% mansd 4; or: loss none"),
-        ("set lab", "say what the link shall do"),
+        ("set", "words are missing, for example: loss 5% mansd 4; or: loss none"),
+        ("set lab", "words are missing"),
         ("set --link up lozz 5%", "lozz: "),
         ("set lab --link up loss 5% 6% 7%", "7%"),
-        ("set lba --link up loss 5%", "no emulator 'lba' runs; there are lab"),
-        ("set lab loss 5%", "which link? There are up, down"),
-        ("set --link left loss 5%", "no link 'left'; there are up, down"),
-        ("show lba", "no emulator 'lba' runs; there are lab"),
-        ("watch lba", "no emulator 'lba' runs; there are lab"),
+        ("set lba --link up loss 5%", "no emulator 'lba'; running: lab"),
+        ("set lab loss 5%", "which link? Links: up, down"),
+        ("set --link left loss 5%", "no link 'left'; links: up, down"),
+        ("show lba", "no emulator 'lba'; running: lab"),
+        ("watch lba", "no emulator 'lba'; running: lab"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(
@@ -120,9 +120,9 @@ def test_among_several_one_is_named(
     server: ControlServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = FakeRelay("x")
-    with running(other) as errands, ControlServer("loss", errands):
+    with running(other) as commands, ControlServer("loss", commands):
         assert run("show") == ExitStatus.CALLER
-        assert "which emulator? There are lab, loss" in capsys.readouterr().err
+        assert "which emulator? Running: lab, loss" in capsys.readouterr().err
         assert run("set loss loss 5%") == ExitStatus.OK  # its name is a word, too
     assert other.settings["x", "forward"] == settings_of("loss 5%")
 
@@ -164,11 +164,11 @@ def test_a_reader_that_has_seen_enough_is_no_error(relay: FakeRelay, server: Con
 
 
 def test_a_watcher_hears_that_the_emulator_has_ended(
-    relay: FakeRelay, errands: CommandQueue
+    relay: FakeRelay, commands: CommandQueue
 ) -> None:
     relay.counters["up", "forward"].arrived = 7
     with ExitStack() as emulator:
-        emulator.enter_context(ControlServer("lab", errands))
+        emulator.enter_context(ControlServer("lab", commands))
         with watching(subprocess.PIPE, subprocess.DEVNULL) as process:
             assert process.stdout is not None
             assert process.stderr is not None

@@ -69,7 +69,7 @@ def programs() -> list[str]:
 def test_the_program_runs() -> None:
     relay = FakeRelay("relay")
     program, _ = programs()
-    with running(relay) as errands, ControlServer("lab", errands):
+    with running(relay) as commands, ControlServer("lab", commands):
         done = subprocess.run(
             [sys.executable, "-c", program], capture_output=True, text=True, check=False
         )

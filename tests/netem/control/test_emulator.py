@@ -61,8 +61,8 @@ def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixt
 
         assert emulator_commands.main(["set", "lab", "loss 5%"]) == ExitStatus.OK
         assert capsys.readouterr().err == (
-            "noack netem set: relay forward has no cap any more, it had mansd 2; "
-            "the words replace all that was said before\n"
+            "noack netem set: relay forward has no cap now; the words replaced "
+            "all settings, mansd 2 too\n"
         )
 
         before = shown(capsys)["links"][0]["forward"]["words"]
@@ -83,7 +83,7 @@ def test_a_killed_emulator_is_not_found(capsys: pytest.CaptureFixture[str]) -> N
         with emulator(server.getsockname(), *options, status=-signal.SIGKILL) as (_, process):
             process.kill()
     assert emulator_commands.main(["show", "lab"]) == ExitStatus.CALLER
-    assert "no emulator 'lab' runs that can be reached" in capsys.readouterr().err
+    assert "no emulator 'lab' accepts commands" in capsys.readouterr().err
 
 
 def test_statistics_are_lines_of_json(tmp_path: Path) -> None:
@@ -118,10 +118,10 @@ def test_a_reader_that_leaves_does_not_stop_the_relay() -> None:
         assert process.stderr is not None
         assert json.loads(process.stdout.readline())["links"][0]["name"] == "relay"
         process.stdout.close()
-        error = read_until(process.stderr.fileno(), lambda text: text.endswith("goes on\n"))
+        error = read_until(process.stderr.fileno(), lambda text: text.endswith("continues\n"))
         assert error.splitlines()[-1] == (
-            "noack netem: statistics can no longer be written to the standard output "
-            "(Broken pipe); the relay goes on"
+            "noack netem: statistics cannot be written to standard output "
+            "(Broken pipe); the relay continues"
         )
         send_through(address, [b"still here"])
         assert server.recv(100) == b"still here"
@@ -199,6 +199,4 @@ def test_a_trace_of_other_links_is_refused(
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == ExitStatus.CALLER
-    assert done.stderr == (
-        f"noack netem: {trace}: has no fates of a link 'up'; it has those of relay\n"
-    )
+    assert done.stderr == (f"noack netem: {trace}: has no link 'up'; its links: relay\n")

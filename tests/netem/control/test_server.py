@@ -89,7 +89,7 @@ def test_the_link_may_be_left_out_if_there_is_one() -> None:
     from tests.netem.control.relays import running as run
 
     relay = FakeRelay("only")
-    with run(relay) as errands, ControlServer("lab", errands), Client(find(None)) as client:
+    with run(relay) as commands, ControlServer("lab", commands), Client(find(None)) as client:
         client.ask("change", words="loss 5%")
     assert relay.settings["only", "forward"] == settings_of("loss 5%")
 
@@ -101,8 +101,8 @@ def test_the_link_may_be_left_out_if_there_is_one() -> None:
         ({"link": "up", "words": "loss 500%"}, "loss 500%"),
         ({"link": "up", "words": "loss 5% seed 3"}, "seed 3: belongs to the link"),
         ({"link": "up", "words": "loss trace /etc/passwd"}, "/etc/passwd: read the file first"),
-        ({"words": "loss 5%"}, "which link. There are up, down"),
-        ({"link": "left", "words": "loss 5%"}, "no link 'left'; there are up, down"),
+        ({"words": "loss 5%"}, "which link. Links: up, down"),
+        ({"link": "left", "words": "loss 5%"}, "no link 'left'; links: up, down"),
         ({"link": "up"}, "give words, or settings"),
         ({"link": "up", "words": "loss 5%", "settings": {}}, "give words, or settings"),
         ({"link": "up", "words": "loss 5%", "direction": "left"}, "direction: should be 'forward'"),
@@ -182,7 +182,7 @@ def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) ->
 
 
 def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
-    errands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
+    commands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held, free = threading.Event(), threading.Event()
 
@@ -190,17 +190,17 @@ def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
         held.set()
         assert free.wait(60)
 
-    monkeypatch.setattr("netem.control.control_server.statistics", slow)
+    monkeypatch.setattr("netem.control.statistics_thread.statistics", slow)
     assert held.wait(60)
     try:
         for _ in range(10):
-            errands.snapshot()  # done by the relay's thread
+            commands.snapshot()  # done by the relay's thread
     finally:
         free.set()
 
 
-def test_when_it_ends_nothing_is_left(errands: CommandQueue) -> None:
-    with ControlServer("lab", errands):
+def test_when_it_ends_nothing_is_left(commands: CommandQueue) -> None:
+    with ControlServer("lab", commands):
         session = find("lab")
     assert running() == []
     more = {"connect/timeout_ms": 500}

@@ -75,14 +75,14 @@ def test_a_name_is_free_again_after_its_emulator_was_killed(runtime_dir: Path) -
 
 
 def test_who_is_not_there_is_answered_with_who_is() -> None:
-    with pytest.raises(CallerError, match="no emulator runs that can be reached; start one"):
+    with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
         find(None)
-    with pytest.raises(CallerError, match="no emulator 'lab' runs that can be reached"):
+    with pytest.raises(CallerError, match="no emulator 'lab' accepts commands"):
         find("lab")
     with published(LAB), published(LAB._replace(name="b")):
-        with pytest.raises(CallerError, match=r"which emulator\? There are b, lab"):
+        with pytest.raises(CallerError, match=r"which emulator\? Running: b, lab"):
             find(None)
-        with pytest.raises(CallerError, match="no emulator 'lba' runs; there are b, lab"):
+        with pytest.raises(CallerError, match="no emulator 'lba'; running: b, lab"):
             find("lba")
 
 

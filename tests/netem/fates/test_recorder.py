@@ -50,9 +50,10 @@ def test_a_row_says_what_an_event_says(path: Path) -> None:
     with FateRecorder(path, [spec_of(LINK), spec_of(LINK, "up")]) as recorder:
         recorder.take(event, NOTHING)
     (row,) = pq.read_table(path).to_pylist()
-    arrival_ns = told.pop("t_ns")
+    arrival_ns, losses = told.pop("t_ns"), told.pop("run")
     assert row == told | {
-        "link": "up", "direction": "reverse", "flow": 0, "packet": 0, "arrival_ns": arrival_ns,
+        "consecutive_losses": losses, "link": "up", "direction": "reverse", "flow": 0, "packet": 0,
+        "arrival_ns": arrival_ns,
     }  # fmt: skip
 
 
@@ -106,7 +107,7 @@ def test_what_comes_too_fast_is_missing_and_told_at_once(
         write_table(self, table)
 
     monkeypatch.setattr(pq.ParquetWriter, "write_table", slow)
-    with FateRecorder(path, [spec_of(LINK)], most_waiting=100_000) as recorder:
+    with FateRecorder(path, [spec_of(LINK)], max_waiting=100_000) as recorder:
         recorder.take(arrivals(100_000), NOTHING)
         recorder.take(arrivals(7), NOTHING)  # returns, although nothing can be written
         assert recorder.missing_events == 7
@@ -114,7 +115,7 @@ def test_what_comes_too_fast_is_missing_and_told_at_once(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "events are missing" in error
-    with pytest.raises(CallerError, match="7 events are missing; a trace with holes"):
+    with pytest.raises(CallerError, match="7 events are missing; an incomplete trace"):
         read_fates(path)
 
 
@@ -144,9 +145,9 @@ def test_when_the_file_cannot_grow_the_relay_goes_on(
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     error = capsys.readouterr().err
     assert error.count("\n") == 1
-    assert "cannot be written any more (File too large)" in error
+    assert "cannot be written (File too large)" in error
     assert (recorder.rows, recorder.missing_events) == (0, 600_000)
-    with pytest.raises(CallerError, match="not finished"):
+    with pytest.raises(CallerError, match="incomplete because"):
         read_fates(path)
 
 
@@ -169,14 +170,14 @@ def rewritten(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
 def test_a_hole_is_found(path: Path) -> None:
     record(path, LINK, [Arrival(10, 0, 4), Arrival(10, 1, 4)] * 5)
     rewritten(path, lambda table: pa.concat_tables([table.slice(0, 5), table.slice(6)]))
-    with pytest.raises(CallerError, match="a forward: flow 1: expected datagram 2 and found 3"):
+    with pytest.raises(CallerError, match="a forward: flow 1: expected packet 2, found 3"):
         read_fates(path)
 
 
 def test_a_datagram_twice_is_found(path: Path) -> None:
     record(path, LINK, [Arrival(10, 0, 4)] * 3)
     rewritten(path, lambda table: pa.concat_tables([table, table.slice(2)]))
-    with pytest.raises(CallerError, match="flow 0: expected datagram 3 and found 2"):
+    with pytest.raises(CallerError, match="flow 0: expected packet 3, found 2"):
         read_fates(path)
 
 
@@ -191,7 +192,7 @@ def test_what_no_emulator_does_is_refused(path: Path, name: str, value: int) -> 
     events[name][1] = value
     with FateRecorder(path, [spec_of(LINK)]) as recorder:
         recorder.take(events, NOTHING)
-    with pytest.raises(CallerError, match=f"a forward: no emulator did this: .*{name} {value}"):
+    with pytest.raises(CallerError, match=f"a forward: impossible decision: .*{name} {value}"):
         read_fates(path)
 
 
@@ -201,23 +202,23 @@ def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="cannot be read"):
         read_fates(tmp_path)
     path.write_text("fates")
-    with pytest.raises(CallerError, match="is no fate trace, or one that was not finished"):
+    with pytest.raises(CallerError, match="not a fate trace, or incomplete"):
         read_fates(path)
     pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(CallerError, match="is no fate trace of this program"):
+    with pytest.raises(CallerError, match="not a fate trace of this program"):
         read_fates(path)
 
 
 def test_a_trace_whose_emulator_was_killed_is_not_finished(path: Path) -> None:
     record(path, LINK, [Arrival(10, 0, 4)] * 3)
     os.truncate(path, path.stat().st_size - 8)
-    with pytest.raises(CallerError, match="not finished as the emulator was killed"):
+    with pytest.raises(CallerError, match="incomplete because the emulator was killed"):
         read_fates(path)
 
 
 def test_a_link_that_the_trace_does_not_know_is_named(path: Path) -> None:
     record(path, LINK, [])
-    with pytest.raises(CallerError, match="no fates of a link 'b'; it has those of a"):
+    with pytest.raises(CallerError, match="has no link 'b'; its links: a"):
         read_fates(path, ["b"])
 
 
@@ -225,6 +226,6 @@ def test_a_trace_of_another_format_is_refused(path: Path) -> None:
     record(path, LINK, [])
     file = pq.ParquetFile(path)
     with pq.ParquetWriter(path, file.schema_arrow) as writer:
-        writer.add_key_value_metadata({METADATA: json.dumps({"format": 2, "version": "9.9"})})
-    with pytest.raises(CallerError, match=r"is of another format, that of noack 9\.9"):
+        writer.add_key_value_metadata({METADATA: json.dumps({"format": 3, "version": "9.9"})})
+    with pytest.raises(CallerError, match=r"has the format of noack 9\.9"):
         read_fates(path)

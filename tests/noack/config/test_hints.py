@@ -83,6 +83,19 @@ def test_nothing_is_suggested_that_would_not_be_right(path: Path, setting: str) 
     assert "transposed" not in said
 
 
+@pytest.mark.parametrize(
+    ("setting", "example"),
+    [
+        ("plant.system=MyPlant", '{ kind = "python", file = "my_plant.py", name = "MyPlant" }'),
+        ("trigger=absolute", '{ policy = "absolute", delta = ... }'),
+    ],
+)
+def test_hint_names_the_kind_of_table_that_a_word_stands_for(
+    path: Path, setting: str, example: str
+) -> None:
+    assert mistake(path, setting).endswith(f"should be a table, e.g. {example}")
+
+
 def test_list_of_tables_is_said_to_be_one(path: Path) -> None:
     assert mistake(path, "network.impairments=4").endswith("= 4: should be a list of tables")
 

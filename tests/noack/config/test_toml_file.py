@@ -137,6 +137,7 @@ def test_hostile_files_take_little_memory(tmp_path: Path) -> None:
             "tables and lists lie within each other more than 32",
         ),
         (f"x = 0x{'f' * 20_000}", "an integer is too large"),
+        (f"x = {'9' * 20_000}", "an integer is too large"),
     ],
 )
 def test_depth_and_digits_are_one_line(tmp_path: Path, read, text: str, wrong: str) -> None:  # type: ignore[no-untyped-def]

@@ -86,12 +86,10 @@ def test_who_is_not_let_in_neither_hears_nor_says_anything(
         batches = coordinator.plane.session.declare_subscriber(
             plant.key("telemetry", "**"), RingChannel(100)
         )
-        goodbyes = coordinator.plane.session.declare_queryable(
-            plant.key("goodbye", "*"), FifoChannel(100)
+        reports = coordinator.plane.session.declare_queryable(
+            plant.key("report", "*"), FifoChannel(100)
         )
-        parse_message = [
-            session.declare_subscriber("**", RingChannel(100)) for session in strangers
-        ]
+        received = [session.declare_subscriber("**", RingChannel(100)) for session in strangers]
         lives = [
             session.liveliness().declare_subscriber("**", RingChannel(100), history=True)
             for session in strangers
@@ -100,14 +98,14 @@ def test_who_is_not_let_in_neither_hears_nor_says_anything(
         for session in strangers:
             for key in (
                 "stop",
-                f"left/plant/{plant.instance}",
+                f"ended/plant/{plant.instance}",
                 "progress",
                 "telemetry/plant/plant_step",
-                "kept/plant",
+                "persisted/plant",
             ):
                 session.put(plant.key(*key.split("/")), "evil")
             session.liveliness().declare_token(plant.key("alive", "sensor", "evil"))
-            for what in ("admit", "join", "goodbye"):
+            for what in ("admit", "join", "report"):
                 key = plant.key(what, "plant")
                 asked.append(session.get(key, FifoChannel(4), payload=HELLO, timeout=0.3))
         plant.publish_telemetry_blocking("plant_step", b"{}", b"own")
@@ -115,13 +113,13 @@ def test_who_is_not_let_in_neither_hears_nor_says_anything(
         wait_for(lambda: (sample := batches.try_recv()) is not None and _is_own(sample))
         coordinator.poll()
         assert batches.try_recv() is None
-        assert goodbyes.try_recv() is None
+        assert reports.try_recv() is None
         assert coordinator.missing() == (*LOOP_ROLES, "recorder")
-        assert coordinator.gone() == {}
+        assert coordinator.failures() == {}
         assert coordinator.progress() is None
         assert plant.stop_requested() is None
-        assert plant.kept() is None
-        for channel in (*parse_message, *lives):  # each hears itself, and nobody else
+        assert plant.persisted() is None
+        for channel in (*received, *lives):  # each hears itself, and nobody else
             while (sample := channel.try_recv()) is not None:
                 assert sample.payload.to_bytes() in (b"", b"evil")
                 assert sample.payload.to_bytes() or "alive/sensor" in str(sample.key_expr)
@@ -201,17 +199,17 @@ def pipes() -> set[str]:
 @pytest.mark.parametrize(
     ("answer", "kind", "line"),
     [
-        ("", Admission, "no admission of this version of noack: "),
-        ("{", Admission, "no admission of this version of noack: "),
-        (b"\xff\xfe", Admission, "no admission of this version of noack: "),
-        ("[" * 100_000, Admission, "no admission of this version of noack: "),
+        ("", Admission, "not a valid admission: "),
+        ("{", Admission, "not a valid admission: "),
+        (b"\xff\xfe", Admission, "not a valid admission: "),
+        ("[" * 100_000, Admission, "not a valid admission: "),
         ("{}", RunStart, "epoch_ns: "),
         ('{"epoch_ns": -1, "addresses": {}}', RunStart, "epoch_ns: "),
         ('{"epoch_ns": 1.5, "addresses": {}}', RunStart, "epoch_ns: "),
         ('{"epoch_ns": 1, "addresses": {"plant": ["127.0.0.1", 0]}}', RunStart, "plant"),
         ('{"epoch_ns": 1, "addresses": {"plant": ["plant.lan", 5]}}', RunStart, "plant"),
-        ("null", MissingRows, "no missing rows of this version of noack: "),
-        ("[]", MissingRows, "no missing rows of this version of noack: "),
+        ("null", MissingRows, "not a valid missing rows: "),
+        ("[]", MissingRows, "not a valid missing rows: "),
         ('{"rows": {"plant_step": 5}}', MissingRows, "plant_step: "),
         ('{"rows": {"plant_step": [[0]]}}', MissingRows, "plant_step"),
         ('{"rows": {"plant_step": [[0, -5]]}}', MissingRows, "plant_step"),
@@ -252,7 +250,7 @@ def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticke
 def test_a_question_whose_answer_was_lost_is_asked_again(
     coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(noack.runtime.control_plane, "_ASK_AGAIN_S", 0.2)
+    monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
     queries = coordinator.plane.session.declare_queryable(
         coordinator.plane.key("ask", "*"), FifoChannel(4)
     )
@@ -260,11 +258,11 @@ def test_a_question_whose_answer_was_lost_is_asked_again(
 
     def serve() -> None:
         kept.append(queries.recv())
-        ControlPlane.answer(queries.recv(), "parse_message")
+        ControlPlane.answer(queries.recv(), "answer")
 
     threading.Thread(target=serve, daemon=True).start()
     with ControlPlane(ticket, "plant") as plant:
-        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "parse_message"
+        assert json.loads(plant.request("ask", {}, timeout_s=30)) == "answer"
     kept.clear()
 
 
@@ -285,10 +283,8 @@ def test_a_launched_process_connects_anew_until_it_is_let_in(
         def request(self, what: str, *_: object, **__: object) -> bytes:
             if len(tries) < 3:
                 raise NoAnswerError(f"no answer to {what!r}")
-            address = after = None
-            return json.dumps({
-                "generation": 0, "admitted_ns": 0, "from_ns": 0, "address": address, "after": after
-            }).encode()  # fmt: skip
+            admission = {"generation": 0, "admitted_ns": 0, "from_ns": 0}
+            return json.dumps(admission | {"address": None, "replaces": None}).encode()
 
     monkeypatch.setattr(noack.runtime.process_entry, "ControlPlane", Silent)
     monkeypatch.setattr(noack.runtime.process_entry, "lifeline_cut", lambda: False)

@@ -46,4 +46,4 @@ def test_a_mistake_names_the_key_where_it_lies(
 
 def test_what_a_diverging_loop_saves_up_is_infinite_and_no_exception() -> None:
     form = QuadraticForm(np.eye(2), np.zeros((0, 2)))
-    assert form.value(np.array([1e200, 0.0])) == math.inf
+    assert form.values(np.array([[1e200, 0.0]])) == [math.inf]

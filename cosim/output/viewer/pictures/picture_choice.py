@@ -10,10 +10,10 @@ from cosim.output.viewer.pictures.phase_picture import PhasePicture
 from cosim.output.viewer.pictures.picture import Picture, Reals
 from cosim.output.viewer.pictures.quadrotor_picture import QuadrotorPicture
 from cosim.output.viewer.pictures.tanks_picture import TanksPicture
-from noack.config.plant_systems import CartPoleSettings
 from noack.config.resolution import LoopMatrices, loop_of
 from noack.config.scenario import Scenario
 from noack.core.linear_systems import Propagator
+from noack.plants.cart_pole import CartPoleSettings
 
 _LEVELS = ("level_1", "level_2", "level_3", "level_4")
 _SAMPLES = 400

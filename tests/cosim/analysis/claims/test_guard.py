@@ -319,7 +319,7 @@ def test_nothing_is_said_of_what_is_claimed_nowhere(make: Make) -> None:
 
 
 def _absolute(make: Make) -> Scenario:
-    from noack.config.triggers import AbsoluteSettings
+    from noack.trigger.absolute import AbsoluteSettings
 
     return make().model_copy(update={"trigger": AbsoluteSettings(policy="absolute", delta=0.02)})
 

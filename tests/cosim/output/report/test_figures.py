@@ -16,8 +16,9 @@ from matplotlib.figure import Figure
 from cosim.output import palette
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
-from cosim.output.report.figure_files import inline, save
+from cosim.output.report.figure_files import inline, save_figure
 from cosim.output.report.figure_style import printed, settings
+from noack.core.errors import CallerError
 from tests.cosim.output.report.conftest import HOSTILE
 
 SIZES = {"normal": 1000, "empty": 0, "one": 1, "not finite": 1000, "ten": 300, "long": 100_000}
@@ -86,8 +87,8 @@ def test_every_axis_has_a_label_with_its_unit(drawn: dict[str, Figure]) -> None:
 def test_every_figure_can_be_saved(drawn: dict[str, Figure], tmp_path: Path) -> None:
     """Warnings are errors here: no log of zero, no limits that coincide, no layout that fails."""
     for name, figure in drawn.items():
-        save(figure, tmp_path / f"{name}.png")
-        save(figure, tmp_path / f"{name}.svg")
+        save_figure(figure, tmp_path / f"{name}.png")
+        save_figure(figure, tmp_path / f"{name}.svg")
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.svg").stat().st_size < 1_000_000
 
@@ -195,6 +196,16 @@ def test_bounds_are_dashed_and_the_measured_is_not() -> None:
     assert len(styles) == 4
 
 
+def test_a_reset_to_zero_is_a_vertical_line_on_a_logarithmic_axis() -> None:
+    t_s = np.arange(8.0)
+    e_c = np.array([1.0, 2.0, 0.0, 0.5, np.nan, 1.0, 0.0, 0.0])
+    (axes,) = signal_figures.error_figure(t_s, e_c + 1, e_c + 1, e_c).axes
+    drawn = axes.lines[0].get_ydata()
+    assert np.array_equal(np.isnan(drawn), np.isnan(e_c))
+    assert (drawn[e_c == 0] < axes.get_ylim()[0]).all()
+    assert 0 < axes.get_ylim()[0] < axes.get_ylim()[1] < 1e9
+
+
 def test_a_bound_has_the_colour_of_what_it_rests_on_in_every_figure() -> None:
     t_s = np.arange(1.0, 5.0)
     kinds: list[BoundKind] = ["identity", "certified", "printed", "certified"]
@@ -244,10 +255,10 @@ def test_the_distribution_of_lateness_is_exact_at_its_ends() -> None:
 def same(draw: Callable[[], Figure], tmp_path: Path, ending: str) -> set[bytes]:
     found = set()
     for _ in range(2):
-        save(draw(), tmp_path / f"figure.{ending}")
+        save_figure(draw(), tmp_path / f"figure.{ending}")
         found.add((tmp_path / f"figure.{ending}").read_bytes())
         with mpl.rc_context({"lines.linewidth": 9, "font.size": 20, "svg.hashsalt": "other"}):
-            save(draw(), tmp_path / f"figure.{ending}")
+            save_figure(draw(), tmp_path / f"figure.{ending}")
             found.add((tmp_path / f"figure.{ending}").read_bytes())
     return found
 
@@ -260,8 +271,8 @@ def test_the_same_figure_gives_the_same_bytes(tmp_path: Path, ending: str) -> No
 
 
 def test_another_ending_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\.svg or \.png, not as \.pdf"):
-        save(Figure(), tmp_path / "figure.pdf")
+    with pytest.raises(CallerError, match=r"figure\.pdf: a figure is saved as \.svg or \.png"):
+        save_figure(Figure(), tmp_path / "figure.pdf")
 
 
 def test_drawing_leaves_the_settings_alone() -> None:

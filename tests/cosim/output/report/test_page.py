@@ -345,7 +345,7 @@ def test_a_report_that_cannot_be_written_is_one_clear_line(
     record: RunRecord, tmp_path: Path
 ) -> None:
     (tmp_path / REPORT_FILE).mkdir()
-    with pytest.raises(MachineError, match=r"report\.html: the report cannot be written"):
+    with pytest.raises(MachineError, match=r"report\.html: cannot be written"):
         written(record, tmp_path)
 
 

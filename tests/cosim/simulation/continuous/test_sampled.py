@@ -16,12 +16,11 @@ from cosim.simulation.continuous.continuous_loop import ContinuousLoop
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.plant_grid_loop import SampledLoop, StepSchedule
 from cosim.simulation.virtual_time import simulate
-from noack.config.resolution import LoopMatrices, resolve
+from noack.config.resolution import LoopMatrices, policy_of, resolve
 from noack.config.scenario_file import validate
 from noack.core.linear_systems import Matrix
 from noack.protocol.record_tables import PLANT_STEP
 from noack.trigger.decaying import DecayingTrigger
-from noack.trigger.policy_from_settings import policy_of
 
 PERIOD_NS = 10_000_000
 STEPS = 200

@@ -81,6 +81,8 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("axes.1.key", None, "key: missing; key and values go together"),
     ("axes.0.name", "Axis", "use small letters, digits and _, beginning with a letter"),
     ("axes.1.values", [1, 1.0], "1 is there twice"),
+    ("axes.1.values", [[[1.0]], [[2.0]]], "axes.1.values: should be numbers, texts, true or false"),
+    ("compare.reference", [1], "compare.reference: should be a number, a text, true or false"),
     (
         "axes.0.variants",
         {"MB": {"mode": "model"}, "ZOH": {"mode": "zoh", "trigger.beta": 0.1}},
@@ -193,7 +195,7 @@ def test_shipped_campaigns_are_valid_and_named_after_their_file(path: Path) -> N
 
 
 def test_the_shipped_campaigns_are_there() -> None:
-    names = ["acknowledgements", "mansd_sweep", "mb_vs_zoh", "policies_under_loss"]
+    names = ["acknowledgements", "mansd_sweep", "mb_vs_zoh", "paper", "policies_under_loss"]
     assert [path.stem for path in SHIPPED] == names
 
 

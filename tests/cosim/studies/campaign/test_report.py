@@ -200,7 +200,7 @@ def test_a_campaign_that_is_not_there_is_one_line() -> None:
     assert done.exit_code == 2
     assert done.stderr == (
         "noack: mb_vs_zho: no such file, nor a shipped campaign; did you mean mb_vs_zoh? "
-        "There are acknowledgements, mansd_sweep, mb_vs_zoh, policies_under_loss\n"
+        "There are acknowledgements, mansd_sweep, mb_vs_zoh, paper, policies_under_loss\n"
     )
 
 

@@ -195,7 +195,7 @@ UNSTABLE = ["--set", "model.gain=[[-0.5]]", "--set", "model.allow_unstable=true"
         ([*UNSTABLE, "--weights", "chosen"], "--gain lqr chooses another"),
         (["--set", 'network.protocol="ack"'], "network.protocol"),
         (["--weights", "given"], "the scenario has no trigger.weight"),
-        (["--bound", "error=1", "--bound", "error=2"], "error has one already"),
+        (["--bound", "error=1", "--bound", "error=2"], "error is given twice"),
         (["--quantile", "nan"], "--quantile: must be between 0 and 1"),
         (["--settle", "1"], "--settle: must be between 0 and 1"),
         (["--under", "theory"], "--under: paper or schedule"),

@@ -1,12 +1,11 @@
 """The counterexamples, each against a closed form or another way of computing it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from cosim.studies.paper.paper_conditions import BASE, load_condition, resolved_draw
+from cosim.studies.paper.draw_measures import resolved_draw
+from cosim.studies.paper.paper_campaign import base_scenario
 from cosim.studies.paper.paper_evidence import (
     _eigenvalues,
     _exact_model,
@@ -19,7 +18,7 @@ from cosim.studies.paper.paper_evidence import (
 from noack.config.named_models import lane_following
 from noack.config.resolution import loop_of
 
-PATH = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
+SCENARIO = base_scenario()
 
 
 def test_the_eigenvalues_are_roots_of_the_characteristic_polynomial() -> None:
@@ -49,7 +48,7 @@ def test_the_share_that_a_capped_loss_loses_is_the_simulated_one() -> None:
 
 
 def test_with_an_exact_model_x_is_the_undisturbed_closed_loop() -> None:
-    found = _exact_model(PATH)
+    found = _exact_model(SCENARIO)
     model = lane_following({})
     H, x0 = model.A + model.B @ model.K, np.array([0.5, 0.0, 0.1, 3.0])
     assert found["events"] == 1
@@ -59,9 +58,9 @@ def test_with_an_exact_model_x_is_the_undisturbed_closed_loop() -> None:
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
 def test_trapped_states_do_not_feel_the_unstable_mode(mode: str) -> None:
-    found = _trapped(PATH)
+    found = _trapped(SCENARIO)
     assert found[mode] == found["n"] - found["unstable"] == 3
-    loop = loop_of(resolved_draw(load_condition(PATH, BASE), found["draw"], "model"))
+    loop = loop_of(resolved_draw(SCENARIO, found["draw"], "model"))
     n, BK = loop.n, loop.B @ loop.K
     H = loop.H if mode == "model" else np.zeros((n, n))
     rate = np.linalg.eigvals(loop.A).real.max()
@@ -88,7 +87,7 @@ def test_the_slow_models_error_is_the_closed_form() -> None:
 
 
 def test_the_vehicle_at_rest_is_where_its_free_motion_ends() -> None:
-    found = _standstill(PATH)
+    found = _standstill(SCENARIO)
     model = lane_following({})
     x0 = np.array(found["x0"])
     assert np.abs(model.K @ x0).max() < 1e-12
@@ -103,7 +102,7 @@ def test_the_vehicle_at_rest_is_where_its_free_motion_ends() -> None:
 
 
 def test_theorem_3s_equation_is_solved_with_and_without_the_factor() -> None:
-    found = _theorem_3(PATH, 0)
+    found = _theorem_3(SCENARIO, 0)
     gamma = found["gamma_per_s"]
     for row in found["rows"]:
         for name, level in (("printed", 0.5), ("derived", 0.5 * np.exp(-0.25 * row["t_s"]))):

@@ -1,7 +1,6 @@
 """Measures of a draw, against closed forms and against what the simulator's own summary says."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,24 +8,20 @@ from scipy.linalg import expm
 
 from cosim.simulation.continuous.continuous_report import run_continuous, summary
 from cosim.studies.paper.draw_measures import (
+    MODES,
     _ideal_norms,
     _settling_s,
     measure_draw,
     open_loop_eigenvalues,
+    resolved_draw,
     simulate_draw,
 )
 from cosim.studies.paper.paper_bounds_of_draws import certified, printed
-from cosim.studies.paper.paper_conditions import (
-    BASE,
-    CONDITIONS,
-    MODES,
-    load_condition,
-    resolved_draw,
-)
+from cosim.studies.paper.paper_campaign import BASE, EXACT_MODEL, load_campaign
 from noack.config.resolution import loop_of
 
-PATH = Path(__file__).parents[4] / "scenarios" / "lane_following.toml"
-SCENARIO = load_condition(PATH, BASE)
+_, SCENARIOS = load_campaign()
+SCENARIO = SCENARIOS[BASE]
 DRAW = 3
 
 
@@ -101,8 +96,7 @@ def test_the_double_eigenvalue_at_zero_is_recognised_in_every_plant() -> None:
 
 
 def test_an_exact_model_sends_nothing_after_the_first_packet() -> None:
-    (exact,) = [c for c in CONDITIONS if c.name == "exact_model"]
-    found = measure_draw(load_condition(PATH, exact), 0)
+    found = measure_draw(SCENARIOS[EXACT_MODEL], 0)
     assert found.model.events == found.model.deliveries == 1
     assert found.model.gap_min_s == math.inf
     assert found.model.settled_1_s == pytest.approx(found.ideal_settled_1_s, abs=1e-6)

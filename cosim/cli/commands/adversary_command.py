@@ -1,0 +1,87 @@
+"""``noack adversary``: the worst losses that the network may cause."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.command import (
+    THEORY,
+    JsonOption,
+    ScenarioArgument,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus
+
+
+class AdversaryAim(StrEnum):
+    """What ``noack adversary`` may maximise."""
+
+    ERROR = "error"
+    STATE = "state"
+    COST = "cost"
+    INTER_EVENT = "inter-event"
+    ALL = "all"
+
+
+@command(THEORY, 20, [
+    ("noack adversary lane_following", "all objectives"),
+    ("noack adversary lane_following --objective error --json", "the controller's error only"),
+    ("noack adversary unstable_pendulum --horizon 2 --beam 64", "a faster search"),
+])  # fmt: skip
+def adversary(
+    scenario: ScenarioArgument,
+    *,
+    objective: Annotated[
+        AdversaryAim,
+        typer.Option(
+            help="Maximise the controller's error ‖e_c‖, the state ‖x‖ or the cost ∫‖x‖² dt, or "
+            "minimise the inter-event time."
+        ),
+    ] = AdversaryAim.ALL,
+    horizon: Annotated[
+        float | None, typer.Option(help="Seconds to search; the scenario's horizon by default.")
+    ] = None,
+    nodes: Annotated[
+        int,
+        typer.Option(
+            help="Search exhaustively while this many segments between events suffice.", min=0
+        ),
+    ] = 500_000,
+    beam: Annotated[int, typer.Option(help="Width of the beam search, in runs.", min=0)] = 512,
+    settings: SetOption = None,
+    json: JsonOption = False,
+) -> int:
+    """Search for the worst losses that the network may cause; compare them with the bounds.
+
+    Exit status 1: a certified bound was exceeded.
+    """
+    from cosim.analysis.adversary import Objective, find_worst
+    from cosim.analysis.adversary.adversary_report import document, print_worst
+    from cosim.live.progress import search_status
+    from noack.config.resolution import resolve
+    from noack.theory.run_conditions import ideal_conditions
+    from noack.theory.scenario_certificates import certify
+
+    given = [] if horizon is None else [f"horizon_s={horizon}"]
+    resolved = resolve(load(find_scenario(scenario), [*(settings or ()), *given]))
+    certificate = certify(resolved, ideal_conditions(resolved))
+    aims = list(Objective) if objective is AdversaryAim.ALL else [Objective(objective.value)]
+    with search_status() as report:
+        found = [
+            find_worst(
+                resolved, aim, most_nodes=nodes, beam=beam, certificate=certificate,
+                report=report(aim.value),
+            )
+            for aim in aims
+        ]  # fmt: skip
+    if json:
+        print_json(document(found, resolved, certificate))
+    else:
+        print_worst(Console(), found, resolved, certificate)
+    return ExitStatus.FAILED if any(worst.breaches for worst in found) else ExitStatus.OK

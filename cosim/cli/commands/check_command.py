@@ -1,0 +1,96 @@
+"""``noack check``: a scenario with everything made explicit, and the assumptions it meets."""
+
+from collections.abc import Iterator
+
+from rich.console import Console
+
+from cosim.cli.command import (
+    FILES,
+    JsonOption,
+    ScenarioArgument,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps as scenario_toml
+from noack.config.scenario_file import load
+from noack.core.clock import NS_PER_S
+from noack.core.errors import ExitStatus
+
+_COMMENT = "# "
+
+
+@command(FILES, 30, [
+    ("noack check lane_following", "print the scenario and its assumptions"),
+    ("noack check lane_following --set mode=zoh --json", "as JSON"),
+])  # fmt: skip
+def check(
+    scenario: ScenarioArgument, *, settings: SetOption = None, json: JsonOption = False
+) -> int:
+    """Check a scenario and print it with all defaults and random draws filled in.
+
+    The output is a scenario file. Comments at its end say which of the paper's assumptions hold.
+
+    A nonlinear plant is also started and linearised. For a plant in Python this runs its code.
+    """
+    from cosim.output.assumptions_table import print_assumptions
+    from noack.config.resolution import policy_of, resolve
+    from noack.theory.assumptions import assumptions
+
+    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    policy_of(resolved)  # some policies require a stable loop
+    verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
+    console = Console()
+    console.width -= len(_COMMENT)
+    with console.capture() as captured:  # printed last: the plant may be refused
+        console.print("the paper's assumptions for this scenario:")
+        print_assumptions(console, verdicts)
+        _print_plant(console, resolved)
+    if json:
+        print_json(resolved.model_dump(mode="json"))
+        return ExitStatus.OK
+    print(scenario_toml(resolved))
+    for line in captured.get().splitlines():
+        print(f"{_COMMENT}{line}".rstrip())
+    return ExitStatus.OK
+
+
+def _print_plant(console: Console, resolved: Scenario) -> None:
+    """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
+    from cosim.analysis.model_comparison import linearisation, said
+    from plant_server.plant import system_of
+
+    if not resolved.coverage.is_linear:
+        about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
+        console.print(f"the plant: {about}", highlight=False, markup=False)
+    if (near := linearisation(resolved)) is not None:
+        for what, value in said(near):
+            console.print(f"{what}: {value}", highlight=False, markup=False)
+    for line in _dependent_defaults(resolved):
+        console.print(line, highlight=False, markup=False)
+
+
+def _dependent_defaults(resolved: Scenario) -> Iterator[str]:
+    """Yield the keys without a value whose default depends on other keys."""
+    from cosim.live.restart_policy import RESTART_BY_HAND_S
+    from cosim.live.start_limit import DEFAULT_S
+
+    watchdog, timeout_s = resolved.plant.watchdog, resolved.timing.actuation_timeout_ns / NS_PER_S
+    if watchdog.timeout_s is None:
+        yield (
+            f"plant.watchdog: policy {watchdog.policy}, after {timeout_s:g} s without an actuation"
+        )
+    if resolved.controller.safe_input is None:
+        yield "controller.safe_input: 0, the input before the first update"
+    if resolved.recovery.rejoin_within_s is None:
+        yield (
+            "recovery.rejoin_within_s: 0: a process that dies ends the run; with `noack record` "
+            f"{RESTART_BY_HAND_S:g}: it may be restarted within {RESTART_BY_HAND_S:g} s"
+        )
+    if resolved.start_within_s is None:
+        yield (
+            f"start_within_s: {DEFAULT_S:g}, longer on a busy machine; with `noack record` "
+            "unlimited"
+        )

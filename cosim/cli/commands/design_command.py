@@ -1,0 +1,193 @@
+"""``noack design``: choose a trigger."""
+
+import json as json_module
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from cosim.cli.command import (
+    CAMPAIGNS,
+    JsonOption,
+    ScenarioArgument,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from cosim.record.run_directory import DEFAULT_RUNS
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import dumps, load, value_of
+from noack.core.errors import CallerError, ExitStatus
+from noack.core.linear_systems import Matrix
+from noack.core.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from cosim.studies.design.candidate_measures import DesignLimits
+
+Settling = Annotated[float, typer.Option(metavar="SECONDS", help="Largest settling time allowed.")]
+Quantile = Annotated[float, typer.Option(help="Share of the draws that must settle in time.")]
+Settle = Annotated[
+    float, typer.Option(help="A run has settled when ‖x‖ stays below this share of ‖x(0)‖.")
+]
+BoundOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="state=X|error=X",
+        help="Largest certified sup‖x‖ (state) or sup‖e_c‖ (error) allowed over the box.",
+    ),
+]
+Under = Annotated[
+    str,
+    typer.Option(
+        help="Conditions of the certificates: the `paper`'s, or the scenario's `schedule`."
+    ),
+]
+Weights = Annotated[
+    str,
+    typer.Option(help="Norms to try: `identity`, `given` in the scenario, `chosen` by noack."),
+]
+Gain = Annotated[
+    str, typer.Option(help="Gain K: `given` in the scenario, or `lqr` of the nominal model.")
+]
+StateCost = Annotated[
+    str | None, typer.Option("--Q", help="LQR state cost: rows, or a diagonal, e.g. '[1, 1]'.")
+]
+InputCost = Annotated[str | None, typer.Option("--R", help="LQR input cost: rows, or a diagonal.")]
+Draws = Annotated[
+    int,
+    typer.Option(help="Draws for the choice; as many fresh draws confirm it.", min=20),
+]
+Seed = Annotated[int, typer.Option(help="Seed of the draws.", min=0, max=2**63 - 1)]
+Out = Annotated[
+    Path | None, typer.Option("--out", help="Write the chosen scenario to this file (TOML).")
+]
+Page = Annotated[
+    Path | None,
+    typer.Option("--page", help="File of the page (HTML); runs/design/NAME.html by default."),
+]
+
+
+@command(CAMPAIGNS, 20, [
+    ("noack design lane_following --settling 14", "the fewest transmissions"),
+    ("noack design lane_following --settling 14 --bound error=3 --out mine.toml", ""),
+    ("noack design double_integrator --settling 8 --gain lqr --Q '[1, 1]' --json", ""),
+])  # fmt: skip
+def design(
+    scenario: ScenarioArgument,
+    *,
+    settling: Settling,
+    quantile: Quantile = 0.95,
+    settle: Settle = 0.02,
+    bound: BoundOption = None,
+    under: Under = "paper",
+    weights: Weights = "identity,chosen",
+    gain: Gain = "given",
+    Q: StateCost = None,
+    R: InputCost = None,
+    draws: Draws = 2000,
+    seed: Seed = 0,
+    settings: SetOption = None,
+    out: Out = None,
+    page: Page = None,
+    json: JsonOption = False,
+) -> int:
+    """Choose α, β and the norm: the fewest transmissions that meet your limits.
+
+    Exit status 1: no choice meets the limits, or fresh draws do not confirm it.
+    """
+    from cosim.live.progress import work_bar
+    from cosim.studies.design import design_page as pages
+    from cosim.studies.design.design_run import design as designed
+    from cosim.studies.design.loop_families import families_of
+
+    loaded = load(find_scenario(scenario), settings or ())
+    loaded.decaying  # noqa: B018 - raises for another policy
+    limits = _limits(settling, quantile, settle, bound or [], under)
+    if out is not None and not out.parent.is_dir():
+        raise CallerError(f"--out {out}: there is no folder {out.parent}")
+    norms = [norm.strip() for norm in weights.split(",") if norm.strip()]
+    with work_bar("choosing norms") as progress:
+        families = families_of(loaded, norms, _regulator(loaded, gain, Q, R), progress)
+    with work_bar("trying candidates") as progress:
+        found = designed(families, limits, draws=draws, seed=seed, progress=progress)
+    written = [
+        write_whole(page or DEFAULT_RUNS / "design" / f"{loaded.name}.html", pages.page(found))
+    ]
+    if out is not None and found.feasible:
+        written.append(write_whole(out, dumps(found.scenario)))
+    if json:
+        print_json(found.document() | {"files": [str(path) for path in written]})
+    else:
+        pages.print_found(Console(), found)
+        for path in written:
+            print(path)
+    if not found.confirmed:
+        typer.echo(f"noack: {found.verdict()}", err=True)
+    return ExitStatus.OK if found.confirmed else ExitStatus.FAILED
+
+
+def _limits(
+    settling: float, quantile: float, settle: float, bounds: list[str], under: str
+) -> "DesignLimits":
+    from cosim.studies.design.candidate_measures import DesignLimits
+
+    for option, value, most in (
+        ("settling", settling, math.inf), ("quantile", quantile, 1), ("settle", settle, 1),
+    ):  # fmt: skip
+        if not 0 < value < most:
+            allowed = "positive" if most == math.inf else "between 0 and 1"
+            raise CallerError(f"--{option}: must be {allowed}, not {value:g}")
+    if under not in ("paper", "schedule"):
+        raise CallerError(f'--under: paper or schedule, not "{under}"')
+    return DesignLimits(settling, quantile, settle, _bounds(bounds), under == "schedule")
+
+
+def _bounds(given: list[str]) -> dict[Any, float]:
+    found: dict[Any, float] = {}
+    for text in given:
+        name, _, value = text.partition("=")
+        if name in found:
+            raise CallerError(f"--bound {text}: {name} is given twice")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = math.nan
+        if name not in ("state", "error") or not 0 < found[name] < math.inf:
+            raise CallerError(f"--bound {text}: write it as state=X or error=X, X positive")
+    return found
+
+
+def _regulator(
+    loaded: Scenario, gain: str, Q: str | None, R: str | None
+) -> tuple[Matrix, Matrix] | None:
+    """Return the LQR costs Q (n, n) and R (m, m); None for the scenario's gain."""
+    if gain not in ("given", "lqr"):
+        raise CallerError(f'--gain: given or lqr, not "{gain}"')
+    if gain == "lqr":
+        n, m = loaded.model.dimensions
+        return _matrix("--Q", Q, n), _matrix("--R", R, m)
+    if Q or R:
+        raise CallerError("--Q, --R: are for --gain lqr only")
+    return None
+
+
+def _matrix(option: str, text: str | None, size: int) -> Matrix:
+    if text is None:
+        return np.eye(size)
+    try:
+        value = np.array(value_of(text, option), dtype=np.float64)
+    except (CallerError, ValueError, TypeError):
+        value = np.empty(0)
+    if value.ndim == 1:
+        value = np.diag(value)
+    if value.shape != (size, size) or not np.isfinite(value).all():
+        example = json_module.dumps([1] * size)
+        raise CallerError(
+            f"{option} {text}: expected {size} x {size} numbers by rows, or {size} for the "
+            f"diagonal, e.g. '{example}'"
+        )
+    return value

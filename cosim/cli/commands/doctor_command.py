@@ -1,0 +1,71 @@
+"""``noack doctor``: what this machine permits, and whether that suffices for a run."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.command import (
+    FILES,
+    JsonOption,
+    RunsOption,
+    SetOption,
+    command,
+    find_scenario,
+    print_json,
+)
+from cosim.cli.completion import scenarios
+from cosim.record.run_directory import DEFAULT_RUNS
+from noack.config.scenario_file import load
+from noack.core.errors import ExitStatus
+
+
+@command(FILES, 10, [
+    ("noack doctor", "for the paper's example"),
+    ("noack doctor lane_weighted --set speed=4", "for another scenario"),
+    ("noack doctor --seconds 10 --json", "measure longer; all numbers as JSON"),
+])  # fmt: skip
+def doctor(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            help="Scenario file or shipped scenario, for its rates, ports and allowed lateness.",
+            autocompletion=scenarios,
+        ),
+    ] = "lane_following",
+    *,
+    settings: SetOption = None,
+    seconds: Annotated[
+        float,
+        typer.Option(
+            help="Seconds to measure wake-ups, without and with real-time settings.",
+            min=0.1,
+            max=3600,
+        ),
+    ] = 2.0,
+    runs: RunsOption = DEFAULT_RUNS,
+    json: JsonOption = False,
+) -> int:
+    """Check this machine: real-time settings, timers, ports, disk.
+
+    Each finding is good, limited or bad, with its meaning for a run and a remedy.
+
+    Exit status 1: a finding is bad, so that no run is possible.
+    """
+    from cosim.doctor.doctor_table import document, print_findings
+    from cosim.doctor.findings import FindingStatus, judge, worst
+    from cosim.doctor.machine_facts import requirements_of
+    from cosim.doctor.machine_measures import measure
+    from cosim.live.progress import PatientConsole
+    from noack.config.resolution import resolve
+
+    resolved = resolve(load(find_scenario(scenario), settings or ()))
+    wanted = requirements_of(resolved)
+    with PatientConsole(stderr=True).status("measuring"):
+        machine = measure(resolved, wanted, runs, seconds)
+    findings = judge(machine, wanted)
+    if json:
+        print_json(document(machine, wanted, findings))
+    else:
+        print_findings(Console(), wanted, findings)
+    return ExitStatus.FAILED if worst(findings) is FindingStatus.BAD else ExitStatus.OK

@@ -1,0 +1,46 @@
+"""``noack fidelity``: a run compared with the ideal loop."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.cli.command import RUNS, JsonOption, RunArgument, RunsOption, command, print_json
+from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from noack.core.errors import ExitStatus
+
+
+@command(RUNS, 60, [
+    ("noack fidelity", "effects of sampling, delay and hold on the last run"),
+    ("noack fidelity --out fidelity.png", "with a figure"),
+    ("noack fidelity runs/latest --json", "as JSON"),
+])  # fmt: skip
+def fidelity(
+    run_dir: RunArgument = None,
+    *,
+    runs: RunsOption = DEFAULT_RUNS,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Write a figure of the differences over time (.svg, .png)."),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Compare a run with the ideal loop in continuous time, effect by effect."""
+    from cosim.analysis.fidelity import compute_fidelity
+    from cosim.live.progress import PatientConsole
+    from cosim.output.fidelity_table import print_fidelity
+    from cosim.output.report.figure_files import save_figure
+    from cosim.output.report.signal_figures import fidelity_figure
+    from cosim.record.run_record import load_record
+
+    path = chosen_run(run_dir, runs)
+    with PatientConsole(stderr=True).status("comparing"):
+        found = compute_fidelity(load_record(path))
+        if out is not None:
+            save_figure(fidelity_figure(found), out)
+    if json:
+        print_json(found.as_json())
+    else:
+        print_fidelity(Console(), found)
+    return ExitStatus.OK if found.explained else ExitStatus.FAILED

@@ -1,0 +1,32 @@
+"""``noack replay``: a run's recorded inputs again, its outputs compared."""
+
+from rich.console import Console
+
+from cosim.cli.command import RUNS, JsonOption, RunArgument, RunsOption, command, print_json
+from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from noack.core.errors import ExitStatus
+
+
+@command(RUNS, 70, [
+    ("noack replay", "the last run; exit status 1 if a bit differs"),
+    ("noack replay runs/latest --json", "as JSON"),
+])  # fmt: skip
+def replay(
+    run_dir: RunArgument = None, *, runs: RunsOption = DEFAULT_RUNS, json: JsonOption = False
+) -> int:
+    """Replay a run's recorded inputs; compare the outputs bit for bit."""
+    from cosim.analysis.replay import replay as replay_record
+    from cosim.analysis.replay.replay_table import print_replay
+    from cosim.live.progress import PatientConsole
+    from cosim.record.environment import changed_since
+    from cosim.record.run_record import load_record
+
+    path = chosen_run(run_dir, runs)
+    with PatientConsole(stderr=True).status("replaying"):
+        found = replay_record(load_record(path))
+    changed = changed_since(path)
+    if json:
+        print_json(found.document() | {"changed_since": changed})
+    else:
+        print_replay(Console(), found, changed)
+    return ExitStatus.OK if found.bit_exact else ExitStatus.FAILED

@@ -1,0 +1,99 @@
+"""``noack set``: change the runtime parameters of a running run."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.cli import completion
+from cosim.cli.command import RUNS, SESSION, JsonOption, command, print_json
+from noack.config.runtime_parameters import SHORT, full_key, text_of
+from noack.config.scenario_file import value_of
+from noack.core.errors import CallerError, ExitStatus
+
+
+@command(
+    RUNS, 45,
+    [
+        ("noack set", "list the runtime parameters and their values"),
+        ("noack set loss.p 0.9", "lose nine in ten packets from now on"),
+        ("noack set mansd 2 trigger.beta 0.3 --json", "change two at once"),
+    ],
+    name="set",
+    context_settings={"ignore_unknown_options": True},  # -0.5 is a value
+)  # fmt: skip
+def set_(
+    settings: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[KEY VALUE]...",
+            help="Keys as in the scenario, or short, and new values: loss.p 0.9 mansd 2. "
+            "Without any, the runtime parameters are listed.",
+            autocompletion=completion.runtime_parameters,
+        ),
+    ] = None,
+    *,
+    session: Annotated[str | None, SESSION] = None,
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            "--run",
+            help="Directory of the run; the newest run by default.",
+            autocompletion=completion.run_directories,
+        ),
+    ] = None,
+    json: JsonOption = False,
+) -> int:
+    """Change a live run: losses, M, trigger, set-point."""
+    from noack.runtime.run_registry import find, request_change
+
+    wanted = parsed(settings or ())
+    answer = request_change(find(session, run), wanted)
+    if json:
+        print_json(answer)
+    elif wanted:
+        console = Console()
+        console.print(
+            f"{answer['name']}: {text_of(wanted)} from {answer['from_s']:.3f} s on",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
+    else:
+        _print_parameters(Console(), answer)
+    return ExitStatus.OK
+
+
+def parsed(words: list[str] | tuple[str, ...]) -> dict[str, Any]:
+    """Return the settings that words give as KEY VALUE or KEY=VALUE.
+
+    Raises:
+        CallerError: a value is missing, or a key is given twice.
+    """
+    found: dict[str, Any] = {}
+    left = list(words)
+    while left:
+        word = left.pop(0)
+        name, equals, text = word.partition("=")
+        if not equals:
+            if not left:
+                raise CallerError(f"{word}: needs a value, e.g. `noack set loss.p 0.9`")
+            text = left.pop(0)
+        key = full_key(name.strip())
+        if key in found:
+            raise CallerError(f"{key}: is given twice")
+        found[key] = value_of(text, name)
+    return found
+
+
+def _print_parameters(console: Console, answer: dict[str, Any]) -> None:
+    short = {key: name for name, key in SHORT.items()}
+    table = Table(title=f"{answer['name']}, at {answer['t_s']:.1f} s")
+    for heading in ("key", "short", "value"):
+        table.add_column(heading)
+    for key, value in answer["runtime_parameters"].items():
+        shown = text_of({"": value}).removeprefix(" = ")
+        table.add_row(key, short.get(key, ""), escape(shown))
+    console.print(table)
+    console.print(f"[dim]{escape(answer['run_dir'])}[/]", soft_wrap=True)

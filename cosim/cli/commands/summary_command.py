@@ -1,0 +1,42 @@
+"""``noack summary``: the verdict and the tables of an earlier run."""
+
+from rich.console import Console
+
+from cosim.cli.command import (
+    RUNS,
+    JsonOption,
+    RunArgument,
+    RunsOption,
+    VerboseOption,
+    command,
+    print_json,
+)
+from cosim.record.run_directory import DEFAULT_RUNS, chosen_run
+from noack.core.errors import ExitStatus
+
+
+@command(RUNS, 50, [
+    ("noack summary", "the last run"),
+    ("noack summary --verbose", "with timing, assumptions and each claim"),
+    ("noack summary runs/latest --json", "all numbers, as JSON"),
+])  # fmt: skip
+def summary(
+    run_dir: RunArgument = None,
+    *,
+    runs: RunsOption = DEFAULT_RUNS,
+    verbose: VerboseOption = False,
+    json: JsonOption = False,
+) -> int:
+    """Show a run's summary; finalise an interrupted run first.
+
+    Exit status 0: the summary was shown, also that of a failed run.
+    """
+    from cosim.live.finalize import reopen
+    from cosim.output.run_verdict import print_outcome
+
+    outcome = reopen(chosen_run(run_dir, runs))
+    if json:
+        print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome, verbose=verbose)
+    return ExitStatus.OK

@@ -1,0 +1,90 @@
+"""What the commands that make a run share: warnings, the run itself, its verdict."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from cosim.cli.command import print_json
+from noack.config.scenario import Scenario
+
+if TYPE_CHECKING:
+    from cosim.record.run_ending import RunEnding
+
+# Each process of a run waits for the slowest: what is not needed at the start is imported later.
+
+
+@dataclass(frozen=True)
+class RunOutput:
+    """What a command prints and writes at the end of a run."""
+
+    report: bool
+    """Write ``report.html``."""
+    verbose: bool
+    """Print all tables."""
+    json: bool
+    """Print the summary as JSON instead."""
+
+
+def run_processes(
+    scenario: Scenario,
+    runs: Path,
+    output: RunOutput,
+    *,
+    spawn: Sequence[str],
+    session: str | None = None,
+    live: bool = False,
+) -> int:
+    """Run a scenario live; print its verdict and return the exit status.
+
+    Args:
+        scenario: not resolved.
+        runs: folder of the run directories.
+        output: what is printed and written at the end.
+        spawn: roles of the processes to start; the others join by ``session``.
+        session: name that the processes of the run share.
+        live: show the run in the viewer.
+    """
+    from cosim.live.launcher import launch
+    from cosim.live.progress import PatientConsole, progress_line
+
+    warn_of_violations(scenario)
+    ending = None
+    try:
+        with progress_line(PatientConsole(stderr=True), scenario, session) as watcher:
+            ending = launch(
+                scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
+            )
+    except OSError:  # a closed terminal does not cost the run
+        if ending is None:
+            raise
+    return finalize_run(ending, output)
+
+
+def warn_of_violations(scenario: Scenario) -> None:
+    """Print the assumptions of Theorem 2 that the scenario violates, on standard error."""
+    from noack.config.resolution import resolve
+    from noack.theory.assumptions import AssumptionStatus, assumptions
+
+    for assumption in assumptions(resolve(scenario)):
+        if assumption.verdict == AssumptionStatus.VIOLATED and assumption.source == "Theorem 2":
+            print(f"noack: warning: violated: {assumption.what}: {assumption.why}", file=sys.stderr)
+
+
+def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
+    """Finish a run's record, print its verdict, and return its exit status."""
+    from cosim.live.finalize import finalize
+    from cosim.live.progress import PatientConsole
+    from cosim.output.run_verdict import print_outcome
+
+    # Minutes for a run of an hour.
+    with PatientConsole(stderr=True).status("replaying the run and checking its claims"):
+        outcome = finalize(ending, report=output.report)
+    if output.json:
+        print_json(outcome.summary)
+    else:
+        print_outcome(Console(), outcome, verbose=output.verbose)
+    return outcome.status

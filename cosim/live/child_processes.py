@@ -1,0 +1,163 @@
+"""The processes that a launcher starts: start, exit status, reason of a failure, end."""
+
+import contextlib
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from noack.core.errors import ExitStatus, MachineError
+from noack.core.python_process import python_command
+from noack.protocol.topology import RECORDER
+from noack.runtime.join_ticket import Ticket
+from noack.runtime.process_entry import TICKET_ON_STDIN
+
+_MODULES = {
+    "recorder": "cosim.live.recorder",
+    "netem": "netem",
+    "plant": "plant_server",
+    "sensor": "sensor_node",
+    "controller": "controller_node",
+}
+_ENVIRONMENT = {
+    TICKET_ON_STDIN: "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "PYTHONUTF8": "1",
+    # Return memory to the system after a busy moment. Unless they are set, glibc raises these
+    # thresholds with each large block, and keeps an arena for each thread.
+    "MIMALLOC_PURGE_DELAY": "0",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_ARENA_MAX": "2",
+    "MALLOC_MMAP_THRESHOLD_": "131072",
+    "MALLOC_TRIM_THRESHOLD_": "131072",
+}
+
+Failure = tuple[ExitStatus, str]
+"""Exit status and reason."""
+
+
+class ChildProcesses:
+    """The launched processes of a run, by role.
+
+    Args:
+        ticket: each process receives it on its standard input, which stays open as a lifeline.
+        run_dir: holds their logs.
+        roles: which processes to launch.
+    """
+
+    def __init__(self, ticket: Ticket, run_dir: Path, roles: Sequence[str]) -> None:
+        self._ticket = ticket
+        self._run_dir = run_dir
+        self._roles = [role for role in _MODULES if role in roles]
+        self._children: dict[str, subprocess.Popen[str]] = {}
+
+    @contextmanager
+    def started(self, *, live: bool) -> Iterator[None]:
+        """Start the processes; end all of them with the context.
+
+        Args:
+            live: whether the recorder also opens a viewer.
+
+        Raises:
+            MachineError: a process cannot be started.
+        """
+        try:
+            for role in self._roles:
+                self._children[role] = self._start(role, live=live)
+            yield
+        finally:
+            for child in self._children.values():
+                _end(child)
+
+    def restart(self, role: str) -> None:
+        """End a process and start another of its role.
+
+        Raises:
+            MachineError: it cannot be started.
+        """
+        _end(self._children[role])
+        self._children[role] = self._start(role, live=False)
+
+    def __contains__(self, role: str) -> bool:
+        """Whether the process of a role was launched, rather than started by hand."""
+        return role in self._children
+
+    def running(self) -> list[str]:
+        """Roles of which the launched process has not exited."""
+        return [role for role, child in self._children.items() if child.poll() is None]
+
+    def has_reported(self, role: str) -> bool:
+        """Whether a launched process has ended itself with an error message."""
+        child = self._children.get(role)
+        return child is not None and child.poll() in (ExitStatus.FAILED, ExitStatus.CALLER)
+
+    def failures(self, reported: Callable[[str], str | None]) -> dict[str, Failure]:
+        """How launched processes failed, by role.
+
+        Args:
+            reported: returns what a process reported to the coordinator, if it did.
+        """
+        codes = {role: child.poll() for role, child in self._children.items()}
+        return {role: self._failure(role, code, reported) for role, code in codes.items() if code}
+
+    def _start(self, role: str, *, live: bool) -> subprocess.Popen[str]:
+        command = python_command("-m", _MODULES[role])
+        if role == RECORDER and live:
+            command.append("--live")
+        try:
+            with (self._run_dir / "logs" / f"{role}.log").open("a") as log:
+                child = subprocess.Popen(
+                    command,
+                    stdin=subprocess.PIPE,
+                    stdout=log,
+                    stderr=log,
+                    encoding="utf-8",
+                    start_new_session=True,  # the launcher handles Ctrl-C
+                    env=os.environ | _ENVIRONMENT,
+                )
+        except OSError as error:
+            raise MachineError(f"{role} cannot be started: {error}") from None
+        assert child.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            child.stdin.write(self._ticket.dumps() + "\n")
+            child.stdin.flush()
+        return child
+
+    def _failure(self, role: str, code: int, reported: Callable[[str], str | None]) -> Failure:
+        if code < 0:
+            return ExitStatus.FAILED, f"{role} died: killed by {signal_name(-code)}"
+        if code in (ExitStatus.INTERRUPTED, ExitStatus.TERMINATED):
+            return ExitStatus.FAILED, f"{role} ended early: {signal_name(code - 128)}"
+        known = code in (ExitStatus.FAILED, ExitStatus.CALLER)
+        lines, own = self._log_lines(role), f"noack {role}: "
+        # Libraries write to the log, too; and on a full disk the log may be empty.
+        logged = next((one.removeprefix(own) for one in lines[::-1] if one.startswith(own)), None)
+        why = logged or reported(role) or "".join(lines[-1:]) or f"exit status {code}"
+        return ExitStatus(code) if known else ExitStatus.FAILED, f"{role}: {why}"
+
+    def _log_lines(self, role: str) -> list[str]:
+        log = self._run_dir / "logs" / f"{role}.log"
+        try:
+            return log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        except OSError:  # the run directory was removed
+            return []
+
+
+def _end(child: subprocess.Popen[str]) -> None:
+    """Kill a process if it still runs, and wait for its end."""
+    if child.poll() is None:
+        child.kill()
+    child.wait()
+    if child.stdin is not None:
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+
+
+def signal_name(number: int) -> str:
+    """Name of a signal."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

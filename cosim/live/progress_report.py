@@ -1,0 +1,62 @@
+"""The recorder's progress report: counts of the rows received so far."""
+
+import json
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.record.run_record import Rows, updates_in
+from noack.core.clock import NS_PER_S
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    NETEM_PACKET,
+    SENSOR_MEASUREMENT,
+    effective,
+)
+
+
+class ProgressReport:
+    """Fields of :class:`noack.runtime.control_messages.RunProgress`.
+
+    Args:
+        live: where the live viewer shows the run; None without one.
+    """
+
+    def __init__(self, live: str | None) -> None:
+        self._fields: dict[str, Any] = {
+            "t_s": 0.0, "events": 0, "deliveries": 0, "longest_loss_burst": 0, "x_norm": None,
+            "live": live, "void": [], "changes": [],
+        }  # fmt: skip
+
+    def add_void(self, text: str) -> None:
+        """Add a line about void claims."""
+        self._fields["void"].append(text)
+
+    def add_change(self, text: str) -> None:
+        """Add a line about a change of runtime parameters."""
+        self._fields["changes"].append(text)
+
+    @np.errstate(all="ignore")  # a run may diverge
+    def count(self, table: str, rows: Rows) -> None:
+        """Count rows of a table."""
+        fields = self._fields
+        if table == SENSOR_MEASUREMENT:
+            fields["t_s"] = int(rows["t_ns"][-1]) / NS_PER_S
+            fields["events"] += int((rows["event"] >= 0).sum())
+            fields["x_norm"] = float(np.linalg.norm(rows["x"][-1]))
+        elif table == CONTROLLER_DELIVERY:
+            fields["deliveries"] += len(rows)
+            # Includes stale updates, which the emulator cannot know in advance.
+            self._see_losses(rows["dropouts"])
+        elif table == NETEM_PACKET:
+            rows = updates_in(rows)[0]
+            self._see_losses(rows["consecutive_losses"][~effective(rows["fate"])])
+
+    def _see_losses(self, consecutive: NDArray[np.int64]) -> None:
+        longest = int(consecutive.max(initial=0))
+        self._fields["longest_loss_burst"] = max(self._fields["longest_loss_burst"], longest)
+
+    def dumps(self) -> str:
+        """The report as JSON."""
+        return json.dumps(self._fields)

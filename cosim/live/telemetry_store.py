@@ -1,0 +1,141 @@
+"""Telemetry on disk: the spool of a run, and which rows of each process it holds."""
+
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cosim.record.run_record import Rows
+from noack.config.resolution import tables_of
+from noack.config.scenario import Scenario
+from noack.core.errors import PeerError
+from noack.protocol.machine_interface import GENERATION, Notice, Start
+from noack.protocol.record_tables import OWNER
+from noack.protocol.topology import LOOP_ROLES, RECORDER
+from noack.runtime.control_messages import LogLine, parse_message
+from noack.runtime.spool import SPOOL, SpoolWriter, read_chunks
+from noack.runtime.telemetry import NOTICES, ReceivedRows, notice_number, notices_of
+
+
+class TelemetryStore:
+    """Writes batches of rows to the spool, and knows which rows are there.
+
+    Args:
+        scenario: the resolved scenario.
+        run_dir: the run's directory.
+        instance: random name of this recorder.
+        start: where in the run the recorder begins; a restarted one uses files of its own, as the
+            one before it may have left half a batch at the end of its files.
+
+    Raises:
+        MachineError: the spool cannot be written.
+    """
+
+    def __init__(self, scenario: Scenario, run_dir: Path, instance: str, start: Start) -> None:
+        self.types = tables_of(scenario)
+        """Row type of each table."""
+        self._folder = run_dir / SPOOL
+        self._writer = SpoolWriter(self._folder, instance if start.is_restart else RECORDER)
+        self._writer.prepare([*self.types, *map(notices_of, (*LOOP_ROLES, RECORDER))])
+        self._received: defaultdict[tuple[str, str, int], ReceivedRows] = defaultdict(ReceivedRows)
+        """By role, table and generation."""
+
+    def add_notice(self, role: str, generation: int, number: int, payload: bytes) -> dict[str, Any]:
+        """Store a line of the log; return its fields.
+
+        Raises:
+            PeerError: the payload is not a line of the log.
+        """
+        line = parse_message(LogLine, payload) | {"process": role}
+        self._writer.append(notices_of(role), notice_number(generation, number), payload)
+        self._received[role, NOTICES, generation].add(number, number + 1)
+        return line
+
+    def add_rows(
+        self, role: str, table: str, generation: int, first: int, payload: bytes
+    ) -> tuple[Rows, bool]:
+        """Store a batch of rows.
+
+        Returns:
+            The rows, and whether they follow the last stored row of their table.
+
+        Raises:
+            PeerError: the batch is not from a process of this run.
+            ValueError: its length is not a multiple of the row length.
+        """
+        if table not in self.types or OWNER[table] != role:
+            raise PeerError(f"{role} has no table {table}")
+        rows: Rows = np.frombuffer(payload, self.types[table])
+        if not len(rows) or int(rows["input"][0]) // GENERATION != generation:
+            raise PeerError("a batch without rows, or with rows of another process")
+        self._writer.append(table, first, payload)
+        received = self._received[role, table, generation]
+        follows = first == received.end
+        received.add(first, first + len(rows))
+        return rows, follows
+
+    def add_own_notice(self, notice: Notice) -> None:
+        """Store a line of the recorder's own for the log."""
+        payload = json.dumps(notice._asdict()).encode()
+        self._writer.append(notices_of(RECORDER), 0, payload)
+
+    def load(self, on_rows: Callable[[str, Rows], None]) -> None:
+        """Read what an earlier recorder of this run has stored.
+
+        Args:
+            on_rows: called with each batch, by table.
+        """
+        for table, dtype in self.types.items():
+            for first, data in read_chunks(self._folder, table):
+                if len(data) and len(data) % dtype.itemsize == 0:
+                    rows: Rows = np.frombuffer(data, dtype)
+                    generation = int(rows["input"][0]) // GENERATION
+                    self._received[OWNER[table], table, generation].add(first, first + len(rows))
+                    on_rows(table, rows)
+        for role in LOOP_ROLES:
+            for number, _ in read_chunks(self._folder, notices_of(role)):
+                generation, first = divmod(number, GENERATION)
+                self._received[role, NOTICES, generation].add(first, first + 1)
+
+    def missing(self, report: Mapping[str, Any]) -> dict[str, list[tuple[int, int]]]:
+        """Ranges of rows that a process has reported and that are not stored, by table."""
+        role, generation = report["process"], report["generation"]
+        missing = {
+            table: self._received[role, table, generation].missing(total)
+            for table, total in report["rows"].items()
+            if table == NOTICES or OWNER.get(table) == role
+        }
+        return {table: ranges for table, ranges in missing.items() if ranges}
+
+    def acknowledgements(self) -> Iterator[tuple[str, dict[str, Any]]]:
+        """Yield, for the newest process of each role, which of its rows are on disk.
+
+        Raises:
+            MachineError: files of the spool were deleted or moved.
+        """
+        self.require_present()
+        newest: dict[str, int] = {}
+        for role, _, generation in self._received:
+            newest[role] = max(newest.get(role, 0), generation)
+        for role, generation in newest.items():
+            rows = {
+                table: received.ranges
+                for (of, table, number), received in self._received.items()
+                if (of, number) == (role, generation)
+            }
+            yield role, {"generation": generation, "rows": rows}
+
+    def require_present(self) -> None:
+        """Check that the spool's files are still in place.
+
+        Raises:
+            MachineError: files of the spool were deleted or moved.
+        """
+        self._writer.require_present()
+
+    def close(self) -> None:
+        """Close the spool's files."""
+        self._writer.close()

@@ -1,0 +1,29 @@
+"""Files that are either written in full or not at all."""
+
+from contextlib import suppress
+from pathlib import Path
+
+from noack.core.errors import MachineError, why
+
+
+def write_whole(path: Path, content: str | bytes, remedy: str = "") -> Path:
+    """Write a file, or replace it, in one step; return its path.
+
+    Args:
+        path: of the file; missing folders are created.
+        content: text, written as UTF-8, or bytes.
+        remedy: ends the message if the file cannot be written.
+
+    Raises:
+        MachineError: the file cannot be written.
+    """
+    scratch = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        scratch.write_bytes(content.encode() if isinstance(content, str) else content)
+        scratch.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            scratch.unlink(missing_ok=True)
+        raise MachineError(f"{path}: cannot be written: {why(error)}{remedy}") from None
+    return path

@@ -1,0 +1,63 @@
+"""Settings of a Functional Mock-up Unit; :mod:`noack.plants.systems.fmu_system` runs it."""
+
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field, FiniteFloat
+
+from noack.plants.plant_settings import Names, PlantSettings, PlantStart
+from noack.plants.systems.plant_system import PlantSystem
+from noack.settings.matrices import Row, require_length
+from noack.settings.user_files import FileSettings
+
+
+class FmuSettings(FileSettings, PlantSettings):
+    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: an exported model of another tool.
+
+    It is native code that runs in the plant's process; see docs/plants.md.
+    """
+
+    needs: ClassVar = ("fmpy", "fmi")
+
+    kind: Literal["fmu"]
+    """What the plant is."""
+    file: str
+    """The FMU; relative names begin at the scenario file."""
+    state_variables: Annotated[Names, Field(min_length=1)]
+    """Its variables that make up x: outputs or locals, real."""
+    input_variables: Annotated[Names, Field(min_length=1)]
+    """Its inputs that make up u, real."""
+    initial_variables: Names | None = None
+    """Its variables that are set to x(0), in x's order; by default the state variables. An empty
+    list: the FMU begins where it wants, which must be plant.initial_state."""
+    operating_state: Row | None = None
+    """What the state variables are where x = 0; by default 0."""
+    operating_input: Row | None = None
+    """What the inputs are where u = 0; by default 0."""
+    parameters: dict[str, bool | int | FiniteFloat | str] = Field({})
+    """Start values of further variables of it."""
+    on_record: Names = ()
+    """Further variables of it that are on record, as z."""
+
+    @property
+    def internal_names(self) -> tuple[str, ...]:
+        """Names of the variables that are on record beside x."""
+        return self.on_record
+
+    def check(self, n: int, m: int) -> None:
+        """Require a variable for each of n states and m inputs.
+
+        Raises:
+            ValueError: there are more, or fewer.
+        """
+        why = f"the model has {n} states and {m} inputs"
+        require_length(self.state_variables, "plant.system.state_variables", n, why)
+        require_length(self.input_variables, "plant.system.input_variables", m, why)
+        require_length(self.initial_variables or None, "plant.system.initial_variables", n, why)
+        require_length(self.operating_state, "plant.system.operating_state", n, why)
+        require_length(self.operating_input, "plant.system.operating_input", m, why)
+
+    def system(self, start: PlantStart) -> PlantSystem:
+        """Return an instance of the FMU at x(0)."""
+        from noack.plants.systems.fmu_system import FmuSystem
+
+        return FmuSystem(self, start.x0)

@@ -1,0 +1,43 @@
+"""A linear system, advanced exactly under a held input."""
+
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from noack.core.linear_systems import HeldInputPropagator, Matrix, Vector
+from noack.plants.plant_settings import PlantSettings, PlantStart
+
+_EMPTY = np.zeros(0)
+
+
+class LinearSettings(PlantSettings):
+    """ẋ = A x + B u, with A and B as the plant's other keys draw them."""
+
+    scenario: ClassVar = "lane_following"
+
+    kind: Literal["linear"] = "linear"
+    """What the plant is."""
+
+    def system(self, start: PlantStart) -> "LinearSystem":
+        """Return the system at x(0)."""
+        return LinearSystem(start.A, start.B, start.x0, step_ns=start.step_ns)
+
+
+class LinearSystem:
+    """``dx/dt = A x + B u``; z is empty.
+
+    Args:
+        A, B: shapes (n, n) and (n, m), per second.
+        x0: x(0), shape (n,).
+        step_ns: the expected step; its matrices are computed before the first deadline.
+    """
+
+    def __init__(self, A: Matrix, B: Matrix, x0: Vector, *, step_ns: int) -> None:
+        self._advance = HeldInputPropagator(A, B)
+        self._advance.step(step_ns)
+        self.x = np.array(x0, dtype=np.float64)
+        self.z = _EMPTY
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """x(t + dt) = Ad x(t) + Bd u."""
+        self.x = self._advance(self.x, u, dt_ns)

@@ -1,0 +1,154 @@
+"""What every kind of plant has.
+
+The loop sees a plant through x and u, deviations from an operating point. The plant's own state z
+may have other coordinates, and more of them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+from pydantic import Field
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.systems.plant_system import PlantSystem
+from noack.protocol.wire_format import MAX_DIMENSION
+from noack.settings.section import ScenarioSection
+
+Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
+Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
+"""dz/dt = f(t, z, v): seconds, (N,), and the physical input v, (m,)."""
+
+
+class PlantStart(NamedTuple):
+    """What a run gives a plant, beside its settings."""
+
+    x0: Vector
+    """x(0), (n,)."""
+    A: Matrix
+    """The true A of a linear plant, (n, n); Â for other plants."""
+    B: Matrix
+    """The true B of a linear plant, B̂ for other plants, (n, m); (n, m + n) with a disturbed state,
+    which then is a further input."""
+    step_ns: int
+    """Step of the plant."""
+
+
+class PlantSettings(ScenarioSection):
+    """Settings of a plant."""
+
+    states: ClassVar[tuple[str, ...]] = ()
+    """The entries of x, with units; empty if the model names them."""
+    inputs: ClassVar[tuple[str, ...]] = ()
+    """The entries of u, with units; empty if the model names them."""
+    needs: ClassVar[tuple[str, str] | None] = None
+    """The module that this kind needs, and the extra of noack that installs it."""
+    scenario: ClassVar[str | None] = None
+    """A shipped scenario with this kind, for tests and benchmarks."""
+    variants: ClassVar[tuple[dict[str, Any], ...]] = ({},)
+    """Settings that tests and benchmarks try one by one."""
+
+    kind: str
+    """What the plant is."""
+
+    @property
+    def settling_s(self) -> float:
+        """Time after which x and u determine z; 0 if they always do."""
+        return 0.0
+
+    @property
+    def internal_names(self) -> tuple[str, ...]:
+        """Names of the entries of z that are recorded; empty if z is not recorded."""
+        return ()
+
+    def check(self, n: int, m: int) -> None:
+        """Require that the plant can have n states and m inputs.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        for what, names, count in (("states", self.states, n), ("inputs", self.inputs, m)):
+            if names and len(names) != count:
+                raise ValueError(
+                    f"plant.system: it has {len(names)} {what} ({', '.join(names)}); "
+                    f"the model has {count}"
+                )
+
+    def require_installed(self) -> None:
+        """Check that the module that this kind needs is installed.
+
+        Raises:
+            CallerError: it is not.
+        """
+        if self.needs is not None and find_spec(self.needs[0]) is None:
+            raise CallerError(
+                f'plant.system.kind: "{self.kind}" needs a package that is not installed; '
+                f"pip install 'noack[{self.needs[1]}]'"
+            )
+
+    def linearisation(self) -> tuple[Matrix, Matrix] | None:
+        """Return A and B at the operating point, (n, n) and (n, m), if they are known exactly.
+
+        None: finite differences of the system's motion give them.
+        """
+        return None
+
+    def prepare(self) -> None:
+        """Do what takes long once per machine, before a run: compile equations.
+
+        Raises:
+            CallerError: what the plant needs is not installed.
+        """
+
+    def system(self, start: PlantStart) -> PlantSystem:
+        """Return the system at x(0).
+
+        Raises:
+            CallerError: what the plant needs is missing, or differs from the settings.
+        """
+        raise NotImplementedError
+
+
+def _same(values: Vector) -> Vector:
+    return values
+
+
+@dataclass(frozen=True)
+class PlantEquations:
+    """``dz/dt = f(t, z, v)`` with x = output(z) and v = physical(u)."""
+
+    derivative: Derivative
+    """f."""
+    initial: Callable[[Vector], Vector] = _same
+    """z(0), (N,), as a function of x(0), (n,)."""
+    output: Callable[[Vector], Vector] = _same
+    """x, (n,), as a function of z."""
+    physical: Callable[[Vector], Vector] = _same
+    """v, (m,), as a function of u."""
+    relative: float = 1e-9
+    """Relative tolerance of each step of the integrator."""
+    absolute: float = 1e-12
+    """Absolute tolerance, in z's units."""
+    is_recorded: bool = False
+    """Whether z is recorded."""
+
+
+class EquationSettings(PlantSettings):
+    """Settings of a plant that is given by differential equations."""
+
+    def equations(self) -> PlantEquations:
+        """Return the equations.
+
+        Raises:
+            CallerError: what the plant needs is not installed, or the settings exclude each other.
+        """
+        raise NotImplementedError
+
+    def system(self, start: PlantStart) -> PlantSystem:
+        """Return the equations, integrated from x(0) on."""
+        # The integrator takes time to import and 40 MB, which other plants do not need.
+        from noack.plants.systems.ode_integrator import OdeSystem
+
+        return OdeSystem(self.equations(), start.x0)

@@ -1,0 +1,155 @@
+"""A class of the user's own: equations, or an object that advances itself.
+
+Its code runs in the plant's process. An exception of the user's code stops the motion, not the run.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.plants.plant_settings import Names, PlantEquations, PlantSettings, PlantStart
+from noack.plants.systems.plant_system import PlantSystem, SystemFailedError
+from noack.settings.user_class import (
+    ClassSettings,
+    failure_text,
+    new_instance,
+    read_only,
+    real_vector,
+)
+
+_PLACE = "plant.system"
+_START_TOLERANCE = 1e-6
+"""Relative difference that x(0) of the scenario and of the class may have."""
+
+
+class PythonPlantSettings(ClassSettings, PlantSettings):
+    """A class of the user's own, from an installed package or from a file.
+
+    Its code runs in the plant's process; docs/plants.md says what the class must offer.
+    """
+
+    group: ClassVar = "noack.plants"
+
+    kind: Literal["python"]
+    """What the plant is."""
+    on_record: Names = ()
+    """Names of the entries of its own state z; z is recorded if they are given."""
+
+    @property
+    def internal_names(self) -> tuple[str, ...]:
+        """Names of the entries of z."""
+        return self.on_record
+
+    def system(self, start: PlantStart) -> PlantSystem:
+        """Return an object of the class, at x(0)."""
+        return PythonSystem(self, start.x0, start.B.shape[1])
+
+
+class PythonSystem:
+    """An object of a user's class, at x(0).
+
+    It has either ``derivative(t_s, z, u)``, dz/dt under the held input, and if z is not x also
+    ``state(x0)`` and ``output(z)``; or ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, and
+    ``z`` if z is to be recorded. ``docs/plants.md`` has examples.
+
+    Args:
+        settings: of a loaded scenario.
+        x0: x(0), shape (n,).
+        m: number of inputs.
+
+    Raises:
+        CallerError: the class does not exist, raises, or lacks what it must offer.
+    """
+
+    def __init__(self, settings: PythonPlantSettings, x0: Vector, m: int) -> None:
+        self._settings = settings
+        self._recorded = len(settings.on_record)
+        try:
+            plant, self.about = new_instance(settings, _PLACE)
+            self._system = self._system_of(plant, x0, m)
+            self.x, self.z = x0, np.zeros(self._recorded)
+            self._copy_state()
+        except CallerError:
+            raise
+        except SystemFailedError as error:
+            raise CallerError(str(error)) from None
+        except (Exception, SystemExit) as error:
+            raise CallerError(self._failure(error)) from None
+        if not np.all(np.abs(self.x - x0) <= _START_TOLERANCE * (np.abs(x0) + 1.0)):
+            raise CallerError(
+                f'{_PLACE}.name = "{settings.name}": x is {self.x.tolist()} at the start; '
+                f"plant.initial_state is {x0.tolist()}"
+            )
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Advance by one step."""
+        try:
+            self._system.advance(u, t_ns, dt_ns)
+            self._copy_state()
+        except (Exception, SystemExit) as error:
+            if isinstance(error, SystemFailedError):
+                raise
+            raise SystemFailedError(self._failure(error)) from None
+
+    def _copy_state(self) -> None:
+        self.x = real_vector("x", self._system.x, len(self.x))
+        if self._recorded:
+            self.z = real_vector("z", self._system.z, self._recorded)
+
+    def _system_of(self, plant: Any, x0: Vector, m: int) -> PlantSystem:
+        if hasattr(plant, "derivative") == hasattr(plant, "advance"):
+            both = "both derivative and" if hasattr(plant, "advance") else "neither derivative nor"
+            raise TypeError(f"it has {both} advance; one of them is needed")
+        if hasattr(plant, "advance"):
+            return _Stepping(plant, x0)
+        z0 = np.array(plant.state(x0.copy()) if hasattr(plant, "state") else x0, dtype=np.float64)
+        if z0.ndim != 1:
+            raise ValueError(f"state(x0) has shape {z0.shape}; a vector is needed")
+        if self._recorded and self._recorded != len(z0):
+            raise ValueError(
+                f"z has {len(z0)} entries; plant.system.on_record names {self._recorded}"
+            )
+        derivative = self._derivative(plant, len(z0))
+        derivative(0.0, z0, np.zeros(m))  # report its errors before the run
+        output = plant.output if hasattr(plant, "output") else np.copy
+        from noack.plants.systems.ode_integrator import OdeSystem
+
+        equations = PlantEquations(
+            derivative, lambda _: z0, output=output, is_recorded=bool(self._recorded)
+        )
+        return OdeSystem(equations, x0)
+
+    def _derivative(self, plant: Any, size: int) -> Callable[[float, Vector, Vector], Vector]:
+        def derivative(t_s: float, z: Vector, u: Vector) -> Vector:
+            try:
+                found = plant.derivative(t_s, read_only(z), read_only(u))
+                return real_vector("derivative(t_s, z, u)", found, size)
+            except (Exception, SystemExit) as error:
+                raise SystemFailedError(self._failure(error)) from None
+
+        return derivative
+
+    def _failure(self, error: BaseException) -> str:
+        return failure_text(self._settings, _PLACE, error)
+
+
+class _Stepping:
+    """An object that advances itself."""
+
+    def __init__(self, plant: Any, x0: Vector) -> None:
+        self._plant = plant
+        plant.start(x0.copy())
+
+    @property
+    def x(self) -> Any:
+        return self._plant.x
+
+    @property
+    def z(self) -> Any:
+        return self._plant.z
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        self._plant.advance(u.copy(), t_ns * 1e-9, dt_ns * 1e-9)

@@ -1,0 +1,339 @@
+"""A Functional Mock-up Unit: another tool's model, run by FMPy (FMI 2 and 3, co-simulation).
+
+By the standard it is told its start values and initialised at t = 0; from then on it is given the
+inputs, makes one ``doStep``, and is asked for its variables, at each step of the plant. Its code is
+native and runs in this process. What it prints is not kept; of its log the last complaint is.
+"""
+
+import contextlib
+import difflib
+import io
+import os
+import weakref
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.plants.fmu import FmuSettings
+from noack.plants.systems.native_code import quiet, temporary_folder
+from noack.plants.systems.plant_system import SystemFailedError
+from noack.settings.user_files import unchanged
+
+_WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
+"""Statuses of FMI."""
+_REAL = {"Real", "Float64", "Float32"}
+_TEXT = {"String"}
+_TRUTH = {"Boolean"}
+_READABLE = {"output", "local"}
+_ALIKE = 1e-6
+"""How far x(0) of the scenario and of the FMU may be apart, relative to its size."""
+_LONGEST = 300
+"""Of what is quoted, in characters."""
+
+
+class FmuSystem:
+    """An instance of an FMU, initialised at x(0).
+
+    Args:
+        settings: of a loaded scenario.
+        x0: x(0), shape (n,).
+
+    Raises:
+        CallerError: FMPy is missing; the FMU is not what the settings say; it cannot be started.
+    """
+
+    def __init__(self, settings: FmuSettings, x0: Vector) -> None:
+        settings.require_installed()
+        path = unchanged(settings, "plant.system")
+        self._place = f'plant.system.file = "{path.name}"'
+        self._operating_state = np.array(settings.operating_state or np.zeros_like(x0))
+        self._operating_input = np.array(
+            settings.operating_input or [0.0] * len(settings.input_variables)
+        )
+        self._log = _Log()
+        end = contextlib.ExitStack()
+        weakref.finalize(self, end.close)  # when it is not needed any more, or the process ends
+        try:
+            description = self._described(path)
+            self.about = _about(description)
+            self._instance = self._loaded(path, end, description)
+            self._start(settings, x0, description)
+        except CallerError:
+            end.close()
+            raise
+        except Exception as error:  # FMPy has no class of its own for most of what can be wrong
+            end.close()
+            self._wrong(f"cannot be started: {self._log.why(error)}")
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Set the inputs, make one communication step, read the variables."""
+        try:
+            with quiet():
+                self._inputs.set(u + self._operating_input)
+                done = self._instance.fmu.doStep(t_ns * 1e-9, dt_ns * 1e-9)
+                if done is not None and done[1]:
+                    raise RuntimeError("it wants the simulation to end")
+                self._read()
+        except Exception as error:  # as above
+            self._instance.status = getattr(error, "status", _ERROR)
+            raise SystemFailedError(f"{self._place}: {self._log.why(error)}") from None
+
+    def _read(self) -> None:
+        self.x = self._states.get() - self._operating_state
+        self.z = self._recorded.get()
+
+    def _wrong(self, message: str) -> NoReturn:
+        raise CallerError(f"{self._place}: {message}")
+
+    def _described(self, path: Path) -> Any:
+        """What the FMU says about itself."""
+        fmpy = _fmpy()
+        try:
+            with path.open("rb") as file:  # FMPy leaves those open that it cannot read
+                description = fmpy.read_model_description(file, validate=False)
+        except Exception as error:  # whatever a file that is no FMU leads to
+            self._wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
+        if description.fmiVersion.startswith("1."):
+            self._wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 can be run")
+        if description.coSimulation is None:
+            self._wrong("is not for co-simulation; export it as a co-simulation FMU")
+        return description
+
+    def _loaded(self, path: Path, end: contextlib.ExitStack, description: Any) -> "_Instance":
+        """Unpack and instantiate the FMU."""
+        fmpy, folder = _fmpy(), end.enter_context(temporary_folder())
+        fmpy.extract(str(path), str(folder))
+        self._require_binary(folder, description)
+        before = Path.cwd()
+        try:
+            with quiet(), contextlib.redirect_stdout(io.StringIO()):
+                fmu = fmpy.instantiate_fmu(
+                    str(folder), description, fmi_type="CoSimulation", logger=self._log.take
+                )
+        finally:
+            os.chdir(before)  # FMPy stays where the library is if it cannot be loaded
+        instance = _Instance(fmu)
+        end.callback(instance.release)
+        return instance
+
+    def _require_binary(self, folder: Path, description: Any) -> None:
+        fmpy = _fmpy()
+        modern = description.fmiVersion.startswith("3.")
+        platform = fmpy.platform_tuple if modern else fmpy.platform
+        name = description.coSimulation.modelIdentifier + fmpy.sharedLibraryExtension
+        if (folder / "binaries" / platform / name).is_file():
+            return
+        there = sorted(one.name for one in (folder / "binaries").glob("*") if one.is_dir())
+        has = f"binaries for {', '.join(there)} only" if there else "no binaries"
+        sources = (folder / "sources").is_dir()
+        hint = "; `fmpy compile` can make it of the sources that it has" if sources else ""
+        self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
+
+    def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
+        """Set the start values, initialise."""
+        fmu, variables = self._instance.fmu, _Variables(description)
+        self._states = _Port(fmu, variables.readable("state_variables", settings.state_variables))
+        self._inputs = _Port(fmu, variables.inputs("input_variables", settings.input_variables))
+        self._recorded = _Port(fmu, variables.real("on_record", settings.on_record))
+        initial = settings.initial_variables
+        if initial is None:
+            initial = settings.state_variables
+        start = _Port(fmu, variables.initial("initial_variables", initial))
+        parameters = [variables.parameter(*entry) for entry in settings.parameters.items()]
+        with quiet():
+            if description.fmiVersion == "2.0":
+                fmu.setupExperiment(startTime=0.0)
+            for variable, value in parameters:
+                _set(fmu, variable.type, [variable.valueReference], [value])
+            if initial:
+                start.set(x0 + self._operating_state)
+            fmu.enterInitializationMode()
+            self._inputs.set(self._operating_input)
+            fmu.exitInitializationMode()
+            self._instance.started = True
+            self._read()
+        scale = np.abs(x0) + np.abs(self._operating_state) + 1.0
+        if not np.all(np.abs(self.x - x0) <= _ALIKE * scale):
+            raise CallerError(
+                f"plant.initial_state: it is {x0.tolist()}, but the FMU begins at "
+                f"{self.x.tolist()}; plant.system.initial_variables names what sets it"
+            )
+
+
+class _Instance:
+    """An FMU's instance, and what the standard lets be done with it."""
+
+    def __init__(self, fmu: Any) -> None:
+        self.fmu = fmu
+        self.started = False
+        self.status = 0
+
+    def release(self) -> None:
+        """Terminate and free it, as far as it can be."""
+        if self.status >= _FATAL:
+            return
+        with quiet():
+            if self.started and self.status <= _WARNING:
+                with contextlib.suppress(Exception):
+                    self.fmu.terminate()
+            with contextlib.suppress(Exception):
+                self.fmu.freeInstance()
+
+
+class _Log:
+    """What an FMU said last of all that is worse than a warning."""
+
+    def __init__(self) -> None:
+        self._last = ""
+
+    def take(self, *said: Any) -> None:
+        """FMI 2 has (environment, name, status, category, message), FMI 3 no name."""
+        status, message = said[-3], said[-1]
+        if status > _WARNING and message:
+            self._last = _short(message.decode(errors="replace"))
+
+    def why(self, error: Exception) -> str:
+        """An error, with what the FMU said of it."""
+        return f"{_short(error)} ({self._last})" if self._last else _short(error)
+
+
+class _Variables:
+    """The variables of an FMU, checked for what they are to be.
+
+    Every method raises a CallerError, one line, for a variable that is not there or not fit.
+    """
+
+    def __init__(self, description: Any) -> None:
+        self._known: Mapping[str, Any] = {one.name: one for one in description.modelVariables}
+
+    def readable(self, key: str, names: Sequence[str]) -> list[Any]:
+        """Real outputs and locals."""
+        found = self.real(key, names)
+        for one in found:
+            if one.causality not in _READABLE:
+                _refuse(key, one, f"is neither output nor local, but {one.causality}")
+        return found
+
+    def inputs(self, key: str, names: Sequence[str]) -> list[Any]:
+        """Real inputs."""
+        found = self.real(key, names)
+        for one in found:
+            if one.causality != "input":
+                _refuse(key, one, f"is no input, but {one.causality}")
+        return found
+
+    def initial(self, key: str, names: Sequence[str]) -> list[Any]:
+        """Real variables that can be set before the initialisation."""
+        found = self.real(key, names)
+        for one in found:
+            if not _settable(one):
+                _refuse(
+                    key, one, "cannot be set at the start; name variables whose initial is exact "
+                    "or approx, or none: []",
+                )  # fmt: skip
+        return found
+
+    def real(self, key: str, names: Sequence[str]) -> list[Any]:
+        """Real scalars."""
+        found = [self._named(key, name) for name in names]
+        twice = next((name for name, count in Counter(names).items() if count > 1), None)
+        if twice is not None:
+            raise CallerError(f'plant.system.{key}: "{twice}" stands there twice')
+        for one in found:
+            if one.type not in _REAL:
+                _refuse(key, one, f"is of type {one.type}; real numbers are needed")
+            if one.dimensions:
+                _refuse(key, one, "is an array; name scalar variables")
+        return found
+
+    def parameter(self, name: str, value: object) -> tuple[Any, Any]:
+        """A variable and the start value that it gets."""
+        one = self._named("parameters", name)
+        kinds: tuple[type, ...]
+        if one.type in _REAL:
+            kinds, needed = (int, float), "a number"
+        elif one.type in _TRUTH:
+            kinds, needed = (bool,), "true or false"
+        elif one.type in _TEXT:
+            kinds, needed = (str,), "a text"
+        else:
+            kinds, needed = (int,), "a whole number"
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+            _refuse("parameters", one, f"is of type {one.type}; give {needed}, not {value!r}")
+        if one.causality == "input":
+            _refuse("parameters", one, "is an input; its value at rest is operating_input")
+        if not _settable(one):
+            _refuse("parameters", one, "cannot be set at the start")
+        return one, value
+
+    def _named(self, key: str, name: str) -> Any:
+        if name in self._known:
+            return self._known[name]
+        close = difflib.get_close_matches(name, self._known, n=1)
+        some = ", ".join(list(self._known)[:8])
+        hint = f"did you mean {close[0]}?" if close else f"it has {some}"
+        raise CallerError(f'plant.system.{key}: the FMU has no variable "{name}"; {hint}')
+
+
+def _refuse(key: str, variable: Any, why: str) -> NoReturn:
+    raise CallerError(f'plant.system.{key}: the FMU\'s "{variable.name}" {why}')
+
+
+class _Port:
+    """Real variables of an instance, read or set together."""
+
+    def __init__(self, fmu: Any, variables: Sequence[Any]) -> None:
+        self._fmu, self._size = fmu, len(variables)
+        places: dict[str, tuple[list[int], list[int]]] = {}
+        for place, variable in enumerate(variables):
+            at, references = places.setdefault(variable.type, ([], []))
+            at.append(place)
+            references.append(variable.valueReference)
+        self._places = [(kind, at, references) for kind, (at, references) in places.items()]
+
+    def get(self) -> Vector:
+        """Their values."""
+        values = np.empty(self._size)
+        for kind, at, references in self._places:
+            values[at] = getattr(self._fmu, f"get{kind}")(references)
+        return values
+
+    def set(self, values: Vector) -> None:
+        """Set them."""
+        for kind, at, references in self._places:
+            _set(self._fmu, kind, references, values[at].tolist())
+
+
+def _set(fmu: Any, kind: str, references: Sequence[int], values: Sequence[Any]) -> None:
+    if kind == "Enumeration":
+        kind = "Int64" if hasattr(fmu, "setInt64") else "Integer"
+    getattr(fmu, f"set{kind}")(references, values)
+
+
+def _settable(variable: Any) -> bool:
+    from fmpy.simulation import settable_in_instantiated
+
+    return bool(settable_in_instantiated(variable))
+
+
+def _about(description: Any) -> str:
+    """An FMU in one line."""
+    tool = description.generationTool or "a tool that it does not name"
+    needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
+    return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"
+
+
+def _fmpy() -> Any:
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints what its platform lacks
+        import fmpy
+    return fmpy
+
+
+def _short(what: object) -> str:
+    text = " ".join(str(what).split())
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

@@ -1,0 +1,98 @@
+"""Equations that are integrated from step to step with error control."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.integrate import ode
+
+from noack.core.linear_systems import Vector
+from noack.plants.plant_settings import PlantEquations
+from noack.plants.systems.plant_system import SystemFailedError
+
+_MAX_STEPS = 10_000
+_ESCAPE = 1e4
+"""A state that grows by this factor within a step of the plant escapes to infinity."""
+_GAVE_UP = {
+    -2: f"the integrator needs more than {_MAX_STEPS:,} steps from one sample to the next",
+    -3: "the integrator's steps become too small; the equations jump there",
+    -4: "they are too stiff for an explicit integrator",
+}
+"""Status of dopri5, in words."""
+
+
+class OdeSystem:
+    """``dz/dt = f(t, z, v)`` under a held input: Dormand & Prince's pair of orders 5 and 4.
+
+    The integrator restarts at every step of the plant, as the input jumps there. So the result
+    depends on z, v and t alone, and a replay repeats it bit for bit. If z escapes to infinity, or f
+    cannot be evaluated, z is NaN from then on, and the run has diverged.
+
+    Args:
+        equations: f, its output and input, and tolerances.
+        x0: x(0), shape (n,).
+    """
+
+    def __init__(self, equations: PlantEquations, x0: Vector) -> None:
+        self._equations = equations
+        self._state = np.array(equations.initial(x0), dtype=np.float64)
+        self._raised: list[BaseException] = []
+        self._integrator = ode(self._guarded)
+        self._integrator.set_integrator(
+            "dopri5", rtol=equations.relative, atol=equations.absolute, nsteps=_MAX_STEPS,
+            verbosity=-1,
+        )  # fmt: skip
+
+    @property
+    def x(self) -> Vector:
+        """The deviation from the operating point, shape (n,)."""
+        return self._equations.output(self._state)
+
+    @property
+    def z(self) -> Vector:
+        """The system's own state, shape (N,); empty if it is not recorded."""
+        return self._state if self._equations.is_recorded else self._state[:0]
+
+    def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
+        """Integrate over one step.
+
+        Raises:
+            SystemFailedError: the tolerance cannot be met, although f is finite.
+            BaseException: f raised it, and it is not an arithmetic error.
+        """
+        t_s = t_ns * 1e-9
+        self._raised.clear()
+        self._integrator.set_f_params(self._equations.physical(u))
+        self._integrator.set_initial_value(self._state, t_s)
+        with warnings.catch_warnings(action="ignore"):  # its status says the same
+            end = self._integrator.integrate(t_s + dt_ns * 1e-9)
+        reached = np.asarray(end, dtype=np.float64)
+        for error in self._raised:
+            # Far outside the equations' domain an arithmetic error is divergence.
+            if not isinstance(error, ArithmeticError | ValueError):
+                raise error
+            reached = np.full_like(self._state, np.nan)
+        if not self._integrator.successful():
+            self._require_divergence(reached)
+            reached = np.full_like(self._state, np.nan)
+        self._state = reached
+
+    def _require_divergence(self, z: Vector) -> None:
+        """Raise SystemFailedError if the integrator gave up although f is finite and z small."""
+        with np.errstate(all="ignore"):
+            slope = np.asarray(self._guarded(self._integrator.t, z, *self._integrator.f_params))
+            escaped = not np.linalg.norm(z) < _ESCAPE * np.linalg.norm(self._state)
+        if np.isfinite(slope).all() and not escaped:
+            why = _GAVE_UP.get(self._integrator.get_return_code(), "the tolerance cannot be met")
+            raise SystemFailedError(
+                f"the plant's equations cannot be integrated at {self._integrator.t:.6g} s: {why}"
+            )
+
+    def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
+        """Return f, or NaN after an exception: the integrator cannot be stopped by one."""
+        if not self._raised:
+            try:
+                return self._equations.derivative(t_s, z, v)
+            except BaseException as error:
+                self._raised.append(error)
+        return np.full_like(z, np.nan)

@@ -1,0 +1,76 @@
+"""What a system is to the loop near its operating point: ẋ ≈ A x + B u."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import logm
+
+from noack.core.linear_systems import Matrix, Vector
+from noack.plants.systems.plant_system import PlantSystem
+
+_STEP_NS = 10_000_000
+_OFF = 1e-4
+_SINGULAR = 1e-9
+"""Where what is left of small deviations spans no more than this of them, x is no state."""
+_AHEAD = 10
+_MISSED = 0.05
+"""Nor where A and B miss more than this share of x so many steps ahead."""
+
+
+def linearise(
+    system_at: Callable[[Vector], PlantSystem],
+    n: int,
+    m: int,
+    *,
+    off: float = _OFF,
+    settling_s: float = 0.0,
+) -> tuple[Matrix, Matrix]:
+    """Linearise a system about x = 0, u = 0 from what held inputs make of small deviations.
+
+    A system of more states than x has a Jacobian that says little of what a loop sees that sees x
+    only. So of n + m small deviations of x(0) and u, each on both sides, x is taken after a time in
+    which the rest of the state has settled, and a step of 10 ms later: by central differences
+    x(t + h) = Ad x(t) + Bd u, and the matrix logarithm of [[Ad, Bd], [0, I]] over h gives A and B.
+
+    Args:
+        system_at: makes the system at an initial state, shape (n,).
+        n: number of states.
+        m: number of inputs.
+        off: how far from the operating point it is looked at, in each coordinate's units.
+        settling_s: for how long to wait; 0 for a system whose state is x.
+
+    Returns:
+        A and B, shapes (n, n) and (n, m), per second; NaN where the system has no answer, or x is
+        no state of it: its entries depend on each other, or do not tell what follows.
+    """
+    settling = round(settling_s * 1e9 / _STEP_NS)
+    ahead = _AHEAD if settling else 1
+
+    def followed(x0: Vector, u: Vector) -> Matrix:
+        system, met = system_at(x0), []
+        for step in range(settling + ahead):
+            met.append(system.x)
+            system.advance(u, step * _STEP_NS, _STEP_NS)
+        return np.array([*met, system.x])[[settling, settling + 1, -1]]
+
+    before, after, later = (np.eye(n + m) for _ in range(3))
+    for i in range(n + m):
+        aside = np.zeros(n + m)
+        aside[i] = off
+        there, back = (followed(sign * aside[:n], sign * aside[n:]) for sign in (1.0, -1.0))
+        before[:n, i], after[:n, i], later[:n, i] = (there - back) / (2 * off)
+    unknown = np.full((n, n), np.nan), np.full((n, m), np.nan)
+    if not (np.isfinite(before).all() and np.isfinite(later).all()):
+        return unknown
+    if np.linalg.svd(before, compute_uv=False)[-1] < _SINGULAR:
+        return unknown
+    step = after @ np.linalg.inv(before)
+    missed = np.linalg.matrix_power(step, ahead) @ before - later
+    if np.linalg.norm(missed) > _MISSED * np.linalg.norm(later[:n]):
+        return unknown
+    with warnings.catch_warnings(action="ignore"):  # of what is singular, which is seen next
+        generator = np.real(logm(step)) / (_STEP_NS * 1e-9)
+    if not np.isfinite(generator).all():
+        return unknown
+    return generator[:n, :n], generator[:n, n:]

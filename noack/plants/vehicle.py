@@ -1,0 +1,221 @@
+"""A road vehicle: the vehicle models of CommonRoad, steered by a servo, along a lane.
+
+The library's equations and parameters are used unchanged. The lane is its x-axis. The lateral axis
+of the lane models (:mod:`noack.config.named_models`) points the other way: V and Y_g have the
+opposite sign of its lateral velocity and y; yaw, yaw rate and steering angle have the same sign.
+"""
+
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Vector
+from noack.plants.plant_settings import EquationSettings, PlantEquations
+from noack.plants.systems import vehicle_equations
+from noack.plants.systems.vehicle_equations import equations, library
+from noack.settings.section import Positive
+
+_CORE = ("x_position", "y_position", "steering_angle", "speed", "yaw")
+_SINGLE_TRACK = (*_CORE, "yaw_rate", "slip_angle")
+_MULTI_BODY = (
+    *_CORE, "yaw_rate",
+    "roll", "roll_rate", "pitch", "pitch_rate", "lateral_velocity", "height", "climb_rate",
+    "front_roll", "front_roll_rate", "front_lateral_velocity", "front_height", "front_climb_rate",
+    "rear_roll", "rear_roll_rate", "rear_lateral_velocity", "rear_height", "rear_climb_rate",
+    "left_front_wheel_rate", "right_front_wheel_rate",
+    "left_rear_wheel_rate", "right_rear_wheel_rate",
+    "front_axle_shift", "rear_axle_shift",
+)  # fmt: skip
+
+
+_PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}
+
+
+class VehicleSettings(EquationSettings):
+    """A road vehicle of CommonRoad's vehicle models, beside the lane that the x-axis is.
+
+    Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is that of the lane models; of the
+    library's coordinates V and Y_g have the opposite sign. u is the requested steering angle.
+    """
+
+    states: ClassVar = (
+        "lateral velocity V, m/s", "yaw rate r, rad/s", "yaw psi, rad", "lateral position Y_g, m",
+    )  # fmt: skip
+    inputs: ClassVar = ("steering angle, rad",)
+    needs: ClassVar = ("vehiclemodels", "vehicle")
+    scenario: ClassVar = "lane_vehicle"
+    variants: ClassVar = (
+        {"model": "kinematic"}, {"model": "single_track"}, {"model": "drift"},
+        {"model": "multi_body"},
+    )  # fmt: skip
+
+    kind: Literal["vehicle"]
+    """What the plant is."""
+    model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"
+    """The library's model: ks (kst of the truck), st, std or mb, in order of their states."""
+    parameters: Literal["ford_escort", "bmw_320i", "vw_vanagon", "truck"] = "bmw_320i"
+    """The library's parameter set, 1 to 4; the truck is kinematic only."""
+    speed_m_per_s: Positive = 15.0
+    """The initial speed, which the vehicle keeps."""
+    speed_gain_per_s: Annotated[FiniteFloat, Field(ge=0, le=100)] = 1.0
+    """Acceleration per deviation from this speed."""
+    steering_s: Annotated[FiniteFloat, Field(ge=0.001, le=10)] = 0.05
+    """Time constant of the steering servo; the vehicle limits its angle and its rate."""
+    friction: Annotated[FiniteFloat, Field(gt=0, le=2)] = 1.0
+    """The road's friction, as a multiple of the tyres' own; for "drift" and "multi_body"."""
+
+    @property
+    def settling_s(self) -> float:
+        """Eight time constants of the steering."""
+        return 8 * self.steering_s
+
+    @property
+    def library_model(self) -> str:
+        """The library's name of the model."""
+        kinematic = "kst" if self.parameters == "truck" else "ks"
+        names = {"kinematic": kinematic, "single_track": "st", "drift": "std", "multi_body": "mb"}
+        return names[self.model]
+
+    @property
+    def internal_names(self) -> tuple[str, ...]:
+        """The states of the library's model, SI units."""
+        kinematic = (*_CORE, "hitch_angle") if self.parameters == "truck" else _CORE
+        return {
+            "kinematic": kinematic,
+            "single_track": _SINGLE_TRACK,
+            "drift": (*_SINGLE_TRACK, "front_wheel_rate", "rear_wheel_rate"),
+            "multi_body": _MULTI_BODY,
+        }[self.model]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.parameters == "truck" and self.model != "kinematic":
+            raise ValueError(
+                f'parameters: the library has no masses for its "truck", which "{self.model}" '
+                'needs; take model = "kinematic" or another vehicle'
+            )
+        if self.friction != 1 and self.model in ("kinematic", "single_track"):
+            raise ValueError(
+                f'friction: the model "{self.model}" has none; "drift" and "multi_body" have'
+            )
+        return self
+
+    def prepare(self) -> None:
+        """Compile the equations, once per machine."""
+        self.require_installed()
+        if not vehicle_equations.is_compiled(self.library_model):
+            vehicle_equations.compiled_dynamics(self.library_model)
+
+    def equations(self) -> PlantEquations:
+        """Return the equations; z is the state of the library's model, the steering straight.
+
+        The servo turns the wheels by (u − δ)/T within the limits of angle and rate, and the vehicle
+        accelerates by k (requested speed − speed), within its limits.
+
+        Raises:
+            CallerError: the library is not installed, or the vehicle cannot reach the speed.
+        """
+        self.require_installed()
+        model, parameters = _MODELS[self.library_model], _parameters_of(self)
+        speed, servo_s, gain = self.speed_m_per_s, self.steering_s, self.speed_gain_per_s
+        if speed > (fastest := parameters.longitudinal.v_max):
+            raise CallerError(
+                f"plant.system.speed_m_per_s: the maximum speed of a {self.parameters} is "
+                f"{fastest:g} m/s; it cannot keep {speed:g}"
+            )
+        rates = equations(self.library_model, parameters)
+        lowest, highest = parameters.steering.min, parameters.steering.max
+
+        def derivative(t_s: float, z: Vector, v: Vector) -> Vector:
+            requested = min(max(float(v[0]), lowest), highest)
+            return rates(z, (requested - float(z[2])) / servo_s, gain * (speed - float(z[3])))
+
+        return PlantEquations(
+            derivative,
+            initial=lambda x0: np.array(model.start(x0, speed, parameters), dtype=np.float64),
+            output=model.output(parameters),
+            relative=model.relative,
+            absolute=1e-3 * model.relative,
+            is_recorded=True,
+        )
+
+
+class _Model(NamedTuple):
+    """One of the library's models."""
+
+    start: Callable[[Vector, float, Any], list[float]]
+    """z(0) from x(0), the speed and the parameters."""
+    output: Callable[[Any], Callable[[Vector], Vector]]
+    """x as a function of z, given the parameters."""
+    relative: float = 1e-9
+    """Relative tolerance of the integration."""
+
+
+@cache
+def _parameters_of(settings: VehicleSettings) -> Any:
+    number = _PARAMETERS[settings.parameters]
+    parameters = library(f"parameters_vehicle{number}")()
+    parameters.tire.p_dx1 *= settings.friction
+    parameters.tire.p_dy1 *= settings.friction
+    return parameters
+
+
+def _start(x0: Vector, speed: float, parameters: Any) -> list[float]:
+    sideways, rate, yaw, lateral = x0.tolist()
+    slip = math.atan2(-sideways, speed)
+    return [0.0, -lateral, 0.0, math.hypot(sideways, speed), yaw, rate, slip]
+
+
+def _output(parameters: Any) -> Callable[[Vector], Vector]:
+    def output(z: Vector) -> Vector:
+        return np.array([-z[3] * math.sin(z[6]), z[5], z[4], -z[1]])
+
+    return output
+
+
+def _start_kinematic(x0: Vector, speed: float, parameters: Any) -> list[float]:
+    # Its reference point is the rear axle; V follows from r, and the steering sets r.
+    _, rate, yaw, lateral = x0.tolist()
+    steering = math.atan(rate * (parameters.a + parameters.b) / speed)
+    return [0.0, -lateral - parameters.b * math.sin(yaw), steering, speed, yaw]
+
+
+def _output_kinematic(parameters: Any) -> Callable[[Vector], Vector]:
+    behind, wheelbase = parameters.b, parameters.a + parameters.b
+
+    def output(z: Vector) -> Vector:
+        rate = z[3] * math.tan(z[2]) / wheelbase
+        return np.array([-behind * rate, rate, z[4], -z[1] - behind * math.sin(z[4])])
+
+    return output
+
+
+def _start_drift(x0: Vector, speed: float, parameters: Any) -> list[float]:
+    started: list[float] = library("init_std")(_start(x0, speed, parameters), parameters)
+    return started
+
+
+def _start_multi_body(x0: Vector, speed: float, parameters: Any) -> list[float]:
+    started: list[float] = library("init_mb")(_start(x0, speed, parameters), parameters)
+    return started
+
+
+def _output_multi_body(parameters: Any) -> Callable[[Vector], Vector]:
+    def output(z: Vector) -> Vector:
+        return np.array([-z[10], z[5], z[4], -z[1]])
+
+    return output
+
+
+_MODELS = {
+    "ks": _Model(_start_kinematic, _output_kinematic),
+    "kst": _Model(lambda *args: [*_start_kinematic(*args), 0.0], _output_kinematic),
+    "st": _Model(_start, _output),
+    "std": _Model(_start_drift, _output, relative=1e-7),
+    "mb": _Model(_start_multi_body, _output_multi_body, relative=1e-6),
+}

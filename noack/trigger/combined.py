@@ -1,0 +1,65 @@
+"""What the policies have in common that combine a rule with an interval."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from noack.core.linear_systems import Matrix
+from noack.settings.matrices import Rows
+from noack.trigger.policy_settings import Interval, PolicySettings
+from noack.trigger.trigger_policy import Policy
+
+if TYPE_CHECKING:
+    AnyTrigger = PolicySettings  # noack.config.triggers inserts the union of all policies
+
+
+class CombinedSettings(PolicySettings):
+    """Settings of a policy that combines a rule with an interval."""
+
+    rule: "AnyTrigger"
+    """The rule that is combined."""
+    interval_s: Interval
+    """Time since the last event."""
+
+    @property
+    def weight(self) -> Rows | None:
+        """W of the rule."""
+        return self.rule.weight
+
+    @property
+    def largest_threshold(self) -> float:
+        """That of the rule."""
+        return self.rule.largest_threshold
+
+    @property
+    def least_threshold(self) -> float | None:
+        """That of the rule."""
+        return self.rule.least_threshold
+
+    def check(self, n: int, why: str) -> None:
+        """Require that the rule fits n states."""
+        try:
+            self.rule.check(n, why)
+        except ValueError as error:
+            raise ValueError(str(error).replace("trigger.", "trigger.rule.", 1)) from None
+
+    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
+        """Require that the rule's sampling period fits the time between measurements."""
+        self.rule.check_period(measured_ns, f"{key}.rule")
+
+
+@dataclass(frozen=True)
+class CombinedTrigger:
+    """A rule with an interval."""
+
+    rule: Policy
+    interval_ns: int
+
+    @property
+    def weight(self) -> Matrix | None:
+        """W of the rule."""
+        return self.rule.weight
+
+    @property
+    def initial_dynamic_variable(self) -> float:
+        """η at the start, of the rule."""
+        return self.rule.initial_dynamic_variable

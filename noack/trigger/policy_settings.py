@@ -1,0 +1,163 @@
+"""What the settings of every trigger policy have.
+
+A policy is one file of this folder. The file holds a subclass of :class:`PolicySettings` with a
+field ``policy``, and the behaviour that the settings describe;
+:mod:`noack.config.triggers` finds it there.
+"""
+
+from typing import TYPE_CHECKING, Annotated, ClassVar, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat
+
+from noack.core.clock import NS_PER_S
+from noack.core.errors import CallerError
+from noack.core.linear_systems import Matrix, spectral_abscissa
+from noack.settings.matrices import Rows, require_shape
+from noack.settings.section import ScenarioSection
+from noack.trigger.trigger_policy import Policy
+
+Size = Annotated[FiniteFloat, Field(ge=1e-15, le=1e15)]
+Share = Annotated[FiniteFloat, Field(gt=0, le=1e9)]
+Interval = Annotated[FiniteFloat, Field(ge=1e-9, le=1e7)]
+
+
+class ModelMatrices(NamedTuple):
+    """The model and the gain that sensor and controller know."""
+
+    A: Matrix
+    """Â, (n, n)."""
+    B: Matrix
+    """B̂, (n, m)."""
+    K: Matrix
+    """Gain, (m, n)."""
+
+
+class PolicySettings(ScenarioSection):
+    """Settings of a trigger policy."""
+
+    events_may_accumulate: ClassVar[bool] = False
+    """Whether events of this policy alone may accumulate where updates are lost."""
+    at_start_only: ClassVar[tuple[str, ...]] = ()
+    """Keys that describe the start of a run and cannot change later."""
+
+    policy: str
+
+    if TYPE_CHECKING:
+
+        @property
+        def weight(self) -> Rows | None:
+            """W of the norm ‖v‖_W; None is the identity."""
+            return None
+
+    @classmethod
+    def example(cls, n: int) -> Self | None:
+        """Return settings for n states of size 1, for tests and benchmarks; None: no general ones.
+
+        Args:
+            n: number of states.
+        """
+        raise NotImplementedError
+
+    def trigger_policy(self, model: ModelMatrices) -> Policy:
+        """Return the behaviour that these settings describe.
+
+        Raises:
+            CallerError: the policy cannot be used with this model.
+        """
+        raise NotImplementedError
+
+    @property
+    def description(self) -> str:
+        """The condition under which the sensor transmits, in one line."""
+        raise NotImplementedError
+
+    @property
+    def beyond_exact(self) -> str | None:
+        """Why exact simulation cannot apply the policy; None if it can."""
+        return None
+
+    @property
+    def largest_threshold(self) -> float:
+        """The largest constant that ‖e_s‖_W is compared with; 0 if there is none."""
+        return 0.0
+
+    @property
+    def least_threshold(self) -> float | None:
+        """The threshold of ‖e_s‖_W never falls below this; None: there is no such threshold."""
+        return None
+
+    def check(self, n: int, why: str) -> None:
+        """Require matrices of the right shapes for n states.
+
+        Raises:
+            ValueError: a matrix has another shape, or is not allowed.
+        """
+
+    def check_period(self, measured_ns: int, key: str = "trigger") -> None:
+        """Require that the policy's own sampling period fits the time between measurements.
+
+        Args:
+            measured_ns: time between measurements.
+            key: of the policy's table, for messages.
+
+        Raises:
+            ValueError: the period is not a whole number of that time.
+        """
+
+
+class WeightedSettings(PolicySettings):
+    """Settings of a policy with a norm of its own."""
+
+    weight: Rows | None = None
+    """W of the norm ‖v‖_W = ‖W v‖₂ by rows, n x n, invertible; the identity unless given."""
+
+    @property
+    def weight_matrix(self) -> Matrix | None:
+        """W, shape (n, n); None is the identity."""
+        return None if self.weight is None else np.array(self.weight)
+
+    def check(self, n: int, why: str) -> None:
+        """Require an invertible W of shape (n, n)."""
+        require_shape(self.weight, "trigger.weight", (n, n), why)
+        if self.weight is not None and np.linalg.matrix_rank(np.array(self.weight)) < n:
+            raise ValueError("trigger.weight: W must be invertible, this one is singular")
+
+
+class LyapunovFunctionSettings(WeightedSettings):
+    """Settings of a policy that uses a Lyapunov function of the model's closed loop."""
+
+    Q: Rows | None = None
+    """Q by rows, n x n, symmetric and positive definite; the identity unless given. P solves
+    AᵀP + PA = −Q of the closed loop A = Â + B̂K."""
+
+    def check(self, n: int, why: str) -> None:
+        """Require matrices of the right shapes, and a positive definite Q."""
+        super().check(n, why)
+        require_shape(self.Q, "trigger.Q", (n, n), why)
+        if self.Q is not None:
+            Q = np.array(self.Q)
+            if not np.allclose(Q, Q.T, rtol=1e-12, atol=0.0) or np.linalg.eigvalsh(Q)[0] <= 0:
+                raise ValueError("trigger.Q: must be symmetric and positive definite")
+
+    def lyapunov_function(self, model: ModelMatrices) -> tuple[Matrix, Matrix]:
+        """Return P and Q with AᵀP + PA = −Q of the model's closed loop, each (n, n).
+
+        Raises:
+            CallerError: the closed loop is not stable.
+        """
+        from scipy.linalg import solve_continuous_lyapunov
+
+        A = model.A + model.B @ model.K
+        if spectral_abscissa(A) >= 0:
+            raise CallerError(
+                "trigger.policy: this one needs a Lyapunov function, but Â + B̂K is not stable"
+            )
+        Q = np.eye(len(A)) if self.Q is None else np.array(self.Q)
+        P = np.asarray(solve_continuous_lyapunov(A.T, -Q), dtype=np.float64)
+        return (P + P.T) / 2, Q
+
+
+def nanoseconds(seconds: float) -> int:
+    """Return a time in whole nanoseconds."""
+    return round(seconds * NS_PER_S)

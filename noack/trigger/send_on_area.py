@@ -1,0 +1,55 @@
+"""Send-on-area: transmit when the integral of the sensor error since the last event exceeds δ.
+
+    ∫_{t_k}^{t} ‖e_s(τ)‖_W dτ > δ
+
+(Miskowicz, "Efficiency of Event-Based Sampling According to Error Energy Criterion", Sensors 10(3),
+2010, and his earlier integral criterion.) A small error that lasts is transmitted as well as a
+large one. Stability is practical. The minimum inter-event time is positive for bounded states, as
+e_s grows from 0 at a bounded rate. A live sensor integrates by the trapezoidal rule between
+measurements; exact simulation integrates e_s itself.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+from noack.core.linear_systems import Matrix
+from noack.trigger.policy_settings import ModelMatrices, Size, WeightedSettings
+from noack.trigger.trigger_condition import QuadraticForm, empty_map, error_map
+from noack.trigger.trigger_rule import TriggerRule
+
+
+class SendOnAreaSettings(WeightedSettings):
+    """Transmit when ∫‖e_s‖_W dt since the last event exceeds δ (Miskowicz)."""
+
+    policy: Literal["send_on_area"]
+    """The event-triggering policy."""
+    delta_s: Size
+    """δ, in the units of ‖W x‖ times seconds."""
+
+    @classmethod
+    def example(cls, n: int) -> Self:
+        """A small δ."""
+        return cls(policy="send_on_area", delta_s=0.02)
+
+    def trigger_policy(self, model: ModelMatrices) -> "SendOnAreaTrigger":
+        """Return the behaviour."""
+        return SendOnAreaTrigger(self.delta_s, self.weight_matrix)
+
+    @property
+    def description(self) -> str:
+        """The condition."""
+        return f"∫‖e_s‖ dt since the last event > {self.delta_s:g}"
+
+
+@dataclass(frozen=True)
+class SendOnAreaTrigger:
+    """Send-on-area; δ > 0 in the units of ‖W x‖ times seconds."""
+
+    delta_s: float
+    weight: Matrix | None = None
+    initial_dynamic_variable = 0.0
+
+    def trigger_rule(self, n: int) -> TriggerRule:
+        """The same after every event; the integral begins at 0 there."""
+        form = QuadraticForm(error_map(n, self.weight), empty_map(n))
+        return TriggerRule(form, floor=self.delta_s, integrates=True)

@@ -1,0 +1,72 @@
+import threading
+
+import pytest
+
+from netem.control.command_queue import CommandQueue
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.core.errors import CallerError, PeerError
+from tests.netem.control.relays import FakeRelay
+
+
+def test_the_relay_is_touched_in_its_own_thread_only(
+    relay: FakeRelay, commands: CommandQueue
+) -> None:
+    commands.snapshot()
+    commands.change("up", ["forward"], settings_of("loss 50%"))
+    (thread,) = relay.threads
+    assert thread != threading.get_ident()
+
+
+def test_a_change_says_since_when_it_holds(relay: FakeRelay, commands: CommandQueue) -> None:
+    relay.counters["up", "reverse"] = Counters(arrived=17)
+    commands.change("up", ["reverse"], settings_of("loss 50% mansd 1"))
+    relay.counters["up", "reverse"].arrived = 20
+    in_force = commands.snapshot().in_force
+    assert in_force["up", "reverse"].since.arrived == 17
+    assert in_force["up", "reverse"].words == "loss 50% mansd 1"
+    assert in_force["up", "forward"].since == Counters()
+    assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
+
+
+def test_an_errands_error_is_the_askers(commands: CommandQueue) -> None:
+    def refuse() -> None:
+        raise CallerError("no")
+
+    def expire() -> None:
+        raise TimeoutError("its own")
+
+    with pytest.raises(CallerError, match="no"):
+        commands.submit(refuse)
+    with pytest.raises(TimeoutError, match="its own"):
+        commands.submit(expire)
+    assert commands.submit(lambda: 7) == 7
+
+
+def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
+    commands = CommandQueue(relay)
+    found: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            commands.snapshot()
+        except PeerError as error:
+            found.append(error)
+
+    asker = threading.Thread(target=ask)
+    asker.start()
+    while asker.is_alive():
+        commands.close()  # whether it has asked already, or asks after this
+    assert [str(error) for error in found] == ["the emulator has ended"]
+    assert commands.look().links[0].name == "up"
+
+
+def test_a_relay_that_is_stuck_is_not_waited_for_forever(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("netem.control.command_queue._PATIENCE_S", 0.01)
+    commands = CommandQueue(relay)
+    with pytest.raises(PeerError, match="has not answered for"):
+        commands.snapshot()
+    commands.run_pending()  # what nobody waits for any more is not done
+    assert relay.threads == set()

@@ -1,0 +1,110 @@
+import argparse
+import io
+import json
+import os
+import pty
+import subprocess
+import sys
+import termios
+import threading
+from pathlib import Path
+
+import pytest
+
+from netem.control.emulator_session import running
+from netem.control.relay_attachments import Options, add_options, attached, options_of
+from noack.core.errors import CallerError, ExitStatus
+from tests.netem.control.processes import read_until, udp_socket
+from tests.netem.control.relays import FakeRelay
+
+
+def options(*arguments: str) -> Options:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    return options_of(parser.parse_args(arguments))
+
+
+def test_options() -> None:
+    assert options() == Options()
+    assert options("--control", "lab", "--stats", "0.5", "--view", "--stats-file", "x") == Options(
+        "lab", 0.5, Path("x"), view=True
+    )
+    assert options("--stats-file", "x") == Options(stats_s=1.0, stats_file=Path("x"))
+
+
+@pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "0.001"])
+def test_a_period_must_make_sense(period: str) -> None:
+    with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):
+        options("--stats", period)
+
+
+def test_lines_and_view_do_not_share_a_terminal() -> None:
+    with pytest.raises(CallerError, match="both use standard output"):
+        options("--stats", "1", "--view")
+
+
+def test_a_file_that_cannot_be_written_is_said_before_the_relay_runs(relay: FakeRelay) -> None:
+    wanted = Options(stats_s=1.0, stats_file=Path("/nowhere/x"))
+    with (
+        pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
+        attached(relay, wanted),
+    ):
+        pass
+
+
+def test_what_is_at_its_side_ends_with_the_relay(relay: FakeRelay, tmp_path: Path) -> None:
+    """Even if it ends before anyone has been served."""
+    threads = threading.active_count()
+    file = tmp_path / "lines"
+    interval = sys.getswitchinterval()
+    with attached(relay, Options("lab", 0.01, file)) as side:
+        assert running() == ["lab"]
+        assert sys.getswitchinterval() < interval
+        for _ in range(3):
+            side.commands.run_pending()
+        relay.counters["up", "forward"].arrived = 5
+        assert side.commands.look().links[0].forward.counters.arrived == 5
+    assert running() == []
+    assert threading.active_count() == threads
+    assert sys.getswitchinterval() == interval
+    last = file.read_text().splitlines()[-1]
+    assert json.loads(last)["links"][0]["forward"]["arrived"] == 5
+
+
+def test_a_full_disk_is_told_and_the_relay_goes_on(
+    relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    error = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", error)
+    with attached(relay, Options(stats_s=0.01, stats_file=Path("/dev/full"))) as side:
+        while not error.getvalue().endswith("\n"):
+            side.commands.run_pending()
+    assert error.getvalue() == (
+        "noack netem: statistics cannot be written to /dev/full "
+        "(No space left on device); the relay continues\n"
+    )
+
+
+def test_the_view_of_an_emulator_in_its_own_terminal() -> None:
+    terminal, end = pty.openpty()
+    termios.tcsetwinsize(end, (30, 80))
+    arguments = ["--listen", "127.0.0.1:0", "--engine", "plain", "--view", "loss", "100%"]
+    with (
+        udp_socket() as server,
+        subprocess.Popen(
+            [sys.executable, "-m", "netem", "--to", f"127.0.0.1:{server.getsockname()[1]}",
+             *arguments],
+            env=os.environ | {"TERM": "xterm-256color"}, stdin=end, stdout=end, stderr=end,
+        ) as process,
+    ):  # fmt: skip
+        try:
+            read_until(terminal, lambda text: "Ctrl-C ends" in text and "forward →" in text)
+            os.write(terminal, b"q")
+            rest = read_until(terminal, lambda text: text.count("Ctrl-C ends") == 1)
+            assert process.wait(60) == ExitStatus.OK
+        finally:
+            process.kill()
+    # What was said meanwhile, below the picture, is still to be read.
+    assert "forward →" in rest.partition("\x1b[?1049l")[2]
+    os.close(terminal)
+    os.close(end)

@@ -1,0 +1,166 @@
+"""The view as text, from statistics of constructed reports."""
+
+import io
+from collections.abc import Sequence
+
+import pytest
+from rich.console import Console
+
+from netem.control.command_queue import CommandQueue
+from netem.control.emulator_statistics import Statistics, statistics
+from netem.control.statistics_history import History
+from netem.control.statistics_view import plain_lines, render
+from netem.engine.relay_interface import LinkSpec
+from netem.rule_records import Counters
+from netem.words.words_to_settings import settings_of
+from noack.core.clock import NS_PER_S
+from tests.netem.control.relays import SETTINGS, FakeRelay, times
+
+
+def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
+    """In the k-th second, from 0, 1000 k datagrams of 100 bytes come on each link."""
+    commands, found, before = CommandQueue(relay), [], None
+    for second in range(seconds):
+        for name, way in relay.counters:
+            if way == "forward":
+                counters = relay.counters[name, way]
+                came = 1000 * second
+                counters.arrived += came
+                counters.arrived_bytes += 100 * came
+                counters.dropped += came // 5
+                counters.forced += came // 10
+                counters.delivered += came - came // 5 - came // 10
+                counters.forwarded += came - came // 5
+                counters.forwarded_bytes += 100 * (came - came // 5)
+                counters.longest_loss_burst = 2
+        relay.delays = times(*[10_000_000] * 98, 20_000_000, 20_000_000)
+        snapshot = commands.look()._replace(elapsed_ns=(second + 1) * NS_PER_S)
+        found.append(statistics(snapshot, before))
+        before = snapshot
+    return found
+
+
+def text_of(
+    relay: FakeRelay, width: int = 80, height: int | None = 24, seconds: int = 3
+) -> list[str]:
+    history = History()
+    for document in documents(relay, seconds):
+        history.add(document)
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height or 24, color_system=None)
+    console.print(render(history, "lab", width, height))
+    return file.getvalue().splitlines()
+
+
+def line_of(lines: Sequence[str], label: str) -> str:
+    (line,) = [line for line in lines if line.startswith(f"│ {label} ")]
+    return " ".join(line.strip("│ ").split())
+
+
+def test_a_link_is_shown_with_both_directions() -> None:
+    lines = text_of(FakeRelay("up"))
+    assert len(lines) <= 24
+    assert all(len(line) <= 80 for line in lines)
+    assert lines[0].split() == ["lab", "0:03,", "plain"]
+    assert "up  127.0.0.1:5000 → [::1]:6000  1 client" in lines[1]
+    assert "loss 10% delay 10ms mansd 2" in lines[3]
+    assert "no impairment" in lines[3]
+    assert line_of(lines, "received") == "received 2,000/s 1.60 Mbit/s 0/s 0 bit/s"
+    assert line_of(lines, "forwarded") == "forwarded 1,600/s 1.28 Mbit/s 0/s 0 bit/s"
+    assert line_of(lines, "loss") == "loss 20.0 % –"
+    assert line_of(lines, "drawn") == "drawn 20.0 %, predicted 9.91 % –, predicted 0 %"
+    assert line_of(lines, "lost") == "lost 600 dropped 0"
+    burst = line_of(lines, "burst")
+    assert burst.startswith("burst 2, cap 2 ━")
+    assert burst.endswith("━ 300 forced 0, no cap")
+    assert line_of(lines, "in flight") == "in flight 5, max 0 5, max 0"
+    p50, p99 = line_of(lines, "delay").removeprefix("delay p50 ").split(" ms p99 ")[:2]
+    assert float(p50) == pytest.approx(10, rel=0.03)
+    assert float(p99.split(" ms")[0]) == pytest.approx(20, rel=0.03)
+
+
+def test_the_last_minute_is_drawn() -> None:
+    lines = text_of(FakeRelay("up"), seconds=61)
+    chart = lines[[line.startswith("│ received ") for line in lines].index(True) + 1]
+    forward = chart[12:44]
+    assert forward == "".join(sorted(forward))  # it rises all the time
+    assert forward.startswith("▁")
+    assert forward.endswith("█")
+
+
+def test_unintended_losses_stand_out() -> None:
+    relay = FakeRelay("up")
+    relay.unintended["lost_in_kernel"] = 1234
+    lines = text_of(relay)
+    assert "unintended losses: 1,234 lost in kernel (forward)" in lines[-2]
+    file = io.StringIO()
+    history = History()
+    history.add(documents(relay)[-1])
+    Console(file=file, width=80, force_terminal=True, color_system="standard").print(
+        render(history, "lab", 80, 30)
+    )
+    assert "\x1b[1;37;41munintended losses" in file.getvalue()
+
+
+def test_more_links_than_fit_are_a_table() -> None:
+    lines = text_of(FakeRelay(*(f"link{k}" for k in range(30))), height=24)
+    assert len(lines) <= 24
+    assert all(len(line) <= 80 for line in lines)
+    assert lines[2].split()[:9] == [
+        "→", "link0", "2,000/s", "1,600/s", "20.0", "%", "9.91", "%", "2/2",
+    ]  # fmt: skip
+    assert lines[-1].split() == ["…", "and", "9", "more"]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 200])
+def test_any_width_will_do(width: int) -> None:
+    relay = FakeRelay("up", "down")
+    assert all(len(line) <= width for line in text_of(relay, width))
+    assert all(len(line) <= width for line in text_of(relay, width, None))
+
+
+def test_long_words_and_names_with_brackets_are_no_trouble() -> None:
+    relay = FakeRelay("up")
+    words = settings_of("loss 10% delay 1ms samples " + ",".join(["1ms"] * 500))
+    relay.specs = [
+        LinkSpec("[bold]up", ("::1", 5000), ("::1", 6000), words, SETTINGS)
+    ]  # fmt: skip
+    relay.counters = {("[bold]up", way): Counters() for way in ("forward", "reverse")}  # type: ignore[misc]
+    relay.settings = {("[bold]up", way): words for way in ("forward", "reverse")}  # type: ignore[misc]
+    lines = text_of(relay)
+    assert "[bold]up  [::1]:5000 → [::1]:6000" in lines[1]
+    assert len(lines) <= 24
+    assert " → [bold]up" in "\n".join(text_of(relay, height=5))
+
+
+def test_without_statistics_there_is_little_to_see() -> None:
+    file = io.StringIO()
+    Console(file=file, width=80).print(render(History(), "lab", 80, 24))
+    assert file.getvalue() == "lab: waiting for statistics\n"
+
+
+def test_what_is_no_terminal_gets_a_line_for_each_direction_in_use() -> None:
+    relay = FakeRelay("up", "down")
+    relay.unintended["send_errors"] = 3
+    first, *_, last = documents(relay)
+    assert plain_lines(first) == []
+    up, down = plain_lines(last)
+    assert up.startswith(
+        "3.0 s  up forward  received 2,000/s  1.60 Mbit/s  forwarded 1,600/s  1.28 Mbit/s  "
+        "loss 20.0 %  drawn 20.0 %, predicted 9.91 %  longest loss burst 2, cap 2  forced 300  "
+    )
+    assert up.endswith("in flight 5  UNINTENDED 3 send_errors")
+    assert "down forward" in down
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_with_many_links_figures_are_whole_in_any_width(width: int) -> None:
+    names = [f"a-link-with-a-long-name-{number}" for number in range(30)]
+    lines = text_of(FakeRelay(*names), width, 24)
+    assert len(lines) <= 24
+    assert all(len(line) <= width for line in lines)
+    for line in lines[2:-1]:
+        assert "2,000/s" in line
+        assert "20.0 %" in line
+        assert "2/2" in line
+    assert ("last minute" in lines[1]) == (width >= 120)

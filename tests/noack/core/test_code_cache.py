@@ -1,0 +1,148 @@
+"""Where compiled code is kept, and what happens where it cannot be."""
+
+import errno
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numba
+import pytest
+
+from noack.core.code_cache import _one_at_a_time, cache_folder, compiler
+
+SOURCES = [Path(__file__)]
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def doubled(number: int) -> int:
+    return 2 * number
+
+
+def kept_at(function: Any) -> object:
+    return function._cache.cache_path
+
+
+def test_other_sources_have_another_folder(home: Path) -> None:
+    other = home / "other.py"
+    other.write_text("None")
+    folders = {cache_folder("netem", sources) for sources in (SOURCES, [*SOURCES, other], SOURCES)}
+    assert len(folders) == 2
+    other.write_text("pass")
+    assert cache_folder("netem", [*SOURCES, other]) not in folders
+
+
+def test_what_is_compiled_is_kept_there(home: Path) -> None:
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    assert compiler(folder)(doubled)(21) == 42
+    assert list(folder.rglob("*.doubled-*.nbi"))
+    assert home in folder.parents
+
+
+COMPILED_LATER = """
+import sys
+from pathlib import Path
+from noack.core.code_cache import compiler
+from tests.noack.core.test_code_cache import doubled
+function = compiler(Path(sys.argv[1]))(doubled)
+print("began", flush=True)
+assert function(21) == 42
+print(len(function.stats.cache_hits), flush=True)
+"""
+
+
+def test_who_comes_while_another_compiles_waits_and_takes_what_is_kept(home: Path) -> None:
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    with (folder / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        later = subprocess.Popen(
+            [sys.executable, "-c", COMPILED_LATER, str(folder)],
+            cwd=Path(__file__).parents[3], stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert later.stdout is not None
+        assert later.stdout.readline() == "began\n"
+        # What the other compiles meanwhile, without asking for the lock that we hold.
+        numba.config.CACHE_DIR = str(folder)
+        assert numba.njit(doubled, cache=True)(21) == 42
+    assert later.communicate(timeout=60)[0] == "1\n"
+
+
+def test_what_a_power_failure_left_empty_is_compiled_anew(home: Path) -> None:
+    for suffix in ("nbi", "nbc"):
+        folder = cache_folder("netem", SOURCES)
+        assert folder is not None
+        assert compiler(folder)(doubled)(21) == 42
+        (file,) = folder.rglob(f"*.doubled-*.{suffix}")
+        file.write_bytes(b"")
+        assert compiler(cache_folder("netem", SOURCES))(doubled)(21) == 42
+        assert file.stat().st_size > 0
+
+
+def test_without_a_home_nothing_is_kept_and_nothing_fails(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (home / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home / "file" / "below"))
+    assert cache_folder("netem", SOURCES) is None
+    function = compiler(None)(doubled)
+    assert function(21) == 42
+    assert kept_at(function) is None  # numba has no place of its own for it, with older rules
+
+
+def test_nor_in_a_folder_of_somebody_else(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: Any) -> NoReturn:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    assert cache_folder("netem", SOURCES) is not None
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    assert cache_folder("netem", SOURCES) is None
+
+
+def test_nor_on_a_full_disk_unless_it_is_there_already(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: int) -> NoReturn:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    assert cache_folder("netem", SOURCES) is None
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    assert compiler(folder)(doubled)(21) == 42
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    assert cache_folder("netem", SOURCES) == folder
+
+
+def test_ctrl_c_waits_for_the_compiler(home: Path) -> None:
+    """LLVM calls Python back, and does not survive an exception there."""
+    folder = cache_folder("netem", SOURCES)
+    assert folder is not None
+    function = compiler(folder)(doubled)
+    going_on: list[str] = []
+    compile_once = function.compile.__closure__[0].cell_contents  # what the lock surrounds
+
+    def interrupted(signature: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        going_on.append("compiled all the same")
+        return compile_once(signature)
+
+    function.compile = _one_at_a_time(interrupted, folder / ".lock")
+    with pytest.raises(KeyboardInterrupt):
+        function(21)
+    assert going_on
+    assert function(21) == 42  # without compiling anew
+    assert len(going_on) == 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,0 +1,80 @@
+"""What holds for every kind of plant that has a shipped scenario."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.config.plants import PLANTS
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.plants.plant_settings import PlantSettings
+from plant_server.plant import system_of
+
+ROOT = Path(__file__).parents[3]
+STEPS = 25
+
+
+def cases() -> Iterator[Any]:
+    for kind, settings in PLANTS.items():
+        for variant in settings.variants if settings.scenario else ():
+            overrides = [f"plant.system.{key}={value}" for key, value in variant.items()]
+            yield pytest.param(settings.scenario, overrides, id="-".join([kind, *overrides]))
+
+
+def scenario_of(name: str, overrides: list[str]) -> Scenario:
+    return resolve(load(ROOT / "scenarios" / f"{name}.toml", overrides))
+
+
+def motion(scenario: Scenario, inputs: np.ndarray) -> np.ndarray:
+    system, period_ns = system_of(scenario), scenario.timing.plant_period_ns
+    states = [system.x]
+    for step, u in enumerate(inputs):
+        system.advance(u, step * period_ns, period_ns)
+        states.append(system.x)
+    return np.array(states)
+
+
+@pytest.mark.parametrize(("name", "overrides"), list(cases()))
+def test_the_operating_point_is_an_equilibrium(name: str, overrides: list[str]) -> None:
+    n, m = scenario_of(name, []).model.dimensions
+    at_rest = scenario_of(name, [*overrides, f"plant.initial_state={[0.0] * n}"])
+    moved = motion(at_rest, np.zeros((STEPS, m)))
+    np.testing.assert_allclose(moved, 0.0, atol=1e-3)  # the drift model's wheels start to slip
+
+
+@pytest.mark.parametrize(("name", "overrides"), list(cases()))
+def test_names_and_dimensions_agree(name: str, overrides: list[str]) -> None:
+    scenario = scenario_of(name, overrides)
+    n, m = scenario.model.dimensions
+    settings, system = scenario.plant.system, system_of(scenario)
+    assert len(system.x) == n
+    assert len(system.z) == len(settings.internal_names)
+    assert len(settings.states) in (0, n)
+    assert len(settings.inputs) in (0, m)
+
+
+@pytest.mark.parametrize(("name", "overrides"), list(cases()))
+def test_the_same_inputs_give_the_same_bits(name: str, overrides: list[str]) -> None:
+    scenario = scenario_of(name, overrides)
+    inputs = 0.01 * np.random.default_rng(1).normal(size=(STEPS, scenario.model.dimensions[1]))
+    first = motion(scenario, inputs)
+    motion(scenario, -inputs)
+    assert np.isfinite(first).all()
+    assert motion(scenario, inputs).tobytes() == first.tobytes()
+
+
+def row(kind: str, settings: type[PlantSettings]) -> str:
+    summary = (settings.__doc__ or "").partition("\n")[0].removesuffix(".")
+    states, inputs = ("; ".join(names) or "any" for names in (settings.states, settings.inputs))
+    scenario = f"`{settings.scenario}`" if settings.scenario else ""
+    return f"| `{kind}` | {summary} | {states} | {inputs} | {scenario} |"
+
+
+def test_the_table_of_kinds_is_the_registrys() -> None:
+    text = (ROOT / "docs/plants.md").read_text()
+    for kind, settings in PLANTS.items():
+        assert row(kind, settings) in text

@@ -1,0 +1,118 @@
+"""Systems that are not linear: their laws, and that a plant repeats them bit for bit."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from noack.plants.cart_pole import CartPoleSettings
+from noack.plants.plant_settings import PlantEquations
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
+
+H_NS = 2_000_000
+
+
+def run(system: OdeSystem, inputs: list[float], h_ns: int = H_NS) -> np.ndarray:
+    states = [system.x]
+    for step, u in enumerate(inputs):
+        system.advance(np.array([u]), step * h_ns, h_ns)
+        states.append(system.x)
+    return np.array(states)
+
+
+def energy(settings: CartPoleSettings, x: np.ndarray) -> float:
+    _, v, angle, rate = x.tolist()
+    m, length = settings.pole_kg, settings.length_m
+    along, up = v + length * rate * math.cos(angle), -length * rate * math.sin(angle)
+    kinetic = settings.cart_kg * v**2 + m * (along**2 + up**2) + settings.inertia_kg_m2 * rate**2
+    return 0.5 * kinetic + m * settings.gravity_m_per_s2 * length * math.cos(angle)
+
+
+def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
+    settings = CartPoleSettings(kind="cart_pole", friction_n_s_per_m=0.0)
+    states = run(OdeSystem(settings.equations(), np.array([0.3, -0.2, 1.0, 0.5])), [0.0] * 1000)
+    assert np.ptp(states[:, 2]) > 1.0  # it has fallen
+    energies = [energy(settings, x) for x in states]
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-7)
+    total, moment = settings.cart_kg + settings.pole_kg, settings.pole_kg * settings.length_m
+    momentum = total * states[:, 1] + moment * states[:, 3] * np.cos(states[:, 2])
+    np.testing.assert_allclose(momentum, momentum[0], atol=1e-8)
+
+
+def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
+    settings = CartPoleSettings(kind="cart_pole")
+    force, h_ns = 0.7, 500_000
+    states = run(
+        OdeSystem(settings.equations(), np.array([0.0, 0.1, 0.2, 0.0])), [force] * 2000, h_ns
+    )
+    power = force * states[:, 1] - settings.friction_n_s_per_m * states[:, 1] ** 2
+    work = np.trapezoid(power, dx=h_ns * 1e-9)
+    gained = energy(settings, states[-1]) - energy(settings, states[0])
+    assert gained == pytest.approx(work, rel=1e-5)
+
+
+def test_its_linearisation_has_the_poles_of_the_literature() -> None:
+    """Open loop, by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041, 5.5651."""
+    A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
+    poles = np.sort(np.linalg.eigvals(A).real)
+    np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
+    np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
+
+
+def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
+    def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
+
+    system = OdeSystem(PlantEquations(pendulum), np.array([2.0, 0.0]))
+    states = run(system, [0.5] * 500, 20_000_000)
+    exact = solve_ivp(
+        lambda t, z: pendulum(t, z, np.array([0.5])), (0, 10), [2.0, 0.0],
+        method="DOP853", rtol=1e-13, atol=1e-13,
+    )  # fmt: skip
+    np.testing.assert_allclose(states[-1], exact.y[:, -1], atol=1e-6)
+
+
+def test_the_same_steps_give_the_same_bits_whatever_was_integrated_before() -> None:
+    first = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.1, 0.0, 0.2, 0.0])
+    )
+    expected = run(first, [0.3, -0.1, 2.0] * 20)
+    other = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.5, 0.0, -1.0, 3.0])
+    )
+    run(other, [9.0] * 50)
+    second = OdeSystem(
+        CartPoleSettings(kind="cart_pole").equations(), np.array([0.1, 0.0, 0.2, 0.0])
+    )
+    assert run(second, [0.3, -0.1, 2.0] * 20).tobytes() == expected.tobytes()
+
+
+def test_what_cannot_be_integrated_is_nan_from_then_on() -> None:
+    def blows_up(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        return (float(z[0]) ** 2,)
+
+    system = OdeSystem(PlantEquations(blows_up), np.array([1.0]))
+    states = run(system, [0.0] * 20, 100_000_000)
+    assert np.isfinite(states[9]).all()
+    assert np.isnan(states[12:]).all()
+
+
+def test_what_a_derivative_raises_is_divergence_if_it_is_of_arithmetic_and_else_raised() -> None:
+    def broken(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
+        if t > 0.003:
+            raise [OverflowError, KeyError][int(v[0])]("far")
+        return (1.0,)
+
+    inputs = {
+        0.0: OdeSystem(PlantEquations(broken), np.zeros(1)),
+        1.0: OdeSystem(PlantEquations(broken), np.zeros(1)),
+    }
+    for u, system in inputs.items():
+        system.advance(np.array([u]), 0, H_NS)
+        assert system.x == pytest.approx([0.002])
+    inputs[0.0].advance(np.zeros(1), H_NS, H_NS)
+    assert np.isnan(inputs[0.0].x).all()
+    with pytest.raises(KeyError, match="far"):
+        inputs[1.0].advance(np.ones(1), H_NS, H_NS)

@@ -1,0 +1,119 @@
+"""The DC motor against its published transfer function, and stiction against another solver."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.integrate import solve_ivp
+
+from noack.plants.dc_motor import DcMotor, DcMotorSettings
+
+H_NS = 2_000_000
+INDUCTANCES = (2.75e-6, 1e-3, 0.05, 0.5)
+"""With the last two, speed and current oscillate."""
+
+
+def settings(**given: Any) -> DcMotorSettings:
+    return DcMotorSettings(kind="dc_motor", **given)
+
+
+def motion(motor: DcMotor, voltages: Any) -> np.ndarray:
+    states = [motor.x]
+    for step, voltage in enumerate(voltages):
+        motor.advance(np.array([voltage]), step * H_NS, H_NS)
+        states.append(motor.x)
+    return np.array(states)
+
+
+def published() -> signal.TransferFunction:
+    """θ(s)/V(s) = K/(s((Js + b)(Ls + R) + K²)), University of Michigan, "DC Motor Position"."""
+    J, b, K, R, L = 3.2284e-6, 3.5077e-6, 0.0274, 4.0, 2.75e-6
+    return signal.TransferFunction(
+        [K], np.polymul([1, 0], np.polyadd(np.polymul([J, b], [L, R]), [K**2]))
+    )
+
+
+def test_the_step_response_is_the_published_transfer_functions() -> None:
+    _, angle = signal.step(published(), T=np.arange(101) * H_NS * 1e-9)
+    found = motion(DcMotor(settings(), np.zeros(3)), [1.0] * 100)
+    np.testing.assert_allclose(found[:, 0], angle, atol=1e-9)
+    assert angle[-1] > 5.0
+
+
+def test_the_linearisation_has_the_published_frequency_response() -> None:
+    A, B = settings().linearisation()
+    w = np.logspace(-1, 7, 50)
+    _, expected = signal.freqresp(published(), w)
+    found = [(np.linalg.solve(1j * one * np.eye(3) - A, B))[0, 0] for one in w]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: float) -> np.ndarray:
+    """The same law by an implicit integrator with events: turning forward, backward, stuck."""
+    J, b, L = motor.inertia_kg_m2, motor.friction_n_m_s, motor.inductance_h
+    K, R, T_c = motor.torque_constant_n_m_per_a, motor.resistance_ohm, motor.coulomb_friction_n_m
+    t_s, x = 0.0, x.copy()
+    while t_s < end_s:
+        turning = math.copysign(1, x[1]) if x[1] else 0.0
+        steady = voltage / R
+        if not x[1] and K * abs(x[2]) > T_c * (1 - 1e-9) and K * steady * np.sign(x[2]) > T_c:
+            turning = math.copysign(1, x[2])
+
+        def derivative(_: float, z: np.ndarray, s: float = turning) -> list[float]:
+            acceleration = (K * z[2] - b * z[1] - s * T_c) / J if s else 0.0
+            return [z[1], acceleration, (voltage - R * z[2] - K * z[1]) / L]
+
+        def change(_: float, z: np.ndarray, s: float = turning) -> float:
+            return float(s * z[1] if s else abs(K * z[2]) - T_c)
+
+        change.terminal, change.direction = True, -1 if turning else 1  # type: ignore[attr-defined]
+        found = solve_ivp(
+            derivative, (t_s, end_s), x, events=change, method="Radau", rtol=1e-10, atol=1e-13
+        )
+        t_s, x = found.t[-1], found.y[:, -1].copy()
+        if found.status == 1 and turning:
+            x[1] = 0.0
+    return x
+
+
+@pytest.mark.parametrize("inductance_h", INDUCTANCES)
+def test_friction_and_stiction_are_another_solvers(inductance_h: float) -> None:
+    motor = settings(inductance_h=inductance_h, coulomb_friction_n_m=1e-3)
+    system, expected = DcMotor(motor, np.array([0.0, 5.0, 0.0])), np.array([0.0, 5.0, 0.0])
+    stuck = 0
+    for voltage in np.random.default_rng(0).choice([0.0, 0.1, -0.1, 0.5, -0.6, 2.0], 20):
+        system.advance(np.array([voltage]), 0, 5_000_000)
+        expected = reference(motor, expected, voltage, 5e-3)
+        np.testing.assert_allclose(system.x, expected, rtol=1e-7, atol=1e-8)
+        stuck += system.x[1] == 0.0
+    assert stuck or inductance_h > 1e-3  # slow currents do not let it stop for a whole step
+
+
+def test_the_shaft_sticks_up_to_the_coulomb_torque_and_no_further() -> None:
+    limit_v = 4.0 * 1e-3 / 0.0274  # R T_c / Kt
+    for factor, moves in ((0.999, False), (1.001, True)):
+        motor = DcMotor(settings(coulomb_friction_n_m=1e-3), np.zeros(3))
+        assert (motion(motor, [factor * limit_v] * 50)[-1, 0] > 0.0) == moves
+
+
+def test_energy_is_conserved() -> None:
+    """∫Vi dt = ∫(Ri² + bω²) dt + T_c|θ| + ½Li² + ½Jω², for a shaft that turns one way."""
+    motor = settings(inductance_h=1e-3, coulomb_friction_n_m=1e-3)
+    voltage, steps, step_ns = 2.0, 40_000, 1000
+    system = DcMotor(motor, np.zeros(3))
+    rows = [system.x]
+    for _ in range(steps):
+        system.advance(np.array([voltage]), 0, step_ns)
+        rows.append(system.x)
+    angle, speed, current = np.array(rows).T
+    dx = step_ns * 1e-9
+    supplied = np.trapezoid(voltage * current, dx=dx)
+    losses = np.trapezoid(4.0 * current**2 + motor.friction_n_m_s * speed**2, dx=dx)
+    stored = 0.5 * (1e-3 * current[-1] ** 2 + motor.inertia_kg_m2 * speed[-1] ** 2)
+    assert supplied == pytest.approx(losses + 1e-3 * angle[-1] + stored, rel=1e-6)
+
+
+def test_a_state_that_is_not_finite_stays_so() -> None:
+    assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()

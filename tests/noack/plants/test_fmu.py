@@ -1,0 +1,283 @@
+"""FMUs as plants, of FMI 2 and 3: against other integrators, and with all that may be wrong."""
+
+import fcntl
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.core.errors import CallerError
+from noack.plants.fmu import FmuSettings
+from noack.plants.linear import LinearSystem
+from noack.plants.plant_settings import PlantEquations
+from noack.plants.systems.fmu_system import FmuSystem
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.systems.plant_system import SystemFailedError
+from noack.settings.user_files import located
+from tests.plant_server.fmus.build import build
+
+pytest.importorskip("fmpy")
+H_NS = 2_000_000
+VERSIONS = pytest.mark.parametrize("version", [2, 3])
+
+
+@pytest.fixture(autouse=True)
+def own_folder_for_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+def settings(path: Path, **more: Any) -> FmuSettings:
+    given = {"state_variables": ("x0", "x1"), "input_variables": ("u",)} | more
+    loaded = located(FmuSettings(kind="fmu", file=str(path), **given), Path(), "scenario.toml")
+    assert isinstance(loaded, FmuSettings)
+    return loaded
+
+
+def run(system: Any, inputs: list[float]) -> np.ndarray:
+    states = [system.x]
+    for step, u in enumerate(inputs):
+        system.advance(np.array([u]), step * H_NS, H_NS)
+        states.append(system.x)
+    return np.array(states)
+
+
+INPUTS = [math.sin(0.01 * step) for step in range(500)]
+X0 = np.array([1.0, -0.5])
+
+
+@VERSIONS
+def test_a_linear_fmu_is_the_linear_system(version: int, tmp_path: Path) -> None:
+    parameters = {"mu": 0.3, "k": 4.0, "linear": True}
+    system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
+    A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0], [1.0]])
+    exact = run(LinearSystem(A, B, X0, step_ns=H_NS), INPUTS)
+    # Runge and Kutta's error of order 4 over steps of 125 µs is far below.
+    np.testing.assert_allclose(run(system, INPUTS), exact, atol=1e-11)
+
+
+@VERSIONS
+def test_van_der_pol_is_what_another_integrator_makes_of_it(version: int, tmp_path: Path) -> None:
+    def van_der_pol(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
+        return float(z[1]), 2.0 * (1.0 - z[0] ** 2) * z[1] - z[0] + v[0]
+
+    system = FmuSystem(
+        settings(build(tmp_path, version), parameters={"mu": 2}, on_record=("energy",)), X0
+    )
+    np.testing.assert_allclose(
+        run(system, INPUTS), run(OdeSystem(PlantEquations(van_der_pol), X0), INPUTS), atol=1e-9
+    )
+    assert system.z == pytest.approx([(system.x[1] ** 2 + system.x[0] ** 2) / 2])
+
+
+@VERSIONS
+def test_the_same_steps_give_the_same_bits(version: int, tmp_path: Path) -> None:
+    loaded = settings(build(tmp_path, version))
+    assert (
+        run(FmuSystem(loaded, X0), INPUTS).tobytes() == run(FmuSystem(loaded, X0), INPUTS).tobytes()
+    )
+
+
+@VERSIONS
+def test_its_linearisation_is_that_of_its_equations(version: int, tmp_path: Path) -> None:
+    loaded = settings(build(tmp_path, version), parameters={"mu": 0.7, "k": 3.0})
+    A, B = linearise(lambda x0: FmuSystem(loaded, x0), 2, 1)
+    np.testing.assert_allclose(A, [[0.0, 1.0], [-3.0, 0.7]], atol=1e-6)
+    np.testing.assert_allclose(B, [[0.0], [1.0]], atol=1e-6)
+
+
+@VERSIONS
+def test_an_operating_point_is_where_x_and_u_are_zero(version: int, tmp_path: Path) -> None:
+    """At x0 = 2 the spring pulls with k x0 = 6, which the input holds."""
+    loaded = settings(
+        build(tmp_path, version), parameters={"k": 3.0, "linear": True},
+        operating_state=(2.0, 0.0), operating_input=(6.0,),
+    )  # fmt: skip
+    still = FmuSystem(loaded, np.zeros(2))
+    np.testing.assert_allclose(run(still, [0.0] * 100), np.zeros((101, 2)), atol=1e-12)
+    moved = FmuSystem(loaded, X0)
+    linear = LinearSystem(np.array([[0, 1], [-3.0, -1]]), np.array([[0.0], [1]]), X0, step_ns=H_NS)
+    np.testing.assert_allclose(run(moved, INPUTS), run(linear, INPUTS), atol=1e-11)
+
+
+@VERSIONS
+@pytest.mark.parametrize(("status", "said"), [(2, "discard"), (3, "error"), (4, "fatal")])
+def test_a_step_that_fails_says_why_once(
+    version: int, status: int, said: str, tmp_path: Path
+) -> None:
+    parameters = {"fail_at_s": 0.02, "fail_status": status}
+    system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
+    with pytest.raises(SystemFailedError) as failed:
+        run(system, [0.0] * 100)
+    text = str(failed.value)
+    assert said in text
+    assert "the spring broke" in text
+    assert "\n" not in text
+
+
+def test_an_fmu_that_wants_to_end_has_failed(tmp_path: Path) -> None:
+    parameters = {"fail_at_s": 0.02, "fail_status": -1}
+    system = FmuSystem(settings(build(tmp_path, 3), parameters=parameters), X0)
+    with pytest.raises(SystemFailedError, match="wants the simulation to end"):
+        run(system, [0.0] * 100)
+
+
+@VERSIONS
+def test_a_warning_is_no_failure_and_noise_is_not_heard(
+    version: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    system = FmuSystem(settings(build(tmp_path, version), parameters={"noisy": True}), X0)
+    print("before")
+    states = run(system, INPUTS)
+    print("after")
+    assert np.isfinite(states).all()
+    del system
+    captured = capfd.readouterr()
+    assert captured.out == "before\nafter\n"
+    assert captured.err == ""
+
+
+@VERSIONS
+@pytest.mark.parametrize(
+    ("more", "expected"),
+    [
+        ({"state_variables": ("x0", "enrgy")}, 'no variable "enrgy"; did you mean energy?'),
+        ({"state_variables": ("x0", "zz")}, 'has no variable "zz"; it has x0, x1, u'),
+        ({"state_variables": ("x0", "u")}, '"u" is neither output nor local, but input'),
+        ({"input_variables": ("x1",)}, '"x1" is no input, but output'),
+        ({"input_variables": ("fail_status",)}, "real numbers are needed"),
+        ({"initial_variables": ("x0", "energy")}, '"energy" cannot be set at the start'),
+        ({"parameters": {"mu": "high"}}, "give a number, not 'high'"),
+        ({"parameters": {"mu": True}}, "give a number, not True"),
+        ({"parameters": {"linear": 1}}, "give true or false, not 1"),
+        ({"parameters": {"fail_status": 1.5}}, "give a whole number, not 1.5"),
+        ({"parameters": {"name": 1}}, "give a text, not 1"),
+        ({"parameters": {"energy": 1.0}}, '"energy" cannot be set at the start'),
+        ({"parameters": {"u": 1.0}}, '"u" is an input; its value at rest is operating_input'),
+        ({"state_variables": ("x0", "x0")}, 'state_variables: "x0" stands there twice'),
+        ({"on_record": ("heat",)}, 'plant.system.on_record: the FMU has no variable "heat"'),
+        ({"initial_variables": ()}, "but the FMU begins at [0.0, 0.0]"),
+    ],
+)
+def test_settings_that_do_not_fit_the_fmu_are_refused_in_one_line(
+    version: int, more: dict[str, Any], expected: str, tmp_path: Path,
+    own_folder_for_temporary_files: Path,
+) -> None:  # fmt: skip
+    with pytest.raises(CallerError) as refused:
+        FmuSystem(settings(build(tmp_path, version), **more), X0)
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert not list(own_folder_for_temporary_files.iterdir())
+
+
+@VERSIONS
+def test_other_variables_may_set_the_start(version: int, tmp_path: Path) -> None:
+    loaded = settings(
+        build(tmp_path, version),
+        initial_variables=("x0_at_the_start", "x1"),
+        parameters={"name": "a"},
+    )
+    assert FmuSystem(loaded, X0).x.tolist() == X0.tolist()
+
+
+@pytest.mark.parametrize(
+    ("edit", "expected"),
+    [
+        (("CoSimulation modelId", "ModelExchange modelId"), "not for co-simulation"),
+        (('modelIdentifier="oscillator"', 'modelIdentifier="other"'), "this machine needs"),
+        (("{oscillator}", "{other}"), "cannot be started: Failed to instantiate"),
+        (('fmiVersion="2.0"', 'fmiVersion="1.0"'), "is no FMU of FMI 2 or 3, or a damaged one"),
+        (('fmiVersion="2.0"', 'fmiVersion="9.0"'), "is no FMU of FMI 2 or 3"),
+        (("</fmiModelDescription>", ""), "is no FMU of FMI 2 or 3"),
+    ],
+)  # fmt: skip
+def test_fmus_that_cannot_be_run_are_refused_in_one_line(
+    edit: tuple[str, str], expected: str, tmp_path: Path
+) -> None:
+    before = Path.cwd()
+    with pytest.raises(CallerError) as refused:
+        FmuSystem(settings(build(tmp_path, 2, edit=edit)), X0)
+    assert expected in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert Path.cwd() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"PK\x05\x06" + bytes(18), bytes(1000)])
+def test_what_is_no_fmu_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "garbage.fmu"
+    path.write_bytes(content)
+    with pytest.raises(CallerError, match="is no FMU of FMI 2 or 3") as refused:
+        FmuSystem(settings(path), X0)
+    assert "\n" not in str(refused.value)
+
+
+@VERSIONS
+def test_a_changed_fmu_is_not_run(version: int, tmp_path: Path) -> None:
+    path = build(tmp_path, version)
+    loaded = settings(path)
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
+        FmuSystem(loaded, X0)
+    path.unlink()
+    with pytest.raises(CallerError, match="cannot be read: No such file"):
+        FmuSystem(loaded, X0)
+
+
+def test_without_fmpy_one_line_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loaded = settings(build(tmp_path, 2))
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    with pytest.raises(
+        CallerError, match=r"needs a package that is not installed; pip install 'noack\[fmi\]'"
+    ):
+        FmuSystem(loaded, X0)
+
+
+def test_what_is_unpacked_goes_with_the_system_or_its_process(
+    tmp_path: Path, own_folder_for_temporary_files: Path
+) -> None:
+    system = FmuSystem(settings(build(tmp_path, 2)), X0)
+    (folder,) = own_folder_for_temporary_files.iterdir()
+    assert (folder / "modelDescription.xml").is_file()
+    del system
+    assert not folder.exists()
+    program = (
+        "import sys, tempfile, numpy as np; from noack.plants.systems.fmu_system import FmuSystem; "
+        "from noack.plants.fmu import FmuSettings; tempfile.tempdir = sys.argv[1]; "
+        "kept = FmuSystem(FmuSettings.model_validate_json(sys.argv[2]), np.zeros(2)); print(kept.x)"
+    )
+    loaded = settings(build(tmp_path, 2)).model_dump_json()
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(own_folder_for_temporary_files), loaded],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.stderr, done.returncode) == ("[0. 0.]\n", "", 0)
+    assert not list(own_folder_for_temporary_files.iterdir())
+
+
+def test_the_next_removes_what_a_killed_process_left_and_nothing_else(
+    tmp_path: Path, own_folder_for_temporary_files: Path
+) -> None:
+    left, used, other = (
+        own_folder_for_temporary_files / name
+        for name in ("noack-native-left", "noack-native-used", "other")
+    )
+    for folder in (left, used, other):
+        (folder / "inside").mkdir(parents=True)
+    lock = os.open(used, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        FmuSystem(settings(build(tmp_path, 2)), X0)
+    finally:
+        os.close(lock)
+    assert sorted(own_folder_for_temporary_files.iterdir()) == [used, other]

@@ -1,0 +1,291 @@
+"""Classes of the user's own as plants."""
+
+import math
+import sys
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.core.errors import CallerError
+from noack.plants.python_plant import PythonPlantSettings, PythonSystem
+from noack.plants.systems.plant_system import SystemFailedError
+from noack.settings.user_files import located
+
+H_NS = 2_000_000
+X0 = np.array([0.3, 0.0])
+PENDULUM = """
+    import math
+    from dataclasses import dataclass
+
+    @dataclass
+    class Pendulum:
+        g: float = 9.81
+
+        def derivative(self, t_s, z, u):
+            return z[1], -self.g * math.sin(z[0]) + u[0]
+"""
+STEPPING = """
+    import numpy as np
+
+    class Stepping:
+        def start(self, x0):
+            self.x, self.z = x0, [0.0, 0.0, 0.0]
+
+        def advance(self, u, t_s, dt_s):
+            self.x[0] += dt_s * self.x[1]
+            self.x[1] += dt_s * u[0]
+            self.z = [t_s, dt_s, u[0]]
+            u[0] = 1e9
+"""
+
+
+def settings(folder: Path, code: str, name: str, **more: Any) -> PythonPlantSettings:
+    path = folder / "mine.py"
+    path.write_text(dedent(code))
+    loaded = located(
+        PythonPlantSettings(kind="python", name=name, file=str(path), **more), Path(), "s.toml"
+    )
+    assert isinstance(loaded, PythonPlantSettings)
+    return loaded
+
+
+def follow(system: PythonSystem, steps: int) -> None:
+    for step in range(steps):
+        system.advance(np.zeros(1), step * H_NS, H_NS)
+
+
+def made(folder: Path, code: str, name: str, **more: Any) -> PythonSystem:
+    return PythonSystem(settings(folder, code, name, **more), X0, 1)
+
+
+def test_a_derivative_is_integrated(tmp_path: Path) -> None:
+    """A pendulum keeps its energy."""
+    system = made(tmp_path, PENDULUM, "Pendulum", parameters={"g": 4.0})
+    for step in range(1000):
+        system.advance(np.zeros(1), step * H_NS, H_NS)
+    angle, rate = system.x
+    energy = rate**2 / 2 - 4.0 * math.cos(angle)
+    assert energy == pytest.approx(-4.0 * math.cos(0.3), rel=1e-9)
+    assert abs(angle - 0.3) > 0.01
+
+
+def test_a_state_of_its_own_is_mapped_and_recorded(tmp_path: Path) -> None:
+    code = """
+        import numpy as np
+
+        class Sheared:
+            def __init__(self, T):
+                self.T = np.array(T)
+
+            def state(self, x0):
+                return np.append(np.linalg.solve(self.T, x0), 0.0)
+
+            def output(self, z):
+                return self.T @ z[:2]
+
+            def derivative(self, t_s, z, u):
+                return np.append(np.linalg.solve(self.T, [(self.T @ z[:2])[1], u[0]]), 1.0)
+    """
+    system = made(
+        tmp_path, code, "Sheared",
+        parameters={"T": ((2.0, 1.0), (0.0, 3.0))}, on_record=("a", "b", "clock"),
+    )  # fmt: skip
+    assert system.x.tolist() == pytest.approx(X0.tolist())
+    for step in range(500):
+        system.advance(np.array([2.0]), step * H_NS, H_NS)
+    assert system.x.tolist() == pytest.approx([0.3 + 1.0, 2.0])
+    assert system.z[2] == pytest.approx(1.0)
+
+
+def test_a_class_may_step_by_itself_and_spoils_nobodys_numbers(tmp_path: Path) -> None:
+    system = made(tmp_path, STEPPING, "Stepping", on_record=("t", "dt", "u"))
+    u = np.array([2.0])
+    system.advance(u, 5 * H_NS, H_NS)
+    first = system.x
+    kept = first.copy()
+    system.advance(u, 6 * H_NS, H_NS)
+    assert u.tolist() == [2.0]
+    assert first.tolist() == kept.tolist()
+    assert system.z.tolist() == [6 * H_NS * 1e-9, H_NS * 1e-9, 2.0]
+    assert system.x[1] == pytest.approx(8e-3)
+
+
+def test_a_shipped_system_is_a_plant_by_entry_point_and_by_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "installed_plants.py").write_text(dedent(PENDULUM))
+    folder = tmp_path / "installed_plants-1.2.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Name: installed-plants\nVersion: 1.2\n")
+    (folder / "entry_points.txt").write_text("[noack.plants]\nswing = installed_plants:Pendulum\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "installed_plants", raising=False)
+    by_entry = PythonSystem(PythonPlantSettings(kind="python", name="swing"), X0, 1)
+    assert by_entry.about == "class installed_plants:Pendulum, installed-plants 1.2"
+    by_module = PythonSystem(
+        PythonPlantSettings(kind="python", name="installed_plants:Pendulum"), X0, 1
+    )
+    for system in (by_entry, by_module):
+        system.advance(np.zeros(1), 0, H_NS)
+    assert by_entry.x.tobytes() == by_module.x.tobytes()
+    with pytest.raises(CallerError, match=r"no installed package has .*there are: .*swing"):
+        PythonSystem(PythonPlantSettings(kind="python", name="swung"), X0, 1)
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("import nothing_so_named",
+         "ModuleNotFoundError: No module named 'nothing_so_named' (mine.py, line 1)"),
+        ("class P(:", "SyntaxError"),
+        ("class Q: pass", "LookupError: mine.py has no P"),
+        ("raise SystemExit(3)", "SystemExit: 3 (mine.py, line 1)"),
+        ("class P: pass", "it has neither derivative nor advance; one of them is needed"),
+        ("class P:\n def derivative(s, t, z, u): return z\n def advance(s, u, t, h): pass",
+         "both derivative and advance"),
+        ("class P:\n def __init__(s, g): pass", "missing 1 required positional argument: 'g'"),
+        ("class P:\n def derivative(s, t, z, u): return z[:1]",
+         "derivative(t_s, z, u) has shape (1,), expected (2,)"),
+        ("class P:\n def derivative(s, t, z, u): return 'ab'", "is not of real numbers"),
+        ("class P:\n def derivative(s, t, z, u):\n  return 1 / (u[0] * 0)", "(mine.py, line 3)"),
+        ("class P:\n def state(s, x): return [[1.0]]\n def derivative(s, t, z, u): return z",
+         "state(x0) has shape (1, 1)"),
+        ("class P:\n def output(s, z): return z[:1]\n def derivative(s, t, z, u): return z",
+         "x has shape (1,), expected (2,)"),
+        ("class P:\n def output(s, z): return 2 * z\n def derivative(s, t, z, u): return z",
+         "x is [0.6, 0.0] at the start; plant.initial_state is [0.3, 0.0]"),
+        ("class P:\n def start(s, x0): pass\n def advance(s, u, t, h): pass",
+         "AttributeError: 'P' object has no attribute 'x'"),
+    ],
+)  # fmt: skip
+def test_what_is_no_plant_is_refused_in_one_line(code: str, expected: str, tmp_path: Path) -> None:
+    with np.errstate(all="raise"), pytest.raises(CallerError) as refused:
+        made(tmp_path, code, "P")
+    assert expected in str(refused.value)
+    assert str(refused.value).startswith('plant.system.name = "P": ')
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("kind", ["derivative", "advance"])
+def test_what_it_raises_later_is_a_failure_that_names_class_and_place(
+    kind: str, tmp_path: Path
+) -> None:
+    code = """
+        class P:
+            def start(self, x0):
+                self.x = x0
+
+            def advance(self, u, t_s, dt_s):
+                if t_s > 0.0199:
+                    raise KeyError("wind")
+
+        class Q:
+            def derivative(self, t_s, z, u):
+                if t_s > 0.0201:
+                    raise KeyError("wind")
+                return 0 * z
+    """
+    name = "Q" if kind == "derivative" else "P"
+    system = made(tmp_path, code, name)
+    for step in range(10):
+        system.advance(np.zeros(1), step * H_NS, H_NS)
+    with pytest.raises(SystemFailedError) as failed:
+        system.advance(np.zeros(1), 10 * H_NS, H_NS)
+    assert f"name = \"{name}\": KeyError: 'wind' (mine.py, line " in str(failed.value)
+
+
+def test_a_shape_that_changes_later_is_a_failure(tmp_path: Path) -> None:
+    code = """
+        class P:
+            def start(self, x0):
+                self.x = x0
+
+            def advance(self, u, t_s, dt_s):
+                self.x = [1.0, 2.0, 3.0]
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError, match=r"x has shape \(3,\), expected \(2,\)"):
+        system.advance(np.zeros(1), 0, H_NS)
+
+
+def test_a_changed_file_is_not_executed(tmp_path: Path) -> None:
+    loaded = settings(tmp_path, PENDULUM, "Pendulum")
+    (tmp_path / "mine.py").write_text("raise SystemExit('executed')")
+    with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
+        PythonSystem(loaded, X0, 1)
+
+
+@pytest.mark.parametrize(
+    ("slope", "expected"),
+    [
+        ("[-1e9 * (z[0] - math.cos(t_s)), 0.0]", "too stiff for an explicit integrator"),
+        (
+            "[1e9 * math.copysign(1.0, math.sin(1e9 * z[0]) - 0.1), 0.0]",
+            "integrated at 2.",
+        ),
+    ],
+)
+def test_equations_that_cannot_be_followed_have_not_diverged(
+    slope: str, expected: str, tmp_path: Path
+) -> None:
+    code = f"""
+        import math
+
+        class P:
+            def derivative(self, t_s, z, u):
+                return {slope}
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError, match=expected):
+        follow(system, 20)
+    assert np.isfinite(system.x).all()
+
+
+def test_a_state_that_escapes_has_diverged(tmp_path: Path) -> None:
+    code = """
+        class P:
+            def derivative(self, t_s, z, u):
+                return [1e3 * v**3 for v in z]
+    """
+    system = made(tmp_path, code, "P")
+    with np.errstate(all="ignore"):
+        follow(system, 100)
+    assert not np.isfinite(system.x).all()
+
+
+@pytest.mark.parametrize(
+    ("returned", "expected"),
+    [
+        ("[z[1] + 1e-3j, 0.0]", "TypeError: derivative(t_s, z, u) is not of real numbers"),
+        ('["1", "2"]', "TypeError: derivative(t_s, z, u) is not of real numbers"),
+        ("sys.exit(3)", "SystemExit: 3"),
+    ],
+)
+def test_what_is_no_derivative_is_refused(returned: str, expected: str, tmp_path: Path) -> None:
+    code = f"""
+        import sys
+
+        class P:
+            def derivative(self, t_s, z, u):
+                return {returned} if t_s > 0.0201 else 0 * z
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError) as failed:
+        follow(system, 20)
+    assert expected in str(failed.value)
+
+
+def test_a_derivative_cannot_write_into_what_it_is_given(tmp_path: Path) -> None:
+    code = """
+        class P:
+            def derivative(self, t_s, z, u):
+                if t_s > 0.0201:
+                    z[0] = 7.0
+                return 0 * z
+    """
+    system = made(tmp_path, code, "P")
+    with pytest.raises(SystemFailedError, match="read-only"):
+        follow(system, 20)

@@ -1,0 +1,192 @@
+"""Vehicles: CommonRoad's equations, and what they are to the loop."""
+
+import math
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from noack.config.named_models import single_track_lane
+from noack.core.errors import CallerError
+from noack.plants.systems.ode_integrator import OdeSystem
+from noack.plants.systems.plant_linearisation import linearise
+from noack.plants.vehicle import VehicleSettings
+
+H_NS = 2_000_000
+X0 = np.array([0.2, -0.1, 0.05, 3.0])
+CARS = ("ford_escort", "bmw_320i", "vw_vanagon")
+MODELS = ("kinematic", "single_track", "drift", "multi_body")
+
+
+def settings(**given: Any) -> VehicleSettings:
+    return VehicleSettings(kind="vehicle", **given)
+
+
+def parameters(car: str) -> Any:
+    number = (*CARS, "truck").index(car) + 1
+    name = f"parameters_vehicle{number}"
+    return getattr(import_module(f"vehiclemodels.{name}"), name)()
+
+
+def steered(system: OdeSystem, angles: list[float]) -> np.ndarray:
+    states = [system.x]
+    for step, angle in enumerate(angles):
+        system.advance(np.array([angle]), step * H_NS, H_NS)
+        states.append(system.x)
+    return np.array(states)
+
+
+@pytest.mark.parametrize("car", CARS)
+@pytest.mark.parametrize("model", ["single_track", "drift", "multi_body"])
+def test_a_vehicle_starts_where_x_says(model: str, car: str) -> None:
+    system = OdeSystem(settings(model=model, parameters=car).equations(), X0)
+    np.testing.assert_allclose(system.x, X0, rtol=1e-12)
+    assert len(system.z) == len(settings(model=model).internal_names)
+
+
+def test_the_lateral_velocity_of_a_kinematic_vehicle_follows_from_its_yaw_rate() -> None:
+    system = OdeSystem(settings(model="kinematic").equations(), X0)
+    behind = parameters("bmw_320i").b
+    np.testing.assert_allclose(system.x, [0.1 * behind, *X0[1:]], rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_lane_goes_by_as_the_lane_models_have_it(model: str) -> None:
+    """Ẏ_g = V − v ψ and ψ̇ = r, of small angles."""
+    system = OdeSystem(
+        settings(model=model, speed_m_per_s=15.0).equations(), np.array([0.0, 0.0, 0.01, 0.0])
+    )
+    states = steered(system, [0.003] * 250)
+    t_s = np.arange(251) * H_NS * 1e-9
+    V, r, psi, Y_g = states.T
+    turned = np.trapezoid(r, t_s)
+    assert psi[-1] - psi[0] == pytest.approx(turned, rel=1e-3)
+    assert psi[-1] > psi[0]
+    aside = np.trapezoid(V - 15.0 * psi, t_s)
+    assert Y_g[-1] - Y_g[0] == pytest.approx(aside, rel=0.01)  # its speed is not quite constant
+
+
+@pytest.mark.parametrize("car", CARS)
+def test_a_single_track_is_near_straight_running_what_the_textbook_says(car: str) -> None:
+    """Riekert and Schunck's matrices, from the library's masses, axles and tyres."""
+    p, v = parameters(car), 18.0
+    per_weight = -p.tire.p_ky1 * p.m * 9.81 / (p.a + p.b)
+    model = single_track_lane(
+        {"mass_kg": p.m, "inertia_kg_m2": p.I_z, "front_m": p.a, "rear_m": p.b,
+         "front_n_per_rad": per_weight * p.b, "rear_n_per_rad": per_weight * p.a,
+         "speed_m_per_s": v}
+    )  # fmt: skip
+    chosen = settings(parameters=car, speed_m_per_s=v)
+    A, B = linearise(
+        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
+    )
+    np.testing.assert_allclose(A, model.A, atol=2e-3)
+    np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not quite settled
+
+
+def test_the_named_model_is_the_bmws() -> None:
+    chosen = settings()
+    A, B = linearise(
+        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
+    )
+    model = single_track_lane({})
+    np.testing.assert_allclose(A, model.A, atol=2e-3)
+    np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("model", ["kinematic", "multi_body"])
+def test_of_a_vehicle_whose_x_is_no_state_there_is_no_linearisation(model: str) -> None:
+    """A kinematic one has fewer states, a multi-body rolls as fast as it turns."""
+    chosen = settings(model=model)
+    A, B = linearise(
+        lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
+    )
+    assert np.isnan(A).all()
+    assert np.isnan(B).all()
+
+
+@pytest.mark.parametrize(("model", "library", "atol"), [
+    ("kinematic", "ks", 1e-7), ("single_track", "st", 1e-7), ("drift", "std", 1e-5),
+    ("multi_body", "mb", 1e-4),
+])  # fmt: skip
+def test_it_moves_as_another_solver_moves_the_librarys_equations(
+    model: str, library: str, atol: float
+) -> None:
+    """An implicit one of stiff equations, over a lane change and with the servo written out."""
+    chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
+    system = OdeSystem(chosen.equations(), X0)
+    name = f"vehicle_dynamics_{library}"
+    dynamics = getattr(import_module(f"vehiclemodels.{name}"), name)
+
+    def whole(t: float, z: np.ndarray, angle: float) -> Any:
+        rates = [(angle - z[2]) / chosen.steering_s, chosen.speed_m_per_s - z[3]]
+        return dynamics(list(z), rates, p)
+
+    z = system.z
+    for angle, steps in ((0.015, 100), (-0.02, 100)):
+        steered(system, [angle] * steps)
+        z = solve_ivp(whole, (0, steps * H_NS * 1e-9), z, args=(angle,), method="Radau",
+                      rtol=1e-9, atol=1e-11).y[:, -1]  # fmt: skip
+    np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
+
+
+def test_the_wheels_turn_as_fast_and_as_far_as_the_vehicle_lets_them() -> None:
+    limits = parameters("bmw_320i").steering
+    system = OdeSystem(settings(speed_m_per_s=2.0, steering_s=0.01).equations(), np.zeros(4))
+    steered(system, [2.0] * 500)
+    assert system.z[2] == pytest.approx(limits.v_max, rel=1e-6)  # rad, after 1 s at v_max rad/s
+    steered(system, [2.0] * 1500)
+    assert system.z[2] == pytest.approx(limits.max, rel=1e-6)
+
+
+def test_on_ice_a_car_that_is_steered_hard_turns_less() -> None:
+    yaw = [
+        steered(
+            OdeSystem(settings(model="drift", friction=friction).equations(), np.zeros(4)),
+            [0.1] * 400,
+        )[-1, 2]
+        for friction in (1.0, 0.1)
+    ]
+    assert 0 < yaw[1] < 0.5 * yaw[0]
+
+
+def test_a_truck_has_a_trailer() -> None:
+    truck = settings(model="kinematic", parameters="truck", speed_m_per_s=10.0)
+    system = OdeSystem(truck.equations(), np.zeros(4))
+    steered(system, [0.05] * 1000)
+    assert truck.internal_names[-1] == "hitch_angle"
+    assert math.isfinite(system.z[-1])
+    assert system.z[-1] < -0.01  # it follows on the inside
+
+
+def test_the_same_steps_give_the_same_bits() -> None:
+    runs = [
+        steered(OdeSystem(settings(model="multi_body").equations(), X0), [0.01, -0.02] * 20)
+        for _ in "ab"
+    ]
+    assert runs[0].tobytes() == runs[1].tobytes()
+
+
+def test_a_vehicle_is_not_asked_to_go_faster_than_it_can() -> None:
+    with pytest.raises(CallerError, match=r"maximum speed of a truck is 22\.22 m/s"):
+        OdeSystem(
+            settings(model="kinematic", parameters="truck", speed_m_per_s=30.0).equations(),
+            np.zeros(4),
+        )
+
+
+@pytest.mark.parametrize(("given", "said"), [
+    ({"parameters": "truck"}, "parameters: the library has no masses"),
+    ({"friction": 0.5}, 'friction: the model "single_track" has none'),
+])  # fmt: skip
+def test_what_the_library_does_not_have_is_refused(given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        settings(**given)
+
+
+def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("noack.plants.plant_settings.find_spec", lambda name: None)
+    with pytest.raises(CallerError, match=r"pip install 'noack\[vehicle\]'"):
+        settings().require_installed()

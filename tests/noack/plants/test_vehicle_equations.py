@@ -1,0 +1,97 @@
+"""The library's equations, compiled or not, are the library's equations."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from noack.plants.four_tank import FourTankSettings
+from noack.plants.systems import vehicle_equations as compiled
+from noack.plants.systems.vehicle_equations import equations, library
+from noack.plants.vehicle import VehicleSettings
+
+CARS = (1, 2, 3)
+WIDTHS = {"ks": 5, "st": 7, "std": 9, "mb": 29}
+
+
+def parameters(car: int) -> Any:
+    return library(f"parameters_vehicle{car}")()
+
+
+def states(model: str, p: Any) -> np.ndarray:
+    """States on the road and off it: as one starts, slow, spinning, sliding, tilted."""
+    random = np.random.default_rng(7)
+    core = [0.0, 1.0, 0.02, 15.0, 0.1, 0.2, 0.01]
+    start = library(f"init_{model}")(core, p) if model in ("std", "mb") else core[: WIDTHS[model]]
+    tried = np.array(start) + random.normal(size=(40, WIDTHS[model])) * 0.05
+    tried[:10, 3] = random.uniform(-0.2, 0.2, 10)  # slower than 0.1 m/s it is a kinematic model
+    if model == "mb":
+        tried[5:20, 23:27] *= -1.0  # wheels do not spin backwards
+    found: np.ndarray = tried
+    return found
+
+
+@pytest.mark.parametrize("car", CARS)
+@pytest.mark.parametrize("model", WIDTHS)
+def test_they_say_what_the_library_says(model: str, car: int) -> None:
+    p = parameters(car)
+    rates, dynamics = equations(model, p), library(f"vehicle_dynamics_{model}")
+    said = 0
+    for z in states(model, p):
+        for inputs in ([0.1, -1.0], [-5.0, 30.0], [0.0, 0.0]):
+            before = z.copy()
+            try:
+                expected = dynamics(z.tolist(), list(inputs), p)
+            except ZeroDivisionError:  # of a wheel that stands still
+                with pytest.raises(ZeroDivisionError):
+                    rates(z, *inputs)
+            else:
+                said += 1
+                np.testing.assert_allclose(rates(z, *inputs), expected, rtol=1e-12, atol=1e-12)
+            np.testing.assert_array_equal(z, before)
+    assert said > 80
+
+
+@pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
+def test_those_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
+    assert (compiled.compiled_dynamics(model) is not None) == is_compiled
+    assert compiled.is_compiled(model)
+
+
+def test_they_take_the_parameters_that_they_are_given() -> None:
+    slippery, grippy = parameters(2), parameters(2)
+    slippery.tire.p_dy1 *= 0.1
+    z = states("std", grippy)[-1]
+    assert (
+        np.abs(
+            equations("std", slippery)(z, 0.0, 0.0) - equations("std", grippy)(z, 0.0, 0.0)
+        ).max()
+        > 0.1
+    )
+
+
+def test_what_cannot_be_compiled_is_run_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def dynamics(z: Any, inputs: Any, p: Any) -> Any:
+        return [eval("2 * value") for value in z]
+
+    monkeypatch.setattr(compiled, "_dynamics", lambda model: dynamics)
+    monkeypatch.setattr(compiled, "_COMPILED", ("other",))
+    uncached = compiled.compiled_dynamics.__wrapped__
+    monkeypatch.setattr(compiled, "compiled_dynamics", uncached)
+    rates = equations("other", parameters(2))
+    assert rates(np.array([1.0, 3.0]), 0.0, 0.0).tolist() == [2.0, 6.0]
+    told = capsys.readouterr().err.splitlines()
+    assert told[-1].startswith("noack: warning: the vehicle's equations stay slow")
+
+
+def test_they_are_compiled_before_a_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+    monkeypatch.setattr(compiled, "compiled_dynamics", made.append)
+    monkeypatch.setattr(compiled, "is_compiled", lambda model: model == "st")
+    VehicleSettings(kind="vehicle").prepare()
+    VehicleSettings(kind="vehicle", model="multi_body").prepare()
+    VehicleSettings(kind="vehicle", model="kinematic", parameters="truck").prepare()
+    FourTankSettings(kind="four_tank").prepare()
+    assert made == ["mb", "kst"]

@@ -1,0 +1,68 @@
+"""What holds of every policy, whichever files the folder of the policies has."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from noack.config.resolution import policy_of, resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import validate
+from noack.config.triggers import POLICIES
+from noack.trigger.policy_settings import PolicySettings
+from noack.trigger.trigger_policy import Trigger
+
+N = 2
+EXAMPLES = {
+    name: example for name, made in POLICIES.items() if (example := made.example(N)) is not None
+}
+MS = 1_000_000
+
+
+def scenario(content: dict[str, Any], settings: PolicySettings) -> Scenario:
+    table = settings.model_dump(mode="json", exclude_none=True)
+    return validate(content | {"trigger": table}, "here")
+
+
+def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Times every 10 ms, and z = (x, e_s) on smooth curves whose error grows."""
+    rng = np.random.default_rng(seed)
+    t_ns = 10 * MS * np.arange(1, k + 1)
+    phase, rate = rng.uniform(0, 6, 2 * N), rng.uniform(0.2, 3, 2 * N)
+    z = np.sin(phase + np.outer(t_ns * 1e-9, rate))
+    z[:, N:] *= (t_ns * 1e-9)[:, None] * rng.choice([0.01, 0.1, 1.0])
+    return t_ns, z
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_table_gives_the_settings_back(content: dict[str, Any], name: str) -> None:
+    made = scenario(content, EXAMPLES[name])
+    assert made.trigger == EXAMPLES[name]
+    assert made.trigger.policy == name
+    assert Scenario.model_validate_json(json.dumps(made.model_dump(mode="json"))) == made
+    assert len(made.trigger.description.splitlines()) == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_many_measurements_at_once_give_the_event_that_they_give_one_by_one(
+    content: dict[str, Any], name: str, seed: int
+) -> None:
+    policy = policy_of(resolve(scenario(content, EXAMPLES[name])))
+    at_once, one_by_one = Trigger(policy), Trigger(policy)
+    t_ns, z = samples(seed, 400)
+    start = np.array([0.5, -0.3])
+    for trigger in (at_once, one_by_one):
+        trigger.start(0, start)
+    decisions = (one_by_one.test(int(t), x[:N], x[N:]) for t, x in zip(t_ns, z, strict=True))
+    expected = next((k for k, decision in enumerate(decisions) if decision.event), None)
+    found = None
+    for begin in range(0, len(z), 32):  # in blocks: what is accumulated goes on
+        block = slice(begin, begin + 32)
+        k = at_once.first_event(t_ns[block], z[block, :N], z[block, N:])
+        if k is not None:
+            found = begin + k
+            break
+    assert found == expected
