@@ -170,7 +170,7 @@ $(VENV)/.installed: requirements.lock pyproject.toml | $(VENV)/bin/python
 	@touch $@
 
 # For `make setup` alone: a run of the loop needs none of it, and the first start would compile it, too.
-COMPILED := netem/*.py netem/rules/*.py netem/engine/*.py netem/engine/pump/*.py netem/capture/*.py
+COMPILED := noack/impairments/*.py noack/impairments/*/*.py netem/*.py netem/rules/*.py netem/engine/*.py netem/engine/pump/*.py netem/capture/*.py
 $(VENV)/.compiled: $(VENV)/.installed $(wildcard $(COMPILED))
 	@$(BIN)/noack netem --compile
 	@touch $@

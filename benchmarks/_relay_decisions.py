@@ -12,8 +12,10 @@ from netem.engine.compiled_rules import compile_rule, compiled_program, compiled
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import PacketDecision, dtype_of
-from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_records import PacketDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.protocol.record_tables import Fate
 
 LOSS = 0.5

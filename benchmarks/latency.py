@@ -43,7 +43,7 @@ def rows_of(settings: str, rounds: Rounds, refused: str) -> list[Row]:
 
 
 def _refused(granted: Mapping[str, str]) -> set[str]:
-    return {setting for setting, verdict in granted.items() if verdict.startswith("refused")}
+    return {setting for setting, verdict in granted.items() if verdict.startswith("not permitted")}
 
 
 def measure(options: argparse.Namespace) -> list[Row]:

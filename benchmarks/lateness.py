@@ -95,7 +95,7 @@ def measure(options: argparse.Namespace) -> list[Row]:
                 found = ticks(kind, ROUND_S, PERIOD_US, asked=asked)
                 figures = {"p50": found.p50_us, "p99": found.p99_us, "max": found.max_us}
                 sides.add(kind, figures)
-                if asked and found.granted["sched_fifo"] != "granted":
+                if asked and found.granted["sched_fifo"] != "applied":
                     sides.add(OURS, f"SCHED_FIFO {found.granted['sched_fifo']}")
     return rows_of(rounds)
 

@@ -9,13 +9,19 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import Counters, FlowState, PacketDecision, RecordedDecision, StageMemory
 from netem.rules.link_rules import admit, leave
-from netem.rules.mansd import NEVER_NS
 from netem.rules.settings_change import carry
-from noack.config.impairments import LinkSettings
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.scenario import Scenario
+from noack.impairments.link_records import (
+    NEVER_NS,
+    Counters,
+    FlowState,
+    PacketDecision,
+    RecordedDecision,
+    StageMemory,
+)
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import BEGINNING, Notice, Record, Start
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -80,7 +86,7 @@ class Link:
         self._state = empty_state(self._program)._replace(
             flows=self._flows, memory=self._memory, recent_ns=self._recent_ns
         )
-        self._verdict = PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0)
+        self._decision = PacketDecision()
         self._in_flight: list[_InFlight] = []
         self._put_in_flight = 0
         self._inputs = self._first_number = first_number
@@ -91,9 +97,9 @@ class Link:
         return self._state.counters
 
     @property
-    def verdict(self) -> PacketDecision:
+    def decision(self) -> PacketDecision:
         """What was decided of the last datagram; overwritten by the next."""
-        return self._verdict
+        return self._decision
 
     @property
     def in_flight(self) -> int:
@@ -155,37 +161,37 @@ class Link:
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
         """Take a datagram; return it if it survives and is not delayed."""
-        verdict = self.decide(message.flow, len(message.data), now_ns)
+        decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
-            self._inputs, self._first_number + verdict.packet, now_ns, now_ns, message.flow,
-            Fate(verdict.fate), verdict.run, verdict.release_ns, verdict.copy_ns, verdict.bit,
-            len(message.data), head,
+            self._inputs, self._first_number + decision.packet, now_ns, now_ns, message.flow,
+            Fate(decision.fate), decision.consecutive_losses, decision.release_ns,
+            decision.copy_ns, decision.bit, len(message.data), head,
         )  # fmt: skip
         self._inputs += 1
         record = Record(NETEM_PACKET, row)
-        if verdict.release_ns == NEVER_NS:
+        if decision.release_ns == NEVER_NS:
             return (record,)
         outputs: list[Datagram | Record | Notice] = []
-        intact = verdict.bit < 0
+        intact = decision.bit < 0
         self._release(
-            outputs, message, verdict.release_ns, verdict.bit, now_ns, copy=False, counts=intact
+            outputs, message, decision.release_ns, decision.bit, now_ns, copy=False, counts=intact
         )
-        if verdict.copy_ns != NEVER_NS:
-            counts = not intact and verdict.copy_bit < 0
+        if decision.copy_ns != NEVER_NS:
+            counts = not intact and decision.copy_bit < 0
             self._release(
-                outputs, message, verdict.copy_ns, verdict.copy_bit, now_ns,
+                outputs, message, decision.copy_ns, decision.copy_bit, now_ns,
                 copy=True, counts=counts,
             )  # fmt: skip
         return (*outputs, record)
 
     def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
-        """Return what becomes of a flow's next datagram; the verdict is overwritten by the next."""
+        """Decide for a flow's next packet; the decision is overwritten by the next one."""
         row = self._rows.get(flow)
         if row is None:
             row = self._add_flow(flow)
-        admit(self._program, self._state, row, size_bytes, now_ns, self._verdict)
-        return self._verdict
+        admit(self._program, self._state, row, size_bytes, now_ns, self._decision)
+        return self._decision
 
     def _release(
         self,
@@ -203,7 +209,7 @@ class Link:
             message = message._replace(data=flipped(message.data, bit))
         self._put_in_flight += 1
         leaving = _InFlight(
-            release_ns, self._put_in_flight, self._verdict.packet, copy, counts,
+            release_ns, self._put_in_flight, self._decision.packet, copy, counts,
             release_ns > now_ns, message,
         )  # fmt: skip
         # What was due before leaves before, even if nobody has come to let it out.

@@ -104,13 +104,13 @@ def _cores(machine: MachineFacts) -> MachineFinding:
 
 
 def _settings(machine: MachineFacts, wanted: RunRequirements) -> Iterator[MachineFinding]:
-    granted = [said for name, said in _SETTINGS.items() if machine.granted.get(name) == "granted"]
+    granted = [said for name, said in _SETTINGS.items() if machine.granted.get(name) == "applied"]
     what = "real-time settings"
     if granted:
-        yield MachineFinding(what, FindingStatus.GOOD, f"granted: {', '.join(granted)}", "")
+        yield MachineFinding(what, FindingStatus.GOOD, f"applied: {', '.join(granted)}", "")
     for name, said in _SETTINGS.items():
         answer = machine.granted.get(name, "not known")
-        if not answer.startswith("refused"):
+        if not answer.startswith("not permitted"):
             continue
         if wanted.realtime:
             means, verdict = "a run goes on without it, and says so", FindingStatus.LIMITED

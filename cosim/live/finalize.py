@@ -1,4 +1,4 @@
-"""The conclusion of a run: its record made whole, its summary written."""
+"""The end of a run: its record completed, its summary and report written."""
 
 import sys
 from collections.abc import Iterator
@@ -24,10 +24,10 @@ from cosim.record.run_directory import (
     REPORT_FILE,
     SCENARIO_FILE,
     SUMMARY_FILE,
-    concluded,
+    finished_run,
     read_object,
 )
-from cosim.record.run_ending import RunEnding, store_ending
+from cosim.record.run_ending import EndingFile, RunEnding
 from cosim.record.run_record import RunRecord, finish_record, load_record
 from noack.core.errors import CallerError, ExitStatus, MachineError, why
 from noack.runtime.spool import SPOOL
@@ -35,9 +35,18 @@ from noack.runtime.spool import SPOOL
 
 @np.errstate(all="ignore")
 def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
-    """Finish what a dead recorder left undone; write summary and, unless told otherwise, report."""
+    """Complete the record of a run; write its summary and report.
+
+    Args:
+        ending: how the run ended.
+        report: whether to write the report.
+
+    Raises:
+        CallerError: the run is still under way.
+        MachineError: record or summary cannot be written.
+    """
     run_dir = ending.run_dir
-    with _told_with(ending), concluded(run_dir):
+    with _with_reason(ending), finished_run(run_dir):
         if (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir():
             record = finish_record(run_dir)
             from cosim.output.viewer.run_view import write_view
@@ -52,20 +61,28 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         summary = _with_results(record, claims, summary)
         _write_summary(run_dir, summary)
         status, reason = ExitStatus(summary.exit.status), summary.exit.reason
-        store_ending(replace(ending, status=status, reason=reason))
+        if (ending.status, ending.reason) != (status, reason):
+            _correct_ending(replace(ending, status=status, reason=reason))
         content = summary.to_json()
         try:
             if report:
                 _report(record, content, run_dir, claims)
-        except Exception as error:  # whatever it is: a run is none the worse for it
+        except Exception as error:  # whatever it is, the run itself is not affected
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
     return Outcome(run_dir, status, reason, content)
 
 
+def _correct_ending(ending: RunEnding) -> None:
+    """Let the launcher's file agree with the summary."""
+    if (ending.run_dir / ENDING_FILE).is_file():
+        with suppress(MachineError), EndingFile(ending.run_dir) as file:
+            file.store(ending.status, ending.reason, ending.startup_s)
+
+
 @contextmanager
-def _told_with(ending: RunEnding) -> Iterator[None]:
-    """Let an error that keeps the record from being finished say how the run ended, too."""
+def _with_reason(ending: RunEnding) -> Iterator[None]:
+    """Add the reason of a failed run to an error that prevents the completion of its record."""
     try:
         yield
     except MachineError as error:
@@ -84,7 +101,7 @@ def _write_summary(run_dir: Path, summary: RunSummary) -> None:
         with suppress(OSError):
             scratch.unlink(missing_ok=True)
         raise MachineError(
-            f"{path}: cannot be written: {why(error)}; `noack summary {run_dir}` does it later"
+            f"{path}: cannot be written: {why(error)}; try `noack summary {run_dir}` later"
         ) from None
 
 
@@ -127,7 +144,7 @@ def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:
 
 
 def reopen(run_dir: Path) -> Outcome:
-    """Return the outcome of an earlier run; finish its record if nobody did.
+    """Return the outcome of an earlier run; complete its record and summary if necessary.
 
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
@@ -136,25 +153,25 @@ def reopen(run_dir: Path) -> Outcome:
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     summary = read_object(run_dir / SUMMARY_FILE)
     ending = _ending(run_dir, summary)
-    # It is of an earlier version or damaged; or a process woke up after the end.
+    # The summary is missing or damaged; or a process that was frozen spooled rows after the end.
     if not can_be_shown(summary) or (run_dir / SPOOL).is_dir():
         return finalize(ending)
     return Outcome(run_dir, ending.status, ending.reason, summary)
 
 
 def _ending(run_dir: Path, summary: Summary) -> RunEnding:
-    """How a run ended, as its summary has it, or else as its launcher stored it."""
-    for said in (summary, read_object(run_dir / ENDING_FILE)):
+    """How a run ended, from its summary or else from its launcher's file."""
+    for found in (summary, read_object(run_dir / ENDING_FILE)):
         with suppress(LookupError, TypeError, ValueError):
-            status, reason = ExitStatus(said["exit"]["status"]), str(said["exit"]["reason"])
-            return RunEnding(run_dir, 0, status, reason, said["startup_s"])
-        summary.clear()  # without an end, nothing of it can be trusted
+            status, reason = ExitStatus(found["exit"]["status"]), str(found["exit"]["reason"])
+            return RunEnding(run_dir, 0, status, reason, found["startup_s"])
+        summary.clear()  # a summary without an exit cannot be trusted
     return RunEnding(run_dir, 0, ExitStatus.FAILED, "the launcher ended early")
 
 
 @np.errstate(all="ignore")
 def rewrite_report(run_dir: Path) -> Path:
-    """Write the report of an earlier run anew, and return its path.
+    """Write the report of an earlier run again, and return its path.
 
     Raises:
         CallerError: it is not a run directory, or the run is still under way.
@@ -167,11 +184,11 @@ def rewrite_report(run_dir: Path) -> Path:
 
 def _report(record: RunRecord, summary: Summary, run_dir: Path, claims: RunClaims) -> Path:
     from cosim.output.report.report_file import (
-        write_report,  # imports matplotlib, which no process needs sooner
+        write_report,  # imports matplotlib
     )
 
     try:
         envelopes = claims.envelopes()
-    except Exception:  # the page is worth having without them
+    except Exception:  # the report is useful without them
         envelopes = []
     return write_report(record, summary, run_dir, envelopes)

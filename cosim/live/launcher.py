@@ -21,7 +21,7 @@ from cosim.live.disk_space import require_disk_space
 from cosim.live.restart_policy import RestartPolicy
 from cosim.live.start_limit import DEFAULT_S, StartLimit
 from cosim.record.environment import write_environment
-from cosim.record.run_directory import in_flight, new_run_dir, point_to_latest, write_scenario
+from cosim.record.run_directory import active_run, new_run_dir, point_to_latest, write_scenario
 from cosim.record.run_ending import EndingFile, RunEnding
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
@@ -93,7 +93,7 @@ def launch(
     ticket = new_ticket(resolved, endpoint, run_dir.resolve(), launched=True)
     children = ChildProcesses(ticket, run_dir, spawn)
     with Signals().handled() as signals, contextlib.ExitStack() as stack:
-        stack.enter_context(in_flight(run_dir))
+        stack.enter_context(active_run(run_dir))
         ending = stack.enter_context(EndingFile(run_dir))
         coordinator = Coordinator(ticket)
         stack.callback(coordinator.close)

@@ -18,7 +18,7 @@ from cosim.output.viewer.live_viewer import LiveView
 from cosim.output.viewer.recording import RunView, ViewError
 from cosim.output.viewer.run_view import open_view, write_view
 from cosim.output.viewer.table_feed import ViewFeed
-from cosim.record.run_directory import in_flight
+from cosim.record.run_directory import active_run
 from cosim.record.run_record import Rows, RunRecord, finish_record, report_of, write_reports
 from noack.config.parameter_changes import ParameterChange, said_of
 from noack.config.runtime_parameters import is_of_loss_alone
@@ -282,7 +282,7 @@ def main(arguments: Sequence[str] | None = None) -> ExitStatus:
     live = "--live" in (sys.argv[1:] if arguments is None else arguments)
 
     def body(process: RunProcess) -> None:
-        with in_flight(Path(process.ticket.run_dir)), ExitStack() as stack:
+        with active_run(Path(process.ticket.run_dir)), ExitStack() as stack:
             live_view = None
             if live and not process.start.is_restart:
                 live_view = LiveView()

@@ -9,7 +9,7 @@ from typing import Protocol
 from cosim.record.environment import write_environment
 from cosim.record.run_directory import (
     REPORTS_FILE,
-    in_flight,
+    active_run,
     new_run_dir,
     point_to_latest,
     write_scenario,
@@ -58,7 +58,7 @@ def simulate_run(
     run_dir = new_run_dir(runs, resolved.name)
     run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
     try:
-        with in_flight(run_dir), EndingFile(run_dir) as ending:
+        with active_run(run_dir), EndingFile(run_dir) as ending:
             resolved = write_scenario(resolved, run_dir)
             write_environment(run_dir, "simulated")
             record = simulator(resolved, progress=progress)

@@ -286,8 +286,8 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
     for role in sorted(realtime):
         verdicts = realtime[role]
         text = ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items())
-        if set(verdicts.values()) == {"granted"}:
-            text = "all granted"
+        if set(verdicts.values()) == {"applied"}:
+            text = "all applied"
         roles_by_settings.setdefault(text, []).append(role)
     for text, roles in roles_by_settings.items():
         whose = "" if len(roles) == len(realtime) else f" of {', '.join(roles)}"

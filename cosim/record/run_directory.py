@@ -1,20 +1,20 @@
 """The run directory: the names of what it holds, and where the newest one is."""
 
 import contextlib
-import fcntl
 import json
 import os
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps
 from noack.core.errors import CallerError, MachineError, why
+from noack.core.file_lock import locked
 from noack.core.regular_file import read_regular
 from noack.settings.user_files import file_tables, unchanged, with_tables
 
@@ -145,35 +145,35 @@ def chosen_run(run_dir: Path | None, runs: Path) -> Path:
 
 
 @contextmanager
-def in_flight(run_dir: Path) -> Iterator[None]:
-    """Mark a run as under way; the launcher and the recorder do, each for as long as it lives.
+def active_run(run_dir: Path) -> Iterator[None]:
+    """Mark a run as active; its launcher and its recorder do so while they live.
 
     Raises:
         MachineError: the directory cannot be written.
     """
-    with _lock_file(run_dir) as lock:
-        fcntl.flock(lock, fcntl.LOCK_SH)
+    with _locked(run_dir, shared=True):
         yield
 
 
 @contextmanager
-def concluded(run_dir: Path) -> Iterator[None]:
-    """Have a run directory to oneself.
+def finished_run(run_dir: Path) -> Iterator[None]:
+    """Lock the directory of a run that has ended.
 
     Raises:
         CallerError: the run is still under way.
         MachineError: the directory cannot be written.
     """
-    with _lock_file(run_dir) as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CallerError(f"{run_dir}: the run is still under way") from None
+    with _locked(run_dir) as alone:
+        if not alone:
+            raise CallerError(f"{run_dir}: the run is still under way")
         yield
 
 
-def _lock_file(run_dir: Path) -> TextIO:
-    try:
-        return (run_dir / _LOCK).open("a")
-    except OSError as error:
-        raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
+@contextmanager
+def _locked(run_dir: Path, *, shared: bool = False) -> Iterator[bool]:
+    with ExitStack() as stack:
+        try:
+            alone = stack.enter_context(locked(run_dir / _LOCK, shared=shared, wait=shared))
+        except OSError as error:
+            raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
+        yield alone

@@ -65,20 +65,9 @@ class EndingFile:
     def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
         """Store how the run ended, under the keys of its summary."""
         self._is_blank = False
-        text = _content(status, reason, startup_s).ljust(_RESERVED_BYTES)
+        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        text = json.dumps(found).encode().ljust(_RESERVED_BYTES)
         with contextlib.suppress(OSError):  # the terminal shows it, too
             self._file.seek(0)
             self._file.write(text)
             self._file.truncate()
-
-
-def store_ending(ending: RunEnding) -> None:
-    """Store the final result of a run: its record may show a failure that the launcher missed."""
-    with contextlib.suppress(OSError):  # the summary has it, too
-        content = _content(ending.status, ending.reason, ending.startup_s)
-        (ending.run_dir / ENDING_FILE).write_bytes(content)
-
-
-def _content(status: ExitStatus, reason: str, startup_s: float | None) -> bytes:
-    found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
-    return json.dumps(found).encode()

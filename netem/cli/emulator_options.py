@@ -8,12 +8,10 @@ from pathlib import Path
 
 from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
-from netem.words.quantities import OWN_TIME_S
-from netem.words.word_examples import require_no_dashes
-from netem.words.words_to_settings import KEYWORDS, parse, settings_of
-from noack.config.impairment_files import read_files
-from noack.config.impairments import LinkSettings
+from netem.words.words_to_settings import KEYWORDS, parse, require_no_dashes, settings_of
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.quantities import OWN_TIME_S
 from noack.runtime.address import parse_address
 from noack.runtime.command_line import Parser
 from noack.runtime.process_entry import add_options

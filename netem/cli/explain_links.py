@@ -13,10 +13,10 @@ from rich.text import Text
 
 from netem.engine.relay_interface import LinkSpec
 from netem.loss_prediction import predict
-from netem.words.explanation import meaning_of, settings_meaning
-from netem.words.settings_to_words import impairment_text, text_of
+from netem.words.explanation import settings_meaning
 from netem.words.tc_command import tc_command
-from noack.config.impairments import LinkSettings
+from netem.words.words_to_settings import text_of
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of as address_text
 
 _FROM_TO = {"forward": "from clients to the server", "reverse": "from the server to clients"}
@@ -100,7 +100,7 @@ def _document(settings: LinkSettings) -> DirectionExplanation:
     return {
         "words": text_of(settings),
         "settings": settings.model_dump(mode="json", exclude_none=True),
-        "meaning": [meaning_of(one) for one in settings.impairments]
+        "meaning": [one.meaning() for one in settings.impairments]
         + [f"{words}: {meaning}" for words, meaning in settings_meaning(settings)],
         "predicted_loss": prediction.rate,
         "predicted_loss_note": prediction.note,
@@ -146,7 +146,7 @@ def _table(settings: LinkSettings, width: int) -> Table:
     table.add_column(overflow="fold")
     for number, one in enumerate(settings.impairments, 1):
         # As text: a bracket in a file's name is not markup.
-        words, meaning = _cut(impairment_text(one), 200), meaning_of(one)
+        words, meaning = _cut(one.text(), 200), one.meaning()
         table.add_row(str(number), Text(words), Text(meaning))
     if not settings.impairments:
         table.add_row("", "", "no impairment")

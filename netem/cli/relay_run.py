@@ -18,8 +18,8 @@ from netem.engine.relay_interface import DIRECTIONS, Direction, LinkSpec, Relay,
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
 from netem.standard_error import say
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.address import text_of
 from noack.runtime.real_time_settings import realtime
 from noack.runtime.signals import Signals

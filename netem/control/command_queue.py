@@ -15,10 +15,10 @@ from typing import Any, NamedTuple, TypeVar
 
 from netem.engine.relay_interface import DIRECTIONS, Direction, LinkReport, Relay
 from netem.loss_prediction import predicted_loss
-from netem.rule_records import Counters
-from netem.words.settings_to_words import text_of
-from noack.config.impairments import LinkSettings
+from netem.words.words_to_settings import text_of
 from noack.core.errors import PeerError
+from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import LinkSettings
 
 T = TypeVar("T")
 

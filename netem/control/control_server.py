@@ -11,9 +11,9 @@ A running emulator listens on a free TCP port of the loopback interface. Its ses
 A query is a JSON object. It must hold ``token``, the secret of the session file. ``change`` takes
 ``link`` (optional if there is one), ``direction`` (``forward``, the default, ``reverse`` or
 ``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
-:class:`~noack.config.impairments.LinkSettings`). The new settings replace the old ones, as with
-``tc qdisc change``. The client reads files that words name, and sends their content. A query with a
-mistake is answered with one line, and changes nothing.
+:class:`~noack.impairments.link_settings.LinkSettings`). The new settings replace the old ones, as
+with ``tc qdisc change``. The client reads files that words name, and sends their content. A query
+with a mistake is answered with one line, and changes nothing.
 
 zenoh asks each connection for the secret as a password, by challenge and response, so that the
 secret itself is never sent. Each query is checked for it again.
@@ -39,11 +39,13 @@ from netem.control.emulator_session import Session, published
 from netem.control.emulator_statistics import Statistics
 from netem.control.statistics_thread import StatisticsThread
 from netem.engine.relay_interface import DIRECTIONS, Direction
-from netem.words.settings_to_words import text_of
-from netem.words.words_to_settings import settings_of
-from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
+from netem.words.words_to_settings import settings_of, text_of
 from noack.config.validation_messages import brief
 from noack.core.errors import CallerError, MachineError, NoackError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.runtime.udp_sockets import LOOPBACK, free_tcp_port
 from noack.runtime.zenoh_session import SessionSecret, cause_of, open_session
 

@@ -17,11 +17,9 @@ from netem.control.live_screen import Screen
 from netem.control.statistics_history import History
 from netem.control.statistics_view import render
 from netem.engine.relay_interface import DIRECTIONS
-from netem.words.word_examples import require_no_dashes
-from netem.words.words_to_settings import settings_of
-from noack.config.impairment_files import read_files
-from noack.config.impairments import LinkSettings
+from netem.words.words_to_settings import require_no_dashes, settings_of
 from noack.core.errors import CallerError, ExitStatus, NoackError
+from noack.impairments.link_settings import LinkSettings, read_files
 from noack.runtime.command_line import Parser, failed
 from noack.runtime.signals import Signals
 

@@ -19,8 +19,8 @@ from netem.engine.relay_interface import (
     FlowReport,
     LinkReport,
 )
-from netem.rule_records import Counters
 from noack.core.clock import NS_PER_S
+from noack.impairments.link_records import Counters
 from noack.protocol.record_tables import Fate
 from noack.runtime.address import text_of
 

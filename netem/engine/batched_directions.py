@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from netem.engine.compiled_pump import functions
 from netem.engine.compiled_rules import compiled_program, compiled_state, set_flow
-from netem.engine.pump.pump_layout import TABLES
+from netem.engine.pump.pump_layout import STATES, TABLES
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import RecordedDecision
-from netem.rules.link_rules import LinkMemory, LinkProgram
-from noack.config.impairments import Corrupt, LinkSettings
+from noack.impairments.link_records import LinkMemory, LinkProgram, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
 
 _ROWS = 16
 
@@ -34,8 +33,8 @@ class BatchedDirection:
         name: of the link and the direction.
         decisions: recorded ones, of each flow.
         row: its row of :data:`netem.engine.pump.pump_layout.DIRECTION`, (1,).
-        link_state: its row of :class:`netem.rule_records.LinkState`, (1,).
-        counters: its row of :class:`netem.rule_records.Counters`, (1,).
+        link_state: its row of :class:`noack.impairments.link_records.LinkState`, (1,).
+        counters: its row of :class:`noack.impairments.link_records.Counters`, (1,).
     """
 
     def __init__(
@@ -105,16 +104,15 @@ class BatchedDirection:
             table: Any = getattr(self.program, name)
             row[name] = table.ctypes.data
             row[f"{name}_rows"] = len(table)
-        for name in ("mansd", "limit", "scored", "tracks"):
+        for name in ("mansd", "limit", "tracks"):
             row[name] = getattr(self.program, name)
-        corrupts = any(isinstance(one, Corrupt) for one in self.settings.impairments)
-        row["keeps"] = self.program.tracks or corrupts
+        flips_bits = any(one.flips_bits for one in self.settings.impairments)
+        row["keeps"] = self.program.tracks or flips_bits
         state: Any = self.state
-        for name in ("flows", "memory", "recent_ns", "queues", "departures_ns"):
+        for name in STATES:
             row[name] = getattr(state, name).ctypes.data
         row["rows"] = len(state.flows)
         row["width"] = state.recent_ns.shape[1]
-        row["queue_rows"] = len(state.queues)
         row["departure_rows"] = len(state.departures_ns)
 
 

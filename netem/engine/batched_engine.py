@@ -39,9 +39,9 @@ from netem.engine.relay_sockets import raise_file_limit, stamp_arrivals
 from netem.engine.socket_names import name_of
 from netem.engine.unintended_losses import UnintendedLosses
 from netem.engine.unreachable_servers import UnreachableServers
-from netem.rule_records import Counters, PacketDecision, dtype_of
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_records import Counters, PacketDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import LOOPBACK, drops_of
 
 _PERIOD_NS = 20_000_000

@@ -17,36 +17,38 @@ from numpy.typing import NDArray
 
 import netem.engine.pump
 import netem.rules
-from netem import relay_events, rule_records
+import noack.impairments
+from netem import relay_events
 from netem.engine import histogram
 from netem.rule_program import new_flow
-from netem.rule_records import array_of, dtype_of
-from netem.rules.link_rules import LinkMemory, LinkProgram
-from netem.rules.mansd import NEVER_NS
 from noack.core import code_cache
 from noack.core.code_cache import cache_folder, compiler
-
-_PROGRAM = {
-    "stages": rule_records.RuleStage,
-    "chances": rule_records.ChanceSettings,
-    "chains": rule_records.GilbertElliottSettings,
-    "four_states": rule_records.FourStateSettings,
-    "scripts": rule_records.ScriptSettings,
-    "waits": rule_records.DelaySettings,
-    "bottlenecks": rule_records.RateSettings,
-    "darknesses": rule_records.BlackoutSettings,
-    "decisions": rule_records.RecordedDecision,
-}
+from noack.impairments import link_records
+from noack.impairments.link_records import (
+    NEVER_NS,
+    LinkMemory,
+    LinkProgram,
+    array_of,
+    dtype_of,
+    union_dtype,
+)
+from noack.impairments.stage_dispatch import (
+    BEHAVIOURS,
+    QUEUE_RECORDS,
+    STAGE_RECORDS,
+    apply_stage,
+)
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:
-    """Return a program as arrays, for compiled rules."""
+    """Return a program as arrays, for compiled rules; a row of ``stages`` has the fields of all."""
     tables: dict[str, Any] = {
-        name: array_of(record, getattr(program, name)) for name, record in _PROGRAM.items()
+        "stages": array_of(union_dtype(STAGE_RECORDS), program.stages),
+        "decisions": array_of(dtype_of(link_records.RecordedDecision), program.decisions),
+        "reals": np.array(program.reals, dtype=np.float64),
     }
     for name in ("integers", "decisions_begin"):
         tables[name] = np.array(getattr(program, name), dtype=np.int64)
-    tables["reals"] = np.array(program.reals, dtype=np.float64)
     return program._replace(**tables)
 
 
@@ -60,13 +62,13 @@ def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: in
         width: length of the rings of release times.
     """
     arrays: dict[str, Any] = {
-        "flows": np.zeros(rows, dtype_of(rule_records.FlowState)),
-        "memory": np.zeros((rows, len(program.stages)), dtype_of(rule_records.StageMemory)),
+        "flows": np.zeros(rows, dtype_of(link_records.FlowState)),
+        "memory": np.zeros((rows, len(program.stages)), dtype_of(link_records.StageMemory)),
         "recent_ns": np.zeros((rows, width), np.int64),
-        "queues": array_of(rule_records.QueueState, state.queues),
+        "queues": array_of(union_dtype(QUEUE_RECORDS), state.queues),
         "departures_ns": np.array(state.departures_ns, dtype=np.int64),
-        "link": array_of(rule_records.LinkState, [state.link])[0],
-        "counters": array_of(rule_records.Counters, [state.counters])[0],
+        "link": array_of(dtype_of(link_records.LinkState), [state.link])[0],
+        "counters": array_of(dtype_of(link_records.Counters), [state.counters])[0],
     }
     return LinkMemory(**arrays)
 
@@ -74,7 +76,7 @@ def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: in
 def set_flow(state: LinkMemory, row: int, number: int, first_delivered: bool) -> None:
     """Let a row of a state of arrays be that of a new flow."""
     flows, memory, recent_ns = _arrays(state)
-    flows[row] = array_of(rule_records.FlowState, [new_flow(number, first_delivered)])[0]
+    flows[row] = array_of(flows.dtype, [new_flow(number, first_delivered)])[0]
     memory[row] = np.zeros(1, memory.dtype)
     recent_ns[row] = NEVER_NS
 
@@ -115,7 +117,7 @@ def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
     """
     _prepare()
     _register(modules)
-    sources = (*_compiled_modules(), *modules, rule_records, relay_events)
+    sources = (*_compiled_modules(), *modules, relay_events)
     return cache_folder(name, (Path(str(module.__file__)) for module in sources))
 
 
@@ -134,21 +136,61 @@ def _prepare() -> Path | None:
     """Let compiled code call the rules; return where it is kept, if it is."""
     modules = list(_compiled_modules())
     _register(modules)
-    sources = (*modules, rule_records, relay_events)
+    sources = (*modules, relay_events)
     return cache_folder("netem", (Path(str(module.__file__)) for module in sources))
 
 
 def _register(modules: Sequence[ModuleType]) -> None:
-    from numba.extending import register_jitable
+    from numba.extending import overload, register_jitable
 
     for module in modules:
         for _, function in inspect.getmembers(module, inspect.isfunction):
-            if function.__module__ == module.__name__:
+            if function is apply_stage:
+                options: Any = _OPTIONS
+                overload(apply_stage, jit_options=options)(compiled_dispatch)
+            elif function.__module__ == module.__name__:
                 register_jitable(**_OPTIONS)(function)
 
 
+def compiled_dispatch(
+    program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
+) -> Callable[..., None]:
+    """Return :func:`noack.impairments.stage_dispatch.apply_stage` for compiled code.
+
+    It compares a stage's kind with each behaviour's number in turn: ``if kind == 0: ... else: if
+    kind == 1: ...``; the compiler makes a jump table of it.
+    """
+    return _comparisons()
+
+
+@cache
+def _comparisons() -> Callable[..., None]:
+    from numba.extending import register_jitable
+
+    def nothing(
+        program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
+    ) -> None:
+        pass
+
+    def one(kind: int, behaviour: Any, others: Any) -> Callable[..., None]:
+        def dispatch(
+            program: Any, state: Any, stage: Any, memory: Any, flow: Any, decision: Any
+        ) -> None:
+            if stage.kind == kind:
+                behaviour(program, state, stage, memory, flow, decision)
+            else:
+                others(program, state, stage, memory, flow, decision)
+
+        return dispatch
+
+    chain: Callable[..., None] = register_jitable(**_OPTIONS)(nothing)
+    for kind in reversed(range(len(BEHAVIOURS))):
+        chain = register_jitable(**_OPTIONS)(one(kind, BEHAVIOURS[kind].apply, chain))
+    return chain
+
+
 def _compiled_modules() -> Iterator[ModuleType]:
-    for package in (netem.rules, netem.engine.pump):
-        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+    for package in (noack.impairments, netem.rules, netem.engine.pump):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             yield importlib.import_module(found.name)
     yield histogram

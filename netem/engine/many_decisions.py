@@ -1,9 +1,9 @@
-"""Decisions for many datagrams at once, without sockets: for tests, planning and benchmarks."""
+"""Decisions for many packets at once, without sockets: for tests, planning and benchmarks."""
 
 from collections.abc import Sequence
 
-from netem.rule_records import PacketDecision
-from netem.rules.link_rules import LinkMemory, LinkProgram, admit
+from netem.rules.link_rules import admit
+from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
 
 
 def admit_many(
@@ -12,11 +12,11 @@ def admit_many(
     flows: Sequence[int],
     sizes_bytes: Sequence[int],
     arrivals_ns: Sequence[int],
-    verdicts: Sequence[PacketDecision],
+    decisions: Sequence[PacketDecision],
 ) -> None:
-    """Decide what becomes of k datagrams, in the order of their arrival; see :func:`admit`."""
+    """Decide for k packets, in the order of their arrival; see :func:`admit`."""
     for number in range(len(flows)):
         admit(
             program, state, flows[number], sizes_bytes[number], arrivals_ns[number],
-            verdicts[number],
+            decisions[number],
         )  # fmt: skip

@@ -8,8 +8,8 @@ from netem.engine.histogram import bucket_of, empty
 from netem.engine.relay_interface import Direction, DirectionReport, FlowReport, LinkSpec
 from netem.engine.unintended_losses import UnintendedLosses
 from netem.link_machine import Datagram, Link
-from netem.rule_records import PacketDecision
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_records import PacketDecision
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import NETEM_RELEASE
 
@@ -64,17 +64,17 @@ class PlainDirection:
     ) -> tuple[PacketDecision, Sequence[ScheduledDeparture]]:
         """Decide what becomes of a datagram; return what leaves at once."""
         outputs = self.link.handle(Datagram(flow, data), now_ns)
-        verdict = self.link.verdict
-        times_ns = (verdict.release_ns, verdict.copy_ns)
-        bits = (verdict.bit, verdict.copy_bit)
+        decision = self.link.decision
+        times_ns = (decision.release_ns, decision.copy_ns)
+        bits = (decision.bit, decision.copy_bit)
         left = sum(t_ns > now_ns for t_ns in times_ns)
         if left:
-            self._kept[flow, verdict.packet] = _Kept(now_ns, verdict.fate, bits, left)
+            self._kept[flow, decision.packet] = _Kept(now_ns, decision.fate, bits, left)
         now = [which for which in range(2) if times_ns[which] == now_ns]
         datagrams = [output for output in outputs if isinstance(output, Datagram)]
-        return verdict, [
+        return decision, [
             ScheduledDeparture(
-                flow, datagram.data, verdict.packet, verdict.fate, now_ns, now_ns, bits[which],
+                flow, datagram.data, decision.packet, decision.fate, now_ns, now_ns, bits[which],
                 delayed=False, copy=which == 1, stale=False,
             )
             for which, datagram in zip(now, datagrams, strict=True)

@@ -31,8 +31,8 @@ from netem.engine.relay_sockets import (
     return_path,
 )
 from netem.engine.unreachable_servers import UnreachableServers
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import MAX_UDP_BYTES, drops_of
 
 _PERIOD_NS = 20_000_000

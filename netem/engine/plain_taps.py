@@ -9,8 +9,7 @@ import numpy as np
 from netem.engine.plain_direction import ScheduledDeparture
 from netem.engine.relay_interface import Address, Tap
 from netem.relay_events import ADDRESS_BYTES, EVENT
-from netem.rule_records import PacketDecision
-from netem.rules.mansd import NEVER_NS
+from noack.impairments.link_records import NEVER_NS, PacketDecision
 
 _MOST = 512
 
@@ -64,7 +63,7 @@ class PlainTaps:
         """Tell that a datagram has come, and what was decided."""
         event = self._add(way, ends, way.back, data, now_ns)
         event["flow"], event["packet"], event["fate"] = flow, verdict.packet, verdict.fate
-        event["run"] = verdict.run
+        event["run"] = verdict.consecutive_losses
         event["delay_ns"] = _delay(verdict.release_ns, now_ns)
         event["copy_delay_ns"] = _delay(verdict.copy_ns, now_ns)
         event["hold_back_ns"] = verdict.hold_back_ns

@@ -10,7 +10,7 @@ from netem.engine.histogram import BUCKETS
 from netem.engine.pump import pump_layout
 from netem.engine.pump.pump_layout import Array, Memory
 from netem.relay_events import EVENT
-from netem.rule_records import Counters, LinkState, dtype_of
+from noack.impairments.link_records import Counters, LinkState, dtype_of
 
 _BUFFERS = 64
 _READY = 64

@@ -12,8 +12,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from netem.rule_records import Counters, RecordedDecision
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_records import Counters, RecordedDecision
+from noack.impairments.link_settings import LinkSettings
 
 Address = tuple[str, int]
 """Host as a number (IPv4 or IPv6) and port."""

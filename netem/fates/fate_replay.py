@@ -12,9 +12,9 @@ from pydantic import BaseModel, Field, ValidationError
 
 from netem.engine.relay_interface import DIRECTIONS, Direction
 from netem.fates.fate_trace import FORMAT, METADATA, SCHEMA
-from netem.rule_records import RecordedDecision
-from noack.config.impairments import Mansd
 from noack.core.errors import CallerError, one_line
+from noack.impairments.link_records import RecordedDecision
+from noack.impairments.link_settings import Mansd
 from noack.protocol.record_tables import Fate
 
 _LONGEST_NS = 2**62

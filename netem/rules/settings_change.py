@@ -1,9 +1,15 @@
-"""A change of settings under way: what a link remembers goes on under the new program."""
+"""A change of settings: what a link remembers goes on under the new program."""
 
 from collections.abc import MutableSequence, Sequence
 
-from netem.rule_records import FlowState, QueueState, RateSettings, RuleStage
-from netem.rules.link_rules import RATE, LinkMemory, LinkProgram
+from noack.impairments.bottleneck import BottleneckStage
+from noack.impairments.link_records import (
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    QueueState,
+    RuleStage,
+)
 
 
 def carry(
@@ -15,32 +21,33 @@ def carry(
 ) -> None:
     """Fill what ``new`` remembers from what ``old`` remembered.
 
-    A stage goes on if the new program has one of its kind and name. Flows, counters and what is
-    under way are the link's own and stay as they are; but the longest run begins anew, as it is to
-    be held against another cap.
+    A stage goes on if the new program has one of its kind and name; a queue goes on under another
+    discipline, too. Flows, counters and packets in flight are the link's own and stay as they are;
+    but the longest loss burst is counted anew, as another cap may apply to it.
 
     Args:
         old: the program so far.
         before: what is remembered.
         new: the program from now on.
         after: a fresh state with as many rows, which shares ``before.flows``.
-        latest_ns: (rows,) when the last that is under way leaves, of each row's flow; −1 if nothing
-            is.
+        latest_ns: (rows,) when the last packet in flight leaves, of each row's flow; −1 if none is.
     """
     for place in range(len(new.stages)):
         stage = new.stages[place]
         was = _place_of(old, stage)
         if was < 0:
             continue
-        if stage.kind == RATE:
-            old_place = old.stages[was].place
+        if stage.queue_places > 0:
+            if stage.kind == old.stages[was].kind:
+                after.queues[place] = before.queues[was]  # type: ignore[index]
             _carry_queue(
-                old.bottlenecks[old_place], before.queues[old_place], before.departures_ns,
-                new.bottlenecks[stage.place], after.queues[stage.place], after.departures_ns,
+                old.stages[was], before.queues[was], before.departures_ns,
+                stage, after.queues[place], after.departures_ns,
             )  # fmt: skip
-        for row in range(len(before.flows)):
-            after.memory[row][place].phase = before.memory[row][was].phase
-            after.memory[row][place].score = before.memory[row][was].score
+        if stage.kind == old.stages[was].kind:
+            for row in range(len(before.flows)):
+                after.memory[row][place].phase = before.memory[row][was].phase
+                after.memory[row][place].score = before.memory[row][was].score
     for row in range(len(before.flows)):
         before.flows[row].since = before.flows[row].packets
         before.flows[row].longest_loss_burst = 0
@@ -54,27 +61,29 @@ def carry(
 
 
 def _place_of(program: LinkProgram, stage: RuleStage) -> int:
-    """Place of the stage with the same kind and name; −1 if there is none."""
+    """Place of the stage with the same name, and of the same kind or with a queue; −1: none."""
     for place in range(len(program.stages)):
         other = program.stages[place]
-        if (other.kind, other.key0, other.key1) == (stage.kind, stage.key0, stage.key1):
+        alike = other.kind == stage.kind or (other.queue_places > 0 and stage.queue_places > 0)
+        if alike and (other.key0, other.key1) == (stage.key0, stage.key1):
             return place
     return -1
 
 
 def _carry_queue(
-    old: RateSettings,
+    old: BottleneckStage,
     queue: QueueState,
     departures_ns: Sequence[int],
-    new: RateSettings,
+    new: BottleneckStage,
     new_queue: QueueState,
     new_departures_ns: MutableSequence[int],
 ) -> None:
-    """Keep the queue; a shorter one forgets who leaves first, so that it counts as full."""
-    kept = min(queue.count, new.queue)
+    """Keep the queue; a shorter one forgets the packets that leave first, and so counts as full."""
+    kept = min(queue.count, new.queue_places)
     first = queue.head + queue.count - kept
     for k in range(kept):
-        new_departures_ns[new.begin + k] = departures_ns[old.begin + (first + k) % old.queue]
+        place = old.queue_begin + (first + k) % old.queue_places
+        new_departures_ns[new.queue_begin + k] = departures_ns[place]
     new_queue.head = 0
     new_queue.count = kept
     new_queue.entry_ns = queue.entry_ns
@@ -90,9 +99,10 @@ def _carry_releases(
     new_ns: MutableSequence[int],
     latest_ns: int,
 ) -> None:
-    """Keep what the guarantee needs to know of the datagrams before the change.
+    """Keep what the guarantee needs to know of the packets before the change.
 
-    With another cap, or where none was kept, nothing overtakes what is under way at the change.
+    With another cap, or where none was kept, no packet leaves before those that are in flight at
+    the change.
     """
     width = new.mansd + 1
     if old.tracks:
@@ -103,6 +113,6 @@ def _carry_releases(
         if old.mansd != new.mansd:
             flow.first_release_ns = max(flow.first_release_ns, latest_ns)
     else:
-        delivered = flow.packets - 1 - flow.run
-        if delivered >= 0 and flow.run < width:
+        delivered = flow.packets - 1 - flow.consecutive_losses
+        if delivered >= 0 and flow.consecutive_losses < width:
             new_ns[delivered % width] = 0

@@ -16,9 +16,8 @@ from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 from netem.engine.relay_interface import LinkSpec
 from netem.words.words_to_settings import settings_of
 from noack.config import toml_file
-from noack.config.impairment_files import read_files
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_settings import LinkSettings, read_files
 from noack.runtime.address import parse_address
 from noack.settings.section import ScenarioSection, Seed
 

@@ -1,55 +1,55 @@
-"""From words to settings: what ``tc netem`` understands, and what it has no words for.
+"""From words to settings and back: the words of ``tc netem``, and further ones.
 
     delay 10ms 2ms distribution normal loss gemodel 1% 10% mansd 4
 
 The order of the words is the order of the impairments; ``mansd``, ``first``, ``limit`` and ``seed``
-are settings, wherever they stand.
+are settings, wherever they stand. Words are not shortened.
 """
 
 import json
-import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, get_args
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter, ValidationError
 
-from netem.words.loss_words import Table, read_loss
-from netem.words.quantities import (
-    CORRELATION,
-    COUNT,
-    OWN_TIME_S,
-    PERCENT,
-    RATE_BPS,
-    SIGNED_COUNT,
-    SIGNED_PERCENT,
-    TIME,
-    TIME_S,
-)
-from netem.words.word_reader import WordReader
-from noack.config.impairments import Delay, Distribution, Impairment, LinkSettings, Rate, Reorder
 from noack.core.errors import CallerError
+from noack.impairments.feature import Impairment, Table
+from noack.impairments.kinds import IMPAIRMENTS, AnyImpairment
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.quantities import COUNT
+from noack.impairments.word_reader import WordReader
 from noack.settings.section import Seed
 
-SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")
-"""Names of distributions; any other word after ``distribution`` is a file's name."""
-
 _REFUSED = {
-    "slot": "this emulator does not gather datagrams into slots; rate and blackout are what it has",
-    "ecn": "this emulator cannot mark datagrams: it sees payloads, not IP headers",
+    "slot": "this emulator does not gather packets into slots; it has rate and blackout",
+    "ecn": "this emulator cannot mark packets: it sees payloads, not IP headers",
 }
-_AFTER = {
-    "distribution": "delay TIME JITTER", "samples": "delay TIME", "lossrel": "delay TIME",
-    "queue": "rate RATE", "once": "loss trace FILE", "from": "loss periodic BURST/PERIOD",
-    "every": "loss script NUMBERS, or after blackout BEGIN-END", "gemodel": "loss",
-    "random": "loss", "state": "loss",
-}  # fmt: skip
-_INTERVALS = "intervals of time, e.g. 2s-3s,5s-5500ms"
-_SAMPLES = "delays with their units, e.g. 1ms,2ms,10ms"
+_FEATURES = {word.name: (kind, word) for kind in IMPAIRMENTS for word in kind.words if word.read}
+_SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
+KEYWORDS = (*_FEATURES, *_SETTINGS, "seed")
+"""Words that begin a clause."""
+_AFTER: dict[str, str] = {}
+"""Where the words stand that begin no clause."""
+for _kind in IMPAIRMENTS:
+    for _word in _kind.words:
+        if _word.name not in _FEATURES:
+            places = [_AFTER[_word.name]] if _word.name in _AFTER else []
+            _AFTER[_word.name] = ", or after ".join([*places, _word.after])
+EXAMPLES: Mapping[str, str] = {
+    **{word.name: word.example for kind in IMPAIRMENTS for word in kind.words},
+    "mansd": "mansd 4",
+    "first": "first",
+    "limit": "limit 1000",
+}
+"""By the word; ``seed`` is an option, too, and so not here."""
+_IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
+_LIMIT = LinkSettings.model_fields["limit"].default
 _SEED: TypeAdapter[int] = TypeAdapter(Seed)
 
 
 class LinkWords(NamedTuple):
-    """What words say."""
+    """Settings in words."""
 
     settings: LinkSettings
     seed: int | None
@@ -70,9 +70,11 @@ def parse(words: str | Sequence[str]) -> LinkWords:
     impairments: list[Impairment] = []
     settings: Table = {}
     while (word := reader.begin()) is not None:
-        word = _keyword(reader, word)
-        if word in _IMPAIRMENTS:
-            table = _IMPAIRMENTS[word](reader)
+        _require_keyword(reader, word)
+        if word in _FEATURES:
+            kind, found = _FEATURES[word]
+            assert found.read is not None
+            table = {"kind": kind.model_fields["kind"].default, **found.read(reader)}
             impairment: Impairment = _validated(_IMPAIRMENT, table, reader)
             _check_place(reader, impairment, impairments, bare_gap=word == "gap")
             impairments.append(impairment)
@@ -99,13 +101,39 @@ def settings_of(words: str | Sequence[str]) -> LinkSettings:
     return settings
 
 
-def _keyword(reader: WordReader, word: str) -> str:
+def text_of(settings: LinkSettings, seed: int | None = None) -> str:
+    """Return words that :func:`parse` reads back to the same settings."""
+    words = [impairment.text() for impairment in settings.impairments]
+    if settings.mansd is not None:
+        words.append(f"mansd {settings.mansd}")
+    if settings.first_delivered:
+        words.append("first")
+    if settings.limit != _LIMIT:
+        words.append(f"limit {settings.limit}")
+    if seed is not None:
+        words.append(f"seed {seed}")
+    return " ".join(words)
+
+
+def require_no_dashes(arguments: Sequence[str]) -> None:
+    """Require that no word is written as an option.
+
+    Raises:
+        CallerError: one is.
+    """
+    for argument in arguments:
+        word = argument.lstrip("-").partition("=")[0]
+        if argument.startswith("-") and word in EXAMPLES:
+            raise CallerError(f"{argument}: write words without the dashes, e.g. {EXAMPLES[word]}")
+
+
+def _require_keyword(reader: WordReader, word: str) -> None:
     if word in _REFUSED:
         reader.wrong(_REFUSED[word])
     if word in _AFTER:
         reader.wrong(f"goes right after {_AFTER[word]}")
-    word = reader.choose(word, KEYWORDS)
-    return _SYNONYMS.get(word, word)
+    if word not in KEYWORDS:
+        reader.unknown(word, KEYWORDS)
 
 
 def _settings(impairments: list[Impairment], settings: Mapping[str, Any]) -> LinkSettings:
@@ -149,113 +177,9 @@ def _check_place(
     reader: WordReader, impairment: Impairment, before: Sequence[Impairment], *, bare_gap: bool
 ) -> None:
     if isinstance(impairment, Reorder):
-        if not any(isinstance(one, Delay | Rate) for one in before):
-            reader.wrong("nothing before it delays a datagram; it goes after delay or rate")
+        if not any(one.delays for one in before):
+            reader.wrong("nothing before it delays a packet; it goes after delay or rate")
         if isinstance(before[-1], Reorder):
             how = "reorder PERCENT gap N"
             reader.wrong(f"there is a reorder before it; write {how}" if bare_gap else
                          f"there is a reorder, or a gap, before it; write {how}")  # fmt: skip
-
-
-def _loss(reader: WordReader) -> Table:
-    table = {"kind": "loss", "loss": read_loss(reader)}
-    if reader.accept("ecn"):
-        reader.wrong(_REFUSED["ecn"])
-    return table
-
-
-def _chance(kind: str) -> Callable[[WordReader], Table]:
-    def read(reader: WordReader) -> Table:
-        table: Table = {"kind": kind, "probability": reader.value(PERCENT)}
-        if reader.number_follows():
-            table["correlation"] = reader.value(CORRELATION)
-        return table
-
-    return read
-
-
-def _reorder(reader: WordReader) -> Table:
-    table = _chance("reorder")(reader)
-    if reader.accept("gap"):
-        table["gap"] = reader.value(COUNT)
-    return table
-
-
-def _gap(reader: WordReader) -> Table:
-    return {"kind": "reorder", "gap": reader.value(COUNT)}
-
-
-def _delay(reader: WordReader) -> Table:
-    table: Table = {"kind": "delay", "delay_s": reader.value(TIME_S)}
-    if reader.number_follows():
-        table["jitter_s"] = reader.value(TIME_S)
-        if reader.number_follows():
-            table["correlation"] = reader.value(CORRELATION)
-    while True:
-        if reader.accept("distribution", "dist"):
-            _once(reader, table, "distribution")
-            _distribution(reader, table)
-        elif reader.accept("samples"):
-            _once(reader, table, "distribution")
-            table["distribution"] = "empirical"
-            table["samples_s"] = reader.values(OWN_TIME_S, _SAMPLES)
-        elif reader.accept("lossrel"):
-            _once(reader, table, "loss_correlation")
-            table["loss_correlation"] = reader.value(SIGNED_PERCENT)
-        else:
-            return table
-
-
-def _once(reader: WordReader, table: Table, key: str) -> None:
-    if key in table:
-        reader.wrong("this delay has one already")
-
-
-def _distribution(reader: WordReader, table: Table) -> None:
-    name = reader.file(f"one of {', '.join(SHAPES)}, or a file")
-    if name not in SHAPES:
-        table |= {"distribution": "empirical", "file": name}
-        return
-    table["distribution"] = name
-    if "jitter_s" not in table:
-        reader.wrong("says nothing without jitter; write delay TIME JITTER distribution NAME")
-
-
-def _rate(reader: WordReader) -> Table:
-    table: Table = {"kind": "rate", "rate_bps": reader.value(RATE_BPS)}
-    for key, signs in (("overhead_bytes", "-"), ("cell_bytes", ""), ("cell_overhead_bytes", "-")):
-        if not reader.number_follows(signs):
-            break
-        table[key] = reader.value(SIGNED_COUNT)
-    if reader.accept("queue"):
-        table["queue"] = reader.value(COUNT)
-    return table
-
-
-def _blackout(reader: WordReader) -> Table:
-    intervals: list[tuple[float, ...]] = []
-    for part in reader.word(_INTERVALS).split(","):
-        found = re.fullmatch(f"({TIME})-({TIME})", part)
-        if found is None:
-            reader.wrong(f"expected {_INTERVALS}")
-        intervals.append(tuple(reader.read(time, OWN_TIME_S) for time in found.groups()))
-    table: Table = {"kind": "blackout", "intervals_s": intervals}
-    if reader.accept("every"):
-        table["every_s"] = reader.value(OWN_TIME_S)
-    return table
-
-
-_IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(Impairment)
-_IMPAIRMENTS: Mapping[str, Callable[[WordReader], Table]] = {
-    "loss": _loss,
-    "delay": _delay,
-    "duplicate": _chance("duplicate"),
-    "corrupt": _chance("corrupt"),
-    "reorder": _reorder,
-    "gap": _gap,
-    "rate": _rate,
-    "blackout": _blackout,
-}
-_SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
-_SYNONYMS = {"latency": "delay", "drop": "loss"}
-KEYWORDS = (*_IMPAIRMENTS, *_SETTINGS, "seed", *_SYNONYMS)

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.impairments import Loss, Mansd, TraceLoss, require_scores
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
 from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.network_section import NetworkSection
 from noack.config.triggers import AnyTrigger
+from noack.impairments.link_settings import Mansd, require_scores
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.trace import TraceLoss
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario

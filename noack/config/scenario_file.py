@@ -9,7 +9,6 @@ from typing import Any
 import tomli_w
 
 from noack.config import toml_file
-from noack.config.impairment_files import read_impairment, read_loss
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
@@ -90,10 +89,10 @@ def _read(
     section: NetworkSection | AcknowledgementSection, folder: Path, place: str
 ) -> dict[str, Any]:
     impairments = tuple(
-        read_impairment(impairment, folder, f"{place}.impairments.{number}")
+        impairment.without_files(folder, f"{place}.impairments.{number}")
         for number, impairment in enumerate(section.impairments)
     )
-    return {"loss": read_loss(section.loss, folder, f"{place}.loss"), "impairments": impairments}
+    return {"loss": section.loss.without_files(folder, f"{place}.loss"), "impairments": impairments}
 
 
 def dumps(scenario: Scenario) -> str:

@@ -4,7 +4,6 @@ Whoever can write there runs code as the user: numba unpickles what it finds. No
 read, where that may be another user.
 """
 
-import fcntl
 import hashlib
 import importlib
 import os
@@ -19,6 +18,8 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from noack.core.file_lock import locked
 
 _ROOM_BYTES = 16 * 1024 * 1024
 _KEPT_S = 30 * 24 * 3600
@@ -60,7 +61,7 @@ def _make_own(folder: Path) -> None:
         status = level.stat(follow_symlinks=False)
         if level == folder.parent:
             _require_own(level, status)
-            level.chmod(0o700)  # older versions left it to the umask
+            level.chmod(0o700)  # whatever the umask was
         elif status.st_uid not in (0, os.getuid()) or _others_may_write(status):
             raise PermissionError(f"{level} can be changed by another user")
     _require_own(folder, status)
@@ -130,8 +131,7 @@ def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any
     def compile_alone(signature: Any) -> Any:
         with ExitStack() as stack:
             with suppress(OSError):  # where files cannot be locked all of them compile
-                file = stack.enter_context(lock.open("w"))
-                fcntl.flock(file, fcntl.LOCK_EX)
+                stack.enter_context(locked(lock, wait=True))
             with _to_the_end():
                 return compiling(signature)
 

@@ -1,4 +1,4 @@
-"""What all command lines of noack share: how a mistake is said, to people and to programs."""
+"""Errors of noack's command lines, as text and as JSON."""
 
 import argparse
 import json
@@ -10,10 +10,10 @@ from noack.core.errors import CallerError, ExitStatus
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose mistakes are errors like any other: one line, with what would be right."""
+    """A parser that raises errors instead of printing usage and exiting."""
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong with the arguments.
+        """Report wrong arguments.
 
         Raises:
             CallerError: always.
@@ -23,15 +23,15 @@ class Parser(argparse.ArgumentParser):
 
 
 def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> ExitStatus:
-    """Say why a command ends, a line for each mistake, and return its exit status.
+    """Print why a command failed, one line per mistake, and return its exit status.
 
     Args:
-        message: what went wrong, and what would be right.
-        status: of the exit.
+        message: what is wrong and what would be right.
+        status: the exit status.
         who: begins each line, such as ``noack netem``.
-        as_json: the command has been asked for JSON: standard output gets a document, too.
+        as_json: also print a JSON document to standard output.
     """
-    with suppress(OSError):  # it may be standard output that failed, or nobody reads
+    with suppress(OSError):  # standard output may be closed or full
         if as_json and sys.stdout is not None:
             reason = {"status": int(status), "reason": message}
             print(json.dumps({"error": message, "exit": reason}, indent=2), flush=True)
@@ -41,7 +41,7 @@ def failed(message: str, status: ExitStatus, *, who: str, as_json: bool) -> Exit
 
 
 def print_to_stderr(line: str) -> None:
-    """Print a line, and go on if it cannot be written: nobody reads, or the log's disk is full."""
+    """Print a line; ignore a closed pipe and a full disk."""
     if sys.stderr is not None:
-        with suppress(OSError, ValueError):  # full, a broken pipe; closed
+        with suppress(OSError, ValueError):  # full or broken pipe; closed
             print(line, file=sys.stderr, flush=True)

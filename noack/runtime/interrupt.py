@@ -1,4 +1,4 @@
-"""Ctrl-C while a program is being imported, when there is nothing yet that it could tear."""
+"""Ctrl-C while a program is imported, before it has anything to clean up."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ def quiet_interrupt() -> Iterator[None]:
     """End the process on SIGINT with exit status 130 and no traceback, while the context lasts.
 
     A ``KeyboardInterrupt`` would be printed from within the imports, or caught there. A handler
-    that somebody else has set is left alone.
+    set by another program is kept.
     """
     usual = signal.default_int_handler
     if threading.current_thread() is not threading.main_thread() or (

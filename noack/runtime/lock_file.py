@@ -1,11 +1,9 @@
-"""Files that tell of something that runs, and can be reached: its owner's alone, while it runs.
+"""Lock files: each describes a running process and how to reach it, for its owner only.
 
-They lie in the user's runtime directory. Whoever puts one there holds a lock on it, which the
-system releases however that process ends; a file without a lock is of one that died, and is removed
-by whoever finds it.
+They are in the user's runtime directory. The process holds a lock on its file, which the system
+releases when the process ends. A file without a lock is stale, and the next reader removes it.
 """
 
-import fcntl
 import json
 import os
 import secrets
@@ -14,13 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from noack.core.file_lock import lock
 from noack.runtime.private_folder import PrivateFolder, open_private
 
 _SUFFIX = ".json"
 
 
 class LockFile(NamedTuple):
-    """A file whose owner runs."""
+    """A file whose process runs."""
 
     path: Path
     written_ns: int
@@ -29,21 +28,21 @@ class LockFile(NamedTuple):
 
 @contextmanager
 def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[Path]:
-    """Keep a file while the context lasts.
+    """Keep a lock file while the context lasts.
 
     Args:
-        kind: folder of the runtime directory that the file lies in; "" for that directory itself.
+        kind: folder in the runtime directory; "" for the directory itself.
         name: of the file, without suffix.
-        content: what it says, as JSON.
+        content: the file's content, as JSON.
 
     Raises:
         CallerError: the folder cannot be made, or is not the user's own.
-        FileExistsError: one that runs has a file of this name.
+        FileExistsError: a running process has a file of this name.
     """
     with open_private(*_inside(kind), create=True) as folder:
         scratch, name = f"{name}.{secrets.token_hex(8)}", name + _SUFFIX
         with os.fdopen(folder.create(scratch), "w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            lock(file, wait=True)
             json.dump(content, file)
             file.flush()
             try:
@@ -57,7 +56,7 @@ def lock_file(kind: str, name: str, content: Mapping[str, object]) -> Iterator[P
 
 
 def live_lock_files(kind: str) -> list[LockFile]:
-    """Return the files of a kind whose owner runs, by name.
+    """Return the lock files of a kind whose process runs, by name.
 
     Raises:
         CallerError: the folder, or a file in it, is not the user's own.
@@ -75,7 +74,7 @@ def _inside(kind: str) -> tuple[str, ...]:
 
 
 def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
-    """Give the file its name, unless one that runs has it."""
+    """Give the file its name, unless a running process has a file of this name."""
     for attempt in range(2):
         try:
             folder.link(scratch, name)
@@ -86,16 +85,14 @@ def _put(folder: PrivateFolder, scratch: str, name: str) -> None:
 
 
 def _alive(folder: PrivateFolder, name: str) -> LockFile | None:
-    """Return a file if its owner runs; the file of one that does not is removed."""
+    """Return a file if its process runs; remove it otherwise."""
     try:
         descriptor = folder.open(name)
     except FileNotFoundError:
         return None
     with os.fdopen(descriptor, "rb") as file:
         status = os.fstat(file.fileno())
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock(file):
             return LockFile(folder.path / name, status.st_mtime_ns, file.read())
         folder.remove_same(name, status)
     return None

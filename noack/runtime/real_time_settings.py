@@ -1,4 +1,4 @@
-"""Real-time settings of a process: each is taken where the system permits it, and reported.
+"""Real-time settings of a process: each is applied where the system permits it, and reported.
 
 Measured effect on the wake-up lateness of a 1 kHz loop (p50/p99, µs): none 80/184, shortest timer
 slack 30/145, SCHED_FIFO 38/106, no deep idle states 16/39.
@@ -11,7 +11,7 @@ import os
 import struct
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,28 +25,26 @@ _CPU_DMA_LATENCY = Path("/dev/cpu_dma_latency")
 def realtime(
     enabled: bool, fifo_priority: int, place: int | None = None
 ) -> Iterator[dict[str, str]]:
-    """Take the real-time settings for the calling thread and undo them at the end.
+    """Apply the real-time settings to the calling thread; undo them with the context.
 
     Args:
-        enabled: whether to ask for any.
+        enabled: whether to apply any.
         fifo_priority: SCHED_FIFO priority.
         place: the process's number along the loop; neighbours get different cores, so that a
-            process does not stand in the way of the one it wakes. None leaves the choice to the
-            system.
+            process does not block the one that it wakes. None leaves the choice to the system.
 
     Yields:
-        For each setting ``"granted"``, or ``"refused: why"``, or ``"not asked for"``.
+        For each setting ``"applied"``, ``"not permitted: why"`` or ``"not requested"``.
     """
     settings = ("memory_lock", "timer_slack", "sched_fifo", "affinity", "cpu_dma_latency")
-    applied = dict.fromkeys(settings, "not asked for")
+    applied = dict.fromkeys(settings, "not requested")
     with contextlib.ExitStack() as undo:
         gc.collect()
         gc.freeze()
         gc.disable()
         undo.callback(gc.enable)
         if enabled:
-            # Locking memory takes a tenth of a second: at real-time priority it would hold up
-            # whatever else runs on this core.
+            # Locking memory takes 0.1 s: at real-time priority it would block this core.
             applied["memory_lock"] = _attempt(_memory_lock)
             applied["timer_slack"] = _attempt(_timer_slack)
             applied["sched_fifo"] = _attempt(lambda: _fifo(fifo_priority, undo))
@@ -56,12 +54,12 @@ def realtime(
         yield applied
 
 
-def _attempt(take: object) -> str:
+def _attempt(apply: Callable[[], None]) -> str:
     try:
-        take()  # type: ignore[operator]
+        apply()
     except (OSError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return f"refused: {reason}"
+        return f"not permitted: {reason}"
     return "applied"
 
 

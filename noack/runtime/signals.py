@@ -1,4 +1,4 @@
-"""SIGINT, SIGTERM and SIGHUP as a flag that is looked at, so that nothing is torn in the middle."""
+"""SIGINT, SIGTERM and SIGHUP as a flag that loops poll, so that no write is interrupted."""
 
 import signal
 import time
@@ -9,11 +9,11 @@ from types import FrameType
 from noack.core.errors import ExitStatus
 
 _ECHO_NS = 500_000_000
-"""What started a process may pass a signal on that its group had already."""
+"""A parent may pass on a signal that the process group has received already."""
 
 
 class Signals:
-    """Turns signals into a flag; a loop ends at its next look, nothing is torn."""
+    """Turns signals into a flag; a loop ends when it polls the flag."""
 
     def __init__(self) -> None:
         self.received: int | None = None
@@ -21,11 +21,11 @@ class Signals:
 
     @contextmanager
     def handled(self) -> Iterator["Signals"]:
-        """Handle the signals while the context lasts; nohup is respected."""
-        parse_message = set(_ENDING)
+        """Handle the signals while the context lasts; under nohup, SIGHUP stays ignored."""
+        handled = set(_ENDING)
         if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
-            parse_message.remove(signal.SIGHUP)
-        before = {number: signal.signal(number, self._note) for number in parse_message}
+            handled.remove(signal.SIGHUP)
+        before = {number: signal.signal(number, self._note) for number in handled}
         try:
             yield self
         finally:
@@ -36,12 +36,12 @@ class Signals:
         now_ns = time.monotonic_ns()
         if self.received is None:
             self.received, self._received_ns = number, now_ns
-        elif now_ns - self._received_ns > _ECHO_NS:  # asked twice: the person means it
+        elif now_ns - self._received_ns > _ECHO_NS:  # a second request: end at once
             raise SystemExit(self.status)
 
     @property
     def status(self) -> ExitStatus:
-        """Exit status that tells of the signal, or OK."""
+        """Exit status for the received signal, or OK."""
         return _ENDING.get(self.received or 0, ExitStatus.OK)
 
 

@@ -1,8 +1,8 @@
-"""The spool: batches of the record on disk as they arrive, readable up to the last whole one.
+"""The spool: batches of the record on disk as they arrive, readable up to the last complete one.
 
-One file per table and writer, a sequence of chunks ``first row (u64), bytes (u64), rows``, little
-endian. A killed writer leaves at most one broken chunk at the end, which readers ignore. The same
-rows may come twice, from two writers; row numbers tell.
+One file per table and writer: a sequence of chunks ``first row (u64), bytes (u64), rows``, little
+endian. A killed writer leaves at most one incomplete chunk at the end, which readers ignore. Two
+writers may write the same rows; the row numbers identify them.
 """
 
 import contextlib
@@ -44,10 +44,10 @@ class SpoolWriter:
             MachineError: the disk is full or the folder cannot be written.
         """
         with self._named():
-            _write_whole(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
+            _write_complete(self._open(table), _CHUNK.pack(first, len(payload)) + payload)
 
     def prepare(self, tables: Iterable[str]) -> None:
-        """Open the files of tables before there is anything to write.
+        """Open the files of tables before the first rows.
 
         Raises:
             MachineError: the folder cannot be written.
@@ -58,7 +58,7 @@ class SpoolWriter:
 
     @contextlib.contextmanager
     def _named(self) -> Iterator[None]:
-        """Say why the system refuses, and where."""
+        """Turn a system error into one with the folder and the reason."""
         try:
             yield
         except OSError as error:
@@ -67,10 +67,10 @@ class SpoolWriter:
             ) from None
 
     def require_present(self) -> None:
-        """Check that the files are where they were made; what is written elsewhere is lost.
+        """Check that the files are still in place: rows in deleted files are lost.
 
         Raises:
-            MachineError: one was deleted or moved.
+            MachineError: a file was deleted or moved.
         """
         for table, file in self._files.items():
             path = self._path(table)
@@ -97,11 +97,11 @@ class SpoolWriter:
         self._files.clear()
 
 
-def _write_whole(file: BinaryIO, chunk: bytes) -> None:
-    """Write a chunk whole or not at all: the rest of one must not be read as rows later.
+def _write_complete(file: BinaryIO, chunk: bytes) -> None:
+    """Write a complete chunk or nothing: a partial chunk would be read as rows later.
 
     Raises:
-        OSError: the system does not take all of it; the error says why.
+        OSError: the system did not write all of it.
     """
     written = 0
     try:
@@ -113,14 +113,14 @@ def _write_whole(file: BinaryIO, chunk: bytes) -> None:
 
 
 def read_chunks(folder: Path, table: str) -> Iterator[tuple[int, bytes]]:
-    """Yield ``(first row, rows)`` of every whole batch of a table, of all writers."""
+    """Yield ``(first row, rows)`` of each complete batch of a table, from all writers."""
     for path in sorted(folder.glob(f"{table}.*")):
         with path.open("rb") as file:
-            yield from _whole_chunks(file)
+            yield from _complete_chunks(file)
 
 
 class SpoolTail:
-    """Reads a spool while it is written, and what was written before its files were removed.
+    """Reads a spool while it is written, to the end even if its files are removed.
 
     Args:
         folder: the spool's directory; it need not exist yet.
@@ -131,13 +131,13 @@ class SpoolTail:
         self._files: dict[str, BinaryIO] = {}
 
     def read(self) -> Iterator[tuple[str, int, bytes]]:
-        """Yield ``(table, first row, rows)`` of every whole batch that was not read before."""
+        """Yield ``(table, first row, rows)`` of each complete batch that was not read before."""
         for path in sorted(self._folder.glob("*.*")):
             if path.name not in self._files:
-                with contextlib.suppress(FileNotFoundError):  # removed a moment ago
+                with contextlib.suppress(FileNotFoundError):  # just removed
                     self._files[path.name] = path.open("rb")
         for name, file in self._files.items():
-            for first, payload in _whole_chunks(file):
+            for first, payload in _complete_chunks(file):
                 yield name.partition(".")[0], first, payload
 
     def close(self) -> None:
@@ -147,8 +147,8 @@ class SpoolTail:
         self._files.clear()
 
 
-def _whole_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield the batches that are whole; the file is left after the last of them."""
+def _complete_chunks(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Yield the complete batches; leave the file position after the last of them."""
     size = os.fstat(file.fileno()).st_size
     while True:
         start = file.tell()

@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz run|show|keep``: the long run, one input again, what is kept."""
+"""``python -m tests.fuzz run|show``: the long run; one input again, as a line of a corpus."""
 
 import argparse
 import importlib.util
@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from tests.fuzz.harness import NAMES, harness, to_line
-from tests.fuzz.keep import keep
 from tests.fuzz.long import fuzz_all
 
 
@@ -22,8 +21,6 @@ def main() -> int:
     show = commands.add_parser("show", help="run one input again")
     show.add_argument("name", choices=NAMES)
     show.add_argument("file", type=Path)
-    kept = commands.add_parser("keep", help="keep the inputs that reach what kept ones do not")
-    kept.add_argument("names", nargs="*", metavar="PARSER")
     options = parser.parse_args()
     if options.command == "show":
         data = options.file.read_bytes()
@@ -34,10 +31,6 @@ def main() -> int:
     names = options.names or NAMES
     if wrong := set(names) - set(NAMES):
         parser.error(f"no such parser: {', '.join(sorted(wrong))}; there are {', '.join(NAMES)}")
-    if options.command == "keep":
-        for name in names:
-            print(f"{name}: {keep(name)} inputs kept", flush=True)
-        return 0
     if importlib.util.find_spec("atheris") is None:
         print("the fuzzer, atheris, is not installed; it has wheels for Linux and few Pythons")
         return 2

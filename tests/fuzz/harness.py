@@ -63,8 +63,8 @@ class Harness:
 
 
 def harness(name: str) -> Harness:
-    """The harness of a parser, or of a module of the same form."""
-    module = importlib.import_module(name if "." in name else f"tests.fuzz.parsers.{name}")
+    """The harness of a parser."""
+    module = importlib.import_module(f"tests.fuzz.parsers.{name}")
     return Harness(
         name, module.one_input, getattr(module, "SEEDS", SEEDS), getattr(module, "WORDS", ())
     )

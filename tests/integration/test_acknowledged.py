@@ -21,7 +21,7 @@ from tests.integration.conftest import Finished, run_scenario, settings
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     values = {
         "horizon_s": 10.0,
-        "speed": 2.0,
+        "speed": 4.0,
         "plant__rate_hz": 100.0,
         "controller__rate_hz": 100.0,
         "trigger__beta": 0.05,

@@ -1,4 +1,4 @@
-"""What kills a process, a port or a person's patience: named, ended cleanly, nothing lost."""
+"""Faults of processes and ports: the run names them, ends cleanly and loses no rows."""
 
 import re
 import signal
@@ -29,15 +29,15 @@ LONG = [*AT_RATE, *settings(speed=4.0, horizon_s=400.0)]
 
 
 def wait_recording(running: Running) -> None:
-    """Wait until the recorder has something of everyone who has something to tell all the time."""
+    """Wait until the recorder has stored rows of plant, sensor and controller."""
     running.wait_started()
     for table in ("plant_step", "sensor_measurement", "controller_step"):
         spooled = running.runs / "latest" / "spool" / f"{table}.recorder"
         wait_for(lambda spooled=spooled: spooled.exists() and spooled.stat().st_size > 10_000)
 
 
-@pytest.mark.parametrize("role", ["plant", "recorder"])  # test_restarts kills more
-def test_a_killed_process_is_named_and_nothing_recorded_is_lost(start: Start, role: str) -> None:
+def test_a_killed_recorder_is_named_and_nothing_recorded_is_lost(start: Start) -> None:
+    role = "recorder"
     running = start(*LONG, "--report")
     wait_recording(running)
     running.child(role).send_signal(signal.SIGKILL)
@@ -51,35 +51,14 @@ def test_a_killed_process_is_named_and_nothing_recorded_is_lost(start: Start, ro
         assert np.array_equal(rows["sequence"], np.arange(len(rows)))
     assert finished.summary["missing_samples"] == 0
     assert finished.summary["replay"]["bit_exact"]
-    assert not finished.summary["replay"]["complete"]  # who was killed cannot say what is missing
+    assert not finished.summary["replay"]["complete"]  # a killed process cannot report its rows
     assert (finished.run_dir / "recording.rrd").stat().st_size > 0
     assert f"{role} died: killed by SIGKILL" in (finished.run_dir / "report.html").read_text()
     assert not (finished.run_dir / "spool").exists()
     assert running.left_behind() == []
 
 
-def test_a_frozen_process_is_named(start: Start) -> None:
-    running = start(*LONG)
-    wait_recording(running)
-    running.child("sensor").send_signal(signal.SIGSTOP)
-    finished = running.finish()
-    assert finished.status == 1
-    assert finished.summary["exit"]["reason"] == "sensor stopped responding"
-    assert len(load_record(finished.run_dir)["plant_step"]) > 10
-    assert running.left_behind() == []
-
-
-@pytest.mark.parametrize(
-    ("number", "status", "reason"),
-    [
-        (signal.SIGINT, 130, "stopped by the user (SIGINT)"),
-        (signal.SIGTERM, 143, "stopped on request (SIGTERM)"),
-    ],
-    ids=["SIGINT", "SIGTERM"],
-)
-def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(
-    start: Start, number: signal.Signals, status: int, reason: str
-) -> None:
+def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(start: Start) -> None:
     running = start(*LONG)
     wait_recording(running)
     done = subprocess.run(
@@ -88,10 +67,10 @@ def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(
     )  # fmt: skip
     assert done.returncode == 2
     assert "still under way" in done.stderr
-    running.process.send_signal(number)
+    running.process.send_signal(signal.SIGTERM)
     finished = running.finish()
-    assert finished.status == status
-    assert finished.summary["exit"]["reason"] == reason
+    assert finished.status == 143
+    assert finished.summary["exit"]["reason"] == "stopped on request (SIGTERM)"
     until_s = finished.summary["judged_until_s"]
     assert 0 < until_s <= finished.summary["reached_s"] + 0.1
     assert all((claim["since_s"] or 0.0) <= until_s for claim in finished.summary["claims"])
@@ -114,7 +93,7 @@ def test_a_killed_launcher_leaves_no_process_behind(start: Start) -> None:
     assert len(load_record(run_dir)["plant_step"]) > 10
 
 
-@pytest.mark.parametrize("role", ["plant", "netem", "control"])
+@pytest.mark.parametrize("role", ["plant", "control"])
 def test_a_taken_port_is_one_clear_line(tmp_path: Path, role: str) -> None:
     kind = socket.SOCK_STREAM if role == "control" else socket.SOCK_DGRAM
     with socket.socket(socket.AF_INET, kind) as squatter:
@@ -136,41 +115,20 @@ def test_a_taken_port_is_one_clear_line(tmp_path: Path, role: str) -> None:
     assert f"set ports.{role} to another port, or to 0 for any" in line
 
 
-def test_a_run_that_diverges_says_when_and_keeps_its_record(tmp_path: Path) -> None:
-    finished = run_scenario(
-        tmp_path,
-        *settings(
-            horizon_s=4.0,
-            model__parameters__a11=500.0,
-            model__allow_unstable=True,
-            plant__rate_hz=100,
-            controller__rate_hz=100,
-        ),
-        "--report",
-    )
-    assert finished.status == 1
-    assert finished.summary["exit"]["reason"].startswith("diverged: x is not finite at ")
-    steps = load_record(finished.run_dir)["plant_step"]
-    lost = ~np.isfinite(steps["x"]).all(axis=1)
-    assert finished.summary["diverged_at_s"] == pytest.approx(steps["t_ns"][lost][0] * 1e-9)
-    assert finished.summary["final_state_norm"] is None
-    assert "diverged: x is not finite" in (finished.run_dir / "report.html").read_text()
-
-
-def test_a_run_that_cannot_keep_up_does_not_claim_its_horizon(tmp_path: Path) -> None:
+def test_an_overloaded_run_does_not_claim_its_horizon(tmp_path: Path) -> None:
     finished = run_scenario(
         tmp_path,
         *settings(speed=1000.0, horizon_s=2000.0, plant__rate_hz=500.0, plant__measure_every=100),
     )
     assert finished.status == 1
-    # Its other threads may starve, too, so that it seems to be gone.
+    # Its other threads may starve, too, so that it seems to be lost.
     reason = finished.summary["exit"]["reason"]
     assert "overrun" in reason or "stopped responding" in reason
     assert finished.summary["reached_s"] < 2000.0
 
 
-def test_a_process_that_never_comes_to_the_start_is_named(start: Start) -> None:
-    """Frozen before the barrier: no liveliness token tells of it yet."""
+def test_a_process_that_is_not_ready_in_time_is_named(start: Start) -> None:
+    """It is frozen before the start barrier, so that it has no liveliness token."""
     running = start(*LONG, *settings(start_within_s=5.0))
     wait_for(lambda: child_of(running.process, "sensor") is not None)
     sensor = child_of(running.process, "sensor")

@@ -1,4 +1,4 @@
-"""The machine's wall clock is stepped while a run goes on, by an hour, there and back."""
+"""The wall clock is stepped by an hour during a run."""
 
 import mmap
 import os
@@ -76,18 +76,18 @@ def test_a_run_does_not_notice_a_stepped_wall_clock(
     witness = Witness(clock.environment)
     for name, value in clock.environment.items():
         monkeypatch.setenv(name, value)
-    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=24.0))
+    running = start(*AT_RATE, *settings(speed=4.0, horizon_s=12.0))
     for name in clock.environment:
         monkeypatch.delenv(name)
     wait_recording(running)
     for role in ROLE_MODULES:
         assert "stepped_clock" in Path(f"/proc/{running.child(role).pid}/maps").read_text()
-    for hours in (1, -1, 0, -1, 1):
+    for hours in (1, -1, 0):
         clock.step_to(hours * HOUR_S)
         wall_s, monotonic_s = witness.offsets_s()
         assert wall_s == pytest.approx(hours * HOUR_S, abs=HOUR_S / 2)
         assert abs(monotonic_s) < HOUR_S / 2
-        time.sleep(0.8)
+        time.sleep(0.4)
     witness.close()
     finished = running.finish()
     assert finished.status == 0, finished.stderr
@@ -99,7 +99,7 @@ def test_a_run_does_not_notice_a_stepped_wall_clock(
     assert summary["replay"]["complete"]
     assert summary["identity_residual_max"] < 1e-11
     record = load_record(finished.run_dir)
-    assert len(record["plant_step"]) == 24 * RATE_HZ + 1
+    assert len(record["plant_step"]) == 12 * RATE_HZ + 1
     for table in record.tables:
         now_ns = record[table]["now_ns"]
         assert (np.diff(now_ns) >= 0).all()

@@ -25,15 +25,6 @@ from tests.integration.conftest import run_scenario, settings
 HORIZON_S = 2.0
 ENOUGH_S = 1.0
 ATTEMPTS = 4
-CASES = {
-    "model": {},
-    "zoh_from_known_state": {
-        "mode": "zoh",
-        "network__initial_sync": "known_state",
-        "plant__measure_every": 2,
-    },
-}
-
 SAME = {
     PLANT_STEP: ("input", "sequence", "t_ns", "actuation"),
     PLANT_ACTUATION: ("input", "sequence", "t_ns"),
@@ -71,17 +62,16 @@ def in_turn_until_ns(live: RunRecord, simulated: RunRecord) -> int:
     return first_ns
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_a_live_run_does_what_the_simulated_run_does(
-    case: dict[str, object], tmp_path: Path
-) -> None:
+def test_a_live_run_does_what_the_simulated_run_does(tmp_path: Path) -> None:
     values = {
         "horizon_s": HORIZON_S,
         "plant__rate_hz": 20.0,
         "controller__rate_hz": 20.0,
         "trigger__beta": 0.02,
         "network__loss__probability": 0.6,
-    } | case
+        "network__initial_sync": "known_state",
+        "plant__measure_every": 2,
+    }
     for _ in range(ATTEMPTS):
         finished = run_scenario(tmp_path / "runs", *settings(**values))
         assert finished.status == 0, finished.stderr

@@ -1,158 +1,106 @@
-"""Hypothesis strategies for settings of a link: everything that is valid."""
+"""Hypothesis strategies for settings of a link, derived from the features and their examples."""
 
-from itertools import accumulate
-from typing import Any
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from hypothesis import strategies as st
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
-from noack.config import impairments as imp
+from noack.impairments.feature import Feature, Impairment
+from noack.impairments.kinds import IMPAIRMENTS
+from noack.impairments.kinds.delay import SHAPES
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings, require_scores
+from noack.impairments.loss_models.trace import TraceLoss
 
-probabilities = st.floats(0, 1)
-correlations = st.floats(0, 1, exclude_max=True)
-times_s = st.floats(0, 3600)
-counts = st.integers(1, 2**40)
-files = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
-    lambda name: name not in ("uniform", "normal", "pareto", "paretonormal")
+_TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1).filter(
+    lambda name: name not in SHAPES
 )
 
 
-def _valid_gilbert_elliott(table: dict[str, Any]) -> bool:
-    loss, burst = table.get("mean_loss"), table.get("mean_burst")
-    return loss is None or loss / (1 - loss) <= burst
-
-
-gilbert_elliott = st.one_of(
-    st.fixed_dictionaries(
-        dict.fromkeys(("good_to_bad", "bad_to_good", "loss_in_good", "loss_in_bad"), probabilities)
-    ),
-    st.fixed_dictionaries(
-        {"mean_loss": st.floats(0, 1, exclude_max=True), "mean_burst": st.floats(1, 1e17)}
-    ).filter(_valid_gilbert_elliott),
-).map(lambda table: imp.GilbertElliottLoss(**table))
-
-
-@st.composite
-def four_states(draw: st.DrawFn) -> imp.FourStateLoss:
-    pairs = st.tuples(probabilities, probabilities).filter(lambda pair: sum(pair) <= 1)
-    (p31, p32), (p13, p14) = draw(pairs), draw(pairs)
-    return imp.FourStateLoss(p13=p13, p31=p31, p32=p32, p23=draw(probabilities), p14=p14)
-
-
-@st.composite
-def periodic(draw: st.DrawFn) -> imp.PeriodicLoss:
-    period = draw(counts)
-    return imp.PeriodicLoss(
-        period=period,
-        burst=draw(st.integers(0, period)),
-        first=draw(st.integers(0, 2**40)),
-    )
-
-
-@st.composite
-def scripted(draw: st.DrawFn) -> imp.ScriptedLoss:
-    lost = sorted(draw(st.sets(st.integers(0, 2**40 - 1), max_size=20)))
-    least = lost[-1] + 1 if lost else 0
-    return imp.ScriptedLoss(
-        lost=tuple(lost), repeat_every=draw(st.one_of(st.just(0), st.integers(least, 2**40)))
-    )
-
-
-losses: st.SearchStrategy[imp.Loss] = st.one_of(
-    st.just(imp.NoLoss()),
-    st.builds(imp.BernoulliLoss, probability=probabilities, correlation=correlations),
-    gilbert_elliott,
-    four_states(),
-    periodic(),
-    scripted(),
-    st.builds(imp.TraceLoss, file=files, repeat=st.booleans()),
-    st.just(imp.WorstCaseLoss()),
-)
+def values(annotation: Any, metadata: list[Any]) -> st.SearchStrategy[Any]:
+    """Values of a field's type, within its limits."""
+    limits: dict[str, Any] = {}
+    for entry in metadata:
+        for part in entry.metadata if isinstance(entry, FieldInfo) else [entry]:
+            limits |= {name: getattr(part, name) for name in ("ge", "gt", "le", "lt", "min_length")
+                       if hasattr(part, name)}  # fmt: skip
+    if get_origin(annotation) is Annotated:
+        inner, *more = get_args(annotation)
+        return values(inner, [*more, *metadata])
+    if get_origin(annotation) is Literal:
+        return st.sampled_from(get_args(annotation))
+    if get_origin(annotation) in (Union, UnionType):
+        return st.one_of([values(one, metadata) for one in get_args(annotation)])
+    if get_origin(annotation) is tuple:
+        items = get_args(annotation)
+        if items[-1] is ...:
+            entries = values(items[0], [])
+            return st.lists(entries, min_size=limits.get("min_length", 0), max_size=9).map(tuple)
+        return st.tuples(*(values(item, []) for item in items))
+    if annotation is float:
+        return st.floats(limits.get("ge", limits.get("gt")), limits.get("le", limits.get("lt")),
+                         exclude_max="lt" in limits, exclude_min="gt" in limits)  # fmt: skip
+    if annotation is int:
+        return st.integers(limits.get("ge"), limits.get("le", limits.get("lt", 0) - 1))
+    if isinstance(annotation, type) and issubclass(annotation, Feature):
+        return varied(annotation)
+    plain = {bool: st.booleans(), str: _TEXTS, NoneType: st.none()}
+    return plain[annotation]
 
 
 @st.composite
-def delays(draw: st.DrawFn) -> imp.Delay:
-    shape = draw(st.sampled_from(["uniform", "normal", "pareto", "paretonormal", "empirical"]))
-    table: dict[str, Any] = {"distribution": shape}
-    if shape == "empirical" and draw(st.booleans()):
-        samples_s = st.lists(st.floats(-3600, 3600), min_size=2, max_size=9)
-        table["samples_s"] = tuple(draw(samples_s))
-    elif shape == "empirical":
-        table["file"] = draw(files)
-    return imp.Delay(
-        delay_s=draw(times_s),
-        jitter_s=draw(times_s),
-        correlation=draw(correlations),
-        loss_correlation=draw(st.floats(-1, 1)),
-        **table,
-    )
+def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
+    """An example of a feature, or one with other values where they make sense."""
+    example = draw(st.sampled_from(feature.examples()))
+    fields = type(example).model_fields
+    names = draw(st.sets(st.sampled_from(sorted(fields)), max_size=3))
+    update = {name: draw(values(fields[name].annotation, fields[name].metadata)) for name in names}
+    try:
+        return type(example)(**{**dict(example), **update})
+    except ValidationError:
+        return example
 
 
-@st.composite
-def blackouts(draw: st.DrawFn) -> imp.Blackout:
-    lengths = draw(st.lists(st.floats(1e-9, 1e4), min_size=2, max_size=8))
-    times = list(accumulate(lengths))
-    times = times[: len(times) // 2 * 2]
-    every = st.none() | st.floats(max(times[-1], 1e-6), 1e6)
-    return imp.Blackout(
-        intervals_s=tuple(zip(times[::2], times[1::2], strict=True)), every_s=draw(every)
-    )
-
-
-rates = st.one_of(
-    st.builds(
-        imp.Rate,
-        rate_bps=st.integers(10**8, 10**12),
-        queue=st.integers(1, 1_000_000),
-        overhead_bytes=st.integers(-65_535, 65_535),
-    ),
-    # Slow links, or many cells, with a queue that leaves in less than a century.
-    st.builds(
-        imp.Rate,
-        rate_bps=st.integers(1, 10**8),
-        queue=st.integers(1, 1000),
-        overhead_bytes=st.integers(-65_535, 100),
-        cell_bytes=st.integers(40, 65_535),
-        cell_overhead_bytes=st.integers(0, 40),
-    ),
-)
-
-impairments: st.SearchStrategy[imp.Impairment] = st.one_of(
-    st.builds(imp.LossOf, loss=losses),
-    st.builds(imp.Duplicate, probability=probabilities, correlation=correlations),
-    st.builds(imp.Corrupt, probability=probabilities, correlation=correlations),
-    delays(),
-    st.builds(imp.Reorder, probability=probabilities, correlation=correlations, gap=counts),
-    rates,
-    blackouts(),
-)
-
-
-def _goes_together(chain: list[imp.Impairment]) -> bool:
+def _goes_together(chain: list[Impairment]) -> bool:
     """Whether each delay that is correlated with loss has a loss before it."""
-    scored = False
-    for one in chain:
-        if isinstance(one, imp.LossOf):
-            scored = isinstance(one.loss, imp.BernoulliLoss | imp.GilbertElliottLoss)
-        elif isinstance(one, imp.Delay) and one.loss_correlation and not scored:
-            return False
+    try:
+        require_scores(chain)
+    except ValueError:
+        return False
     return True
 
 
-settings: st.SearchStrategy[imp.LinkSettings] = st.builds(
-    imp.LinkSettings,
-    impairments=st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
-    mansd=st.none() | st.integers(0, 1_000_000),
-    first_delivered=st.booleans(),
-    limit=st.integers(1, 1_000_000),
+def _settings(impairments: st.SearchStrategy[Impairment]) -> st.SearchStrategy[LinkSettings]:
+    return st.builds(
+        LinkSettings,
+        impairments=st.lists(impairments, max_size=5).filter(_goes_together).map(tuple),
+        mansd=st.none() | st.sampled_from([0, 1, 2, 5]) | st.integers(0, 1_000_000),
+        first_delivered=st.booleans(),
+        limit=st.sampled_from([1, 20, 16_384]),
+    )
+
+
+settings = _settings(st.one_of([varied(kind) for kind in IMPAIRMENTS]))
+"""Everything that is valid, names of files included."""
+_HARSH = [
+    one for kind in IMPAIRMENTS for one in kind.examples()
+    if getattr(one, "file", None) is None and not isinstance(getattr(one, "loss", None), TraceLoss)
+]  # fmt: skip
+harsh = _settings(st.sampled_from(_HARSH))
+"""Examples that the features give, in any order; they name no files."""
+capped = harsh.filter(lambda one: one.impairments and one.mansd is not None and one.mansd < 9).map(
+    lambda one: one.model_copy(update={"first_delivered": True})
 )
 
 
-def words_can_say(settings: imp.LinkSettings) -> bool:
-    """Whether each reorder has a delay before it; words refuse what does nothing."""
+def words_can_say(settings: LinkSettings) -> bool:
+    """Whether each reorder has a delay before it; words refuse what has no effect."""
     delayed, reordered = False, False
     for one in settings.impairments:
-        if isinstance(one, imp.Reorder) and (reordered or not delayed):
+        if isinstance(one, Reorder) and (reordered or not delayed):
             return False
-        delayed = delayed or isinstance(one, imp.Delay | imp.Rate)
-        reordered = isinstance(one, imp.Reorder)
+        delayed = delayed or one.delays
+        reordered = isinstance(one, Reorder)
     return True

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from netem.engine.compiled_rules import compile_rule, compiled_program, compiled_state, set_flow
 from netem.engine.many_decisions import admit_many
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import PacketDecision, RecordedDecision, dtype_of
-from netem.rules.link_rules import LinkMemory
-from noack.config.impairments import Impairment, LinkSettings
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.link_records import LinkMemory, PacketDecision, RecordedDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
 
 MOST = 1_000_000
 
@@ -52,7 +52,7 @@ def decide(compiled_admit_many: Any) -> Decide:
     """Decisions of the compiled rules; scalars stand for all datagrams alike."""
 
     def run(
-        settings: LinkSettings | Sequence[Impairment],
+        settings: LinkSettings | Sequence[AnyImpairment],
         count: int,
         *,
         seed: int = 0,

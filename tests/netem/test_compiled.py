@@ -11,25 +11,22 @@ from hypothesis import strategies as st
 
 from netem.engine.many_decisions import admit_many
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import PacketDecision, RecordedDecision, dtype_of
-from netem.rules.link_rules import LinkMemory
-from noack.config.impairments import (
-    BernoulliLoss,
-    Blackout,
-    Corrupt,
-    Delay,
-    Duplicate,
-    FourStateLoss,
-    GilbertElliottLoss,
-    Impairment,
-    LinkSettings,
-    LossOf,
-    PeriodicLoss,
-    Rate,
-    Reorder,
-    ScriptedLoss,
-    WorstCaseLoss,
-)
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_records import LinkMemory, PacketDecision, RecordedDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 chances = st.floats(0, 1)
 correlations = st.just(0.0) | st.floats(0, 0.999)
@@ -46,7 +43,7 @@ losses = st.one_of(
     st.builds(PeriodicLoss, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
     st.sets(st.integers(0, 30)).map(lambda names: ScriptedLoss(lost=tuple(sorted(names)))),
 ).map(lambda loss: LossOf(loss=loss))  # fmt: skip
-impairments: st.SearchStrategy[Impairment] = st.one_of(
+impairments: st.SearchStrategy[AnyImpairment] = st.one_of(
     losses,
     st.builds(Duplicate, probability=chances, correlation=correlations),
     st.builds(Corrupt, probability=chances, correlation=correlations),
@@ -63,7 +60,7 @@ impairments: st.SearchStrategy[Impairment] = st.one_of(
 )  # fmt: skip
 
 
-def aware(loss: LossOf, correlation: float, of_loss: float) -> tuple[Impairment, ...]:
+def aware(loss: LossOf, correlation: float, of_loss: float) -> tuple[AnyImpairment, ...]:
     """A loss, and a delay that knows of it."""
     return loss, Delay(
         delay_s=0.01, jitter_s=0.01, distribution="normal", correlation=correlation,
@@ -104,7 +101,7 @@ def plain(
         memory=[new_memory(program) for _ in range(many)],
         recent_ns=[[-1] * recent_width(program) for _ in range(many)],
     )
-    verdicts = [PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0) for _ in flows]
+    verdicts = [PacketDecision() for _ in flows]
     admit_many(program, state, flows, sizes, arrivals, verdicts)
     return verdicts, state
 

@@ -8,24 +8,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link, update_link_of
-from noack.config.impairments import (
-    BernoulliLoss,
-    Blackout,
-    Corrupt,
-    Delay,
-    Duplicate,
-    FourStateLoss,
-    GilbertElliottLoss,
-    Impairment,
-    LinkSettings,
-    Loss,
-    LossOf,
-    Rate,
-    Reorder,
-    WorstCaseLoss,
-)
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import (
     NETEM_PACKET,
@@ -43,7 +41,7 @@ STATES = FourStateLoss(p13=0.3, p31=0.2, p32=0.3, p23=0.5, p14=0.2)
 ALL = WorstCaseLoss()
 LOSSES = [BERNOULLI, BURSTS, CORRELATED, STATES, ALL]
 JITTER = Delay(delay_s=0.01, jitter_s=0.005, distribution="normal", correlation=0.3)
-TIMELESS: tuple[Impairment, ...] = (
+TIMELESS: tuple[AnyImpairment, ...] = (
     LossOf(loss=BERNOULLI),
     Duplicate(probability=0.3, correlation=0.5),
     Corrupt(probability=0.3),
@@ -54,7 +52,9 @@ TIMELESS: tuple[Impairment, ...] = (
 Outputs = Sequence[Datagram | Record | Notice]
 
 
-def new_link(*impairments: Impairment, mansd: int | None = 3, seed: int = 5, **more: Any) -> Link:
+def new_link(
+    *impairments: AnyImpairment, mansd: int | None = 3, seed: int = 5, **more: Any
+) -> Link:
     return Link(
         LinkSettings(impairments=impairments or (LossOf(loss=BERNOULLI),), mansd=mansd, **more),
         seed,
@@ -118,7 +118,13 @@ def test_nor_do_bits_copies_and_delays(arrivals: list[tuple[int, int]], mansd: i
     def decision(of: Link, flow: int, now_ns: int) -> tuple[int, ...]:
         verdict = of.decide(flow, 100, now_ns)
         wish = verdict.release_ns - verdict.hold_back_ns - now_ns if verdict.bit < 0 else -1
-        return verdict.fate, verdict.run, verdict.bit, verdict.copy_bit, max(wish, -1)
+        return (
+            verdict.fate,
+            verdict.consecutive_losses,
+            verdict.bit,
+            verdict.copy_bit,
+            max(wish, -1),
+        )
 
     for flow, now_ns in arrivals:
         found[flow].append(decision(link, flow, now_ns))
@@ -152,7 +158,7 @@ def test_two_impairments_of_a_kind_are_independent() -> None:
     ids=lambda one: one.kind,
 )
 def test_adding_an_impairment_does_not_change_what_is_lost(
-    mansd: int | None, other: Impairment
+    mansd: int | None, other: AnyImpairment
 ) -> None:
     loss = LossOf(loss=CORRELATED)
     alone = fates(new_link(loss, mansd=mansd), 0, 500)
@@ -176,7 +182,7 @@ def test_another_probability_changes_no_other_randomness(place: int) -> None:
     new, its_own = CHANGES[one.kind]
     changed = [*TIMELESS[:place], one.model_copy(update=new), *TIMELESS[place + 1 :]]
 
-    def visible(impairments: Sequence[Impairment]) -> list[dict[str, Any]]:
+    def visible(impairments: Sequence[AnyImpairment]) -> list[dict[str, Any]]:
         link, found = new_link(*impairments, mansd=None), []
         for k in range(2000):
             verdict = link.decide(0, 100, k * 10**9)

@@ -16,27 +16,31 @@ from hypothesis import strategies as st
 
 from netem.link_machine import Datagram, Link
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from netem.rule_records import FlowState, PacketDecision, RecordedDecision
 from netem.rules import mansd as rule
-from netem.rules.link_rules import DELIVERED, settle
-from noack.config.impairments import (
-    BernoulliLoss,
-    Blackout,
-    Corrupt,
-    Delay,
-    Duplicate,
-    FourStateLoss,
-    GilbertElliottLoss,
-    Impairment,
-    LinkSettings,
-    LossOf,
-    NoLoss,
-    PeriodicLoss,
-    Rate,
-    Reorder,
-    ScriptedLoss,
-    WorstCaseLoss,
+from netem.rules.link_rules import settle
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_records import (
+    DELIVERED,
+    DROPPED,
+    FlowState,
+    PacketDecision,
+    RecordedDecision,
 )
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.lossless import NoLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 MS = 1_000_000
 
@@ -61,7 +65,7 @@ delays = st.one_of(
     ),
     st.just(Delay(distribution="empirical", samples_s=(0.0, 0.001, 0.03))),
 )
-impairments: st.SearchStrategy[Impairment] = st.one_of(
+impairments: st.SearchStrategy[AnyImpairment] = st.one_of(
     losses.map(lambda loss: LossOf(loss=loss)),
     st.builds(Duplicate, probability=probabilities, correlation=correlations),
     st.builds(Corrupt, probability=probabilities, correlation=correlations),
@@ -71,7 +75,7 @@ impairments: st.SearchStrategy[Impairment] = st.one_of(
     st.builds(Rate, rate_bps=st.sampled_from([100_000, 10**7]), queue=st.integers(1, 5)),
     st.just(Blackout(intervals_s=((0.001, 0.003), (0.004, 0.01)), every_s=0.012)),
 )
-OVERTAKING: tuple[Impairment, ...] = (
+OVERTAKING: tuple[AnyImpairment, ...] = (
     Delay(delay_s=0.005, jitter_s=0.02),
     Reorder(probability=0.5),
 )
@@ -331,16 +335,16 @@ def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
     state = empty_state(program)._replace(
         flows=[flow], memory=[new_memory(program)], recent_ns=[[-1] * width]
     )
-    verdict = PacketDecision(0, 0, 0, 0, 0, 0, 0, 0, 0)
     releases: list[int | None] = []
     for packet, wish in enumerate(wishes):
         if wish is None and rule.must_pass(flow, mansd):
             wish = 0
         if wish is None:
-            settle(program, state, 0, packet, 1, False, -1, -1, -1, -1, 0, verdict)
+            settle(program, state, 0, PacketDecision(DROPPED, packet))
             releases.append(None)
         else:
-            settle(program, state, 0, packet, DELIVERED, False, wish, -1, -1, -1, 0, verdict)
+            verdict = PacketDecision(DELIVERED, packet, release_ns=wish)
+            settle(program, state, 0, verdict)
             alternatives = sorted({wish, *(t for t in releases if t is not None and t > wish)})
             least = next(t for t in alternatives if longest_run_of([*releases, t]) <= mansd)
             assert verdict.release_ns == least
@@ -358,12 +362,12 @@ def test_flows_never_share_a_counter(order: list[int], mansd: int, settings: Lin
     found: dict[int, list[tuple[int, int, int]]] = {}
     for now, flow in enumerate(order):
         verdict = together.decide(flow, 18, now * MS)
-        found.setdefault(flow, []).append((now, verdict.fate, verdict.run))
+        found.setdefault(flow, []).append((now, verdict.fate, verdict.consecutive_losses))
     for flow, of_flow in found.items():
         alone = Link(settings, 3, "a")
         for now, fate, run in of_flow:
             verdict = alone.decide(flow, 18, now * MS)
-            assert (verdict.fate, verdict.run) == (fate, run)
+            assert (verdict.fate, verdict.consecutive_losses) == (fate, run)
 
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
@@ -372,13 +376,14 @@ def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
     alone = decide(LinkSettings(impairments=(worst,), mansd=3), 1000)
     doubled = decide(LinkSettings(impairments=(worst, Duplicate(probability=1.0)), mansd=3), 1000)
     np.testing.assert_array_equal(alone.fates, doubled.fates)
-    np.testing.assert_array_equal(alone.verdicts["run"], doubled.verdicts["run"])
+    losses = "consecutive_losses"
+    np.testing.assert_array_equal(alone.verdicts[losses], doubled.verdicts[losses])
     assert (doubled.verdicts["copy_ns"] >= 0).sum() == 250
 
 
 # In great number, compiled, with an observer in NumPy.
 
-HARSH: dict[str, tuple[Impairment, ...]] = {
+HARSH: dict[str, tuple[AnyImpairment, ...]] = {
     "losses and jitter": (
         LossOf(loss=BernoulliLoss(probability=0.7, correlation=0.8)),
         Delay(delay_s=0.001, jitter_s=0.01, distribution="pareto"),
@@ -418,7 +423,7 @@ def test_not_once_in_hundreds_of_thousands(
 @given(st.integers(0, 3), st.integers(0, 40))
 def test_must_pass_is_a_counter(mansd: int, run: int) -> None:
     state = new_flow(0, False)
-    state.run = run
+    state.consecutive_losses = run
     assert isinstance(state, FlowState)
     assert rule.must_pass(state, mansd) == (run >= mansd)
     assert not rule.must_pass(state, -1)

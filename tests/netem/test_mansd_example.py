@@ -5,9 +5,8 @@ from pathlib import Path
 import pytest
 
 from netem.link_machine import Link
-from netem.rule_records import RecordedDecision
-from netem.rules.mansd import NEVER_NS
 from netem.words.words_to_settings import settings_of
+from noack.impairments.link_records import NEVER_NS, RecordedDecision
 from noack.protocol.record_tables import Fate
 
 PAGE = (Path(__file__).parents[2] / "docs/mansd.md").read_text()

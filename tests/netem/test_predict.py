@@ -11,10 +11,9 @@ from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.loss_prediction import predict, predicted_loss
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import PacketDecision, dtype_of
-from netem.rules.mansd import NEVER_NS
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_records import NEVER_NS, PacketDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 
 DECISIONS = 1_000_000
@@ -120,14 +119,17 @@ def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        ("loss 5% blackout 1s-2s", "what a blackout takes depends on when datagrams come"),
+        ("loss 5% blackout 1s-2s", "losses in a blackout depend on when packets arrive"),
         ("loss script 3,4", "a script that is played once"),
         ("loss trace a.txt", "a.txt has not been read"),
         ("loss 5% 99.9%", "a correlation of 0.999 is too high"),
-        ("loss 5% 90% loss 5% 90%", "together they have .* states"),
-        ("loss periodic 1/1000 loss 5%", "together they have 1000 states"),
-        ("loss periodic 1/100000000", "its pattern repeats only after 100000000 datagrams"),
-        ("loss periodic 1/9999991 loss periodic 1/2", "their pattern repeats only after"),
+        ("loss 5% 90% loss 5% 90%", "together the impairments have .* states"),
+        ("loss periodic 1/1000 loss 5%", "together the impairments have 1000 states"),
+        ("loss periodic 1/100000000", "the loss pattern repeats only after 100000000 packets"),
+        (
+            "loss periodic 1/9999991 loss periodic 1/2",
+            "the loss patterns repeat together only after",
+        ),
     ],
 )
 def test_what_cannot_be_told_says_why(words: str, why: str) -> None:
@@ -136,7 +138,10 @@ def test_what_cannot_be_told_says_why(words: str, why: str) -> None:
     assert re.search(why, prediction.note)
 
 
-QUEUE, OVERTAKEN = "as long as no queue overflows", "not counting what is overtaken (stale)"
+QUEUE, OUT_OF_ORDER = (
+    "as long as no queue overflows",
+    "not counting packets delivered out of order (stale)",
+)
 
 
 @pytest.mark.parametrize(
@@ -145,21 +150,21 @@ QUEUE, OVERTAKEN = "as long as no queue overflows", "not counting what is overta
         ("loss 5%", ""),
         ("loss 5% delay 10ms", ""),
         ("loss 5% rate 1mbit", QUEUE),
-        ("delay 10ms 2ms loss 5%", OVERTAKEN),
-        ("delay 0 2ms distribution pareto mansd 1", OVERTAKEN),
+        ("delay 10ms 2ms loss 5%", OUT_OF_ORDER),
+        ("delay 0 2ms distribution pareto mansd 1", OUT_OF_ORDER),
         ("delay 10ms 2ms mansd 0", ""),
-        ("delay 0 samples 1ms,2ms", OVERTAKEN),
-        ("delay 10ms reorder 5%", OVERTAKEN),
+        ("delay 0 samples 1ms,2ms", OUT_OF_ORDER),
+        ("delay 10ms reorder 5%", OUT_OF_ORDER),
         ("delay 10ms reorder 0%", ""),
         ("delay 0 reorder 5%", ""),
-        ("rate 1mbit reorder 5%", f"{QUEUE}; {OVERTAKEN}"),
+        ("rate 1mbit reorder 5%", f"{QUEUE}; {OUT_OF_ORDER}"),
         ("delay 10ms 2ms reorder 5% rate 1mbit", QUEUE),
-        ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OVERTAKEN}"),
+        ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OUT_OF_ORDER}"),
     ],
 )
 def test_what_is_not_counted_is_said(words: str, note: str) -> None:
     assert predict(settings_of(words)).note == note
-    assert makes_stale(settings_of(words)) == (OVERTAKEN in note)
+    assert makes_stale(settings_of(words)) == (OUT_OF_ORDER in note)
 
 
 def makes_stale(settings: LinkSettings) -> bool:

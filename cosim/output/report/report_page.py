@@ -76,10 +76,10 @@ def page(
 
 
 @cache
-def templates() -> Environment:
-    """The templates of the pages; all text is escaped."""
+def templates(folder: Path = Path(__file__).parent) -> Environment:
+    """The templates of the report and of a folder; all text is escaped."""
     found = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
+        loader=FileSystemLoader([folder, Path(__file__).parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

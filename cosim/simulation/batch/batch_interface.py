@@ -16,13 +16,13 @@ from cosim.simulation.continuous.continuous_run import MAX_EVENTS
 from cosim.simulation.continuous.network_fates import timeless
 from netem.link_machine import UPDATE_LINK
 from netem.rule_program import empty_state, program_of, stream_names
-from netem.rule_records import PacketDecision, dtype_of
-from noack.config.impairments import LinkSettings
 from noack.config.resolution import loop_of, policy_of
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import stream_keys
+from noack.impairments.link_records import PacketDecision, dtype_of
+from noack.impairments.link_settings import LinkSettings
 from noack.trigger import self_triggered_interval
 from noack.trigger.trigger_policy import Policy
 

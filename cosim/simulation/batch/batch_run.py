@@ -28,8 +28,8 @@ from cosim.simulation.batch.quadratic_crossing import (
 )
 from cosim.simulation.batch.taylor import Array, degree_for, driven, powers, reaches, value
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load, store, times
-from netem.rules.link_rules import DELIVERED, FORCED, LinkMemory, LinkProgram, admit
-from netem.rules.mansd import NEVER_NS
+from netem.rules.link_rules import admit
+from noack.impairments.link_records import DELIVERED, FORCED, NEVER_NS, LinkMemory, LinkProgram
 
 _LARGEST = 1e100
 """Beyond, a state is said to have diverged, as in ``continuous_loop``."""
@@ -107,7 +107,7 @@ class LossTable(NamedTuple):
     program: LinkProgram
     state: LinkMemory
     verdicts: Any
-    """One, of :class:`netem.rule_records.PacketDecision`."""
+    """One, of :class:`noack.impairments.link_records.PacketDecision`."""
 
 
 class EventLog(NamedTuple):
@@ -137,7 +137,7 @@ def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> Non
     """Let the link be that of a run: before its first update, with the run's random streams."""
     flow = network.state.flows[0]
     flow.packets = 0
-    flow.run = 0
+    flow.consecutive_losses = 0
     flow.forced_first = 1 if first_delivered else 0
     flow.first_release_ns = NEVER_NS
     flow.score = 0.0

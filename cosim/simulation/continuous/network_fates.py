@@ -3,8 +3,10 @@
 from collections.abc import Callable
 
 from netem.link_machine import UPDATE_LINK, Link
-from noack.config.impairments import Corrupt, LinkSettings, LossOf
 from noack.config.scenario import Scenario
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 
 

@@ -1,17 +1,15 @@
 """The page of a campaign: one file of HTML with all its figures and tables."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomli_w
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from cosim.output import report
 from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
+from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import Drawn
 from cosim.studies.campaign.campaign_summary import CampaignSummary, ComparedResult, GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
@@ -21,23 +19,23 @@ NONE = "–"
 
 
 class SummaryRow(NamedTuple):
-    """Of a table of grid points."""
+    """A row of a table of grid points."""
 
     labels: Sequence[str]
     cells: Sequence[str]
 
 
 def page(summary: CampaignSummary, drawn: Sequence[Drawn], base: Mapping[str, Any]) -> str:
-    """Return the page as HTML; whatever is not a figure is escaped.
+    """Return the page as HTML; all text but the figures is escaped.
 
     Args:
-        summary: what was found.
-        drawn: the figures, in order.
+        summary: the results.
+        drawn: the figures in order.
         base: content of the scenario that all runs start from.
     """
     campaign = summary.campaign
     content = campaign.model_dump(mode="json", exclude_none=True)
-    return _templates().get_template("campaign.html.jinja").render(
+    return templates(Path(__file__).parent).get_template("campaign.html.jinja").render(
         title=campaign.name,
         description=campaign.description,
         subtitle=f"{len(summary.found):,} grid points, {summary.draws:,} draws at each, "
@@ -61,16 +59,18 @@ def page(summary: CampaignSummary, drawn: Sequence[Drawn], base: Mapping[str, An
 
 
 def verdict(summary: CampaignSummary) -> str:
-    """One sentence on the whole."""
+    """Return one sentence on all results."""
     runs = len(summary.found) * summary.draws
     certified = sum(found.point.certified_error is not None for found in summary.found)
     if summary.breaches:
         return f"{summary.breaches:,} of {runs:,} runs exceed a certified bound."
     if not certified:
-        why = "none is with a hold, a floor or another policy"
-        return f"{runs:,} runs; no bound is certified at any grid point ({why})."
+        return (
+            f"{runs:,} runs; no grid point has a certified bound "
+            "(a hold, a floor and other policies have none)."
+        )
     where = "all" if certified == len(summary.found) else f"{certified} of {len(summary.found)}"
-    return f"{runs:,} runs; none exceeds the bound that is certified at {where} grid points."
+    return f"{runs:,} runs; {where} grid points have a certified bound; none was exceeded."
 
 
 def found_row(found: GridPointResult, metrics: Sequence[Metric]) -> SummaryRow:
@@ -87,7 +87,7 @@ def compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> Summary
 
 
 def _compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> SummaryRow:
-    """The same, and in how many draws the metric is smaller."""
+    """The same, with the share of draws in which the metric is smaller."""
     labels, cells = compared_row(compared, metrics)
     shares = [
         compared.differences[m].smaller if m in compared.differences else None for m in metrics
@@ -102,32 +102,20 @@ def _compared_row(compared: ComparedResult, metrics: Sequence[Metric]) -> Summar
 
 
 def written(estimate: Estimate) -> str:
-    """Mean ± half-width, and of how many runs if not of all."""
+    """Mean ± half-width, and the share of finite runs if not all are."""
     if not estimate.finite:
         return "never"
     text = plus_minus(estimate.mean, estimate.halfwidth)
     if estimate.finite < estimate.draws:
-        text += f" (in {100 * estimate.finite / estimate.draws:.4g} %)"
+        text += f" ({100 * estimate.finite / estimate.draws:.4g} % of runs)"
     return text
 
 
 def unfinished(summary: CampaignSummary) -> Iterator[str]:
-    """Of grid points where not all runs reached the horizon."""
+    """Return a remark for each grid point where not all runs reached the horizon."""
     for found in summary.found:
         others = {how: count for how, count in found.ended.items() if how != "finished"}
         if others:
             where = ", ".join(f"{axis} {label}" for axis, label in found.point.labels.items())
             counts = ", ".join(f"{n:,} {how.replace('_', ' ')}" for how, n in others.items())
             yield f"At {where} not all runs reached the horizon: {counts}"
-
-
-@cache
-def _templates() -> Environment:
-    folders = [Path(__file__).parent, Path(report.__file__).parent]
-    return Environment(
-        loader=FileSystemLoader(folders),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )

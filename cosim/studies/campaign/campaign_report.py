@@ -1,4 +1,4 @@
-"""Writes what a campaign found into its folder, and prints it."""
+"""Writes the results of a campaign into its folder and prints them."""
 
 import json
 import math
@@ -23,17 +23,17 @@ from cosim.studies.campaign.campaign_page import (
 from cosim.studies.campaign.campaign_summary import CampaignSummary
 from cosim.studies.campaign.chunk_store import RUNS, Store
 from cosim.studies.campaign.metrics import METRICS
-from noack.core.errors import MachineError
+from noack.core.whole_file import write_whole
 
 PAGE, SUMMARY = "campaign.html", "summary.json"
 _MOST_ROWS = 40
 _APART = 3
-"""At most between columns, margins included."""
+"""Largest distance between columns, margins included."""
 _MOST_REMARKS = 5
 
 
 def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]) -> list[Path]:
-    """Write page and summary; return the paths of what is to be looked at.
+    """Write page and summary; return their paths and that of the runs.
 
     Raises:
         MachineError: they cannot be written.
@@ -41,14 +41,8 @@ def write_report(summary: CampaignSummary, store: Store, base: Mapping[str, Any]
     written = [store.folder / PAGE, store.folder / SUMMARY]
     html = page(summary, list(figures(summary, store)), base)
     document = json.dumps(_known(summary.document()), indent=1, allow_nan=False)
-    try:
-        for path, text in zip(written, (html, document + "\n"), strict=True):
-            scratch = path.with_name(f".{path.name}.partial")
-            scratch.write_text(text, encoding="utf-8")
-            scratch.replace(path)
-    except OSError as error:
-        reason = error.strerror or error
-        raise MachineError(f"{store.folder}: the page cannot be written: {reason}") from None
+    for path, text in zip(written, (html, document + "\n"), strict=True):
+        write_whole(path, text)
     return [*written, store.folder / RUNS]
 
 
@@ -63,7 +57,7 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
         )
     ]
     if campaign.compare is not None:
-        title = f"minus the same draw at {campaign.compare.axis} = {campaign.compare.reference}"
+        title = f"paired difference to {campaign.compare.axis} = {campaign.compare.reference}"
         tables.append((title, [compared_row(one, shown) for one in summary.compared]))
     axes = [axis.called for axis in campaign.axes]
     headings = [METRICS[metric].heading for metric in shown]
@@ -74,8 +68,8 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
             console.print(f"and {len(rows) - _MOST_ROWS} more grid points: see the page")
     if campaign.time == "continuous":
         console.print(
-            "continuous time: the trigger watches always, and the network takes none; with "
-            'time = "sampled" it is as in a live run, sampling and delays included',
+            "continuous time: the trigger acts at once and the network has no delay; with "
+            'time = "sampled" the runs have the sampling and delays of a live run',
             style="dim",
             highlight=False,
         )
@@ -90,7 +84,7 @@ def print_summary(console: Console, summary: CampaignSummary) -> None:
 def tables_of(
     title: str, axes: Sequence[str], headings: Sequence[str], rows: Sequence[SummaryRow], width: int
 ) -> Iterator[Table]:
-    """Tables with all columns, as many as are needed for a terminal of this width; nothing is cut.
+    """Split a table into as many as a terminal of this width needs; nothing is truncated.
 
     Args:
         title: of the first.
@@ -121,12 +115,12 @@ def tables_of(
 
 
 def _width(heading: str, cells: Iterable[str]) -> int:
-    """Of a column, whose heading may break between words."""
+    """Width of a column; its heading may break between words."""
     return max(map(len, (*heading.split(), *cells))) + _APART
 
 
 def _known(value: Any) -> Any:
-    """As JSON knows it: null for what is not finite."""
+    """The value for JSON: null for a number that is not finite."""
     if isinstance(value, dict):
         return {key: _known(entry) for key, entry in value.items()}
     if isinstance(value, list):

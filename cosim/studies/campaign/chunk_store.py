@@ -5,7 +5,6 @@ with the values of the axes beside what was measured. A chunk that is there is n
 """
 
 import contextlib
-import fcntl
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -24,6 +23,7 @@ from cosim.studies.campaign.campaign_grid import Point
 from cosim.studies.campaign.campaign_workers import Chunk
 from cosim.studies.campaign.worker_identity import arithmetic, difference
 from noack.core.errors import CallerError, MachineError
+from noack.core.file_lock import locked
 
 RUNS, MANIFEST = "runs", "campaign.json"
 _LOCK = ".lock"
@@ -170,11 +170,8 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
     with ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = stack.enter_context((folder / _LOCK).open("a"))
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise CallerError(f"{folder}: another noack is at work in it") from None
+            if not stack.enter_context(locked(folder / _LOCK)):
+                raise CallerError(f"{folder}: another noack is at work in it")
             made_by = _claim(folder, manifest)
             for scratch in (folder / RUNS).glob(f"*/.*{_PARTIAL}"):
                 scratch.unlink(missing_ok=True)

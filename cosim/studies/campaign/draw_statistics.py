@@ -1,8 +1,8 @@
-"""What the draws of a grid point say of a metric, and how surely.
+"""Estimates of a metric from the draws of a grid point, with confidence intervals.
 
-Means have Student's confidence intervals, ± t s/√k; they and their spread are of the finite values,
-whose number is said. The median's interval is that of order statistics (binomial, free of any
-distribution) and counts what is infinite: a run that never settles is later than all others.
+Means have Student's confidence intervals, ± t s/√k. Mean and interval are of the finite values.
+The median's interval is that of order statistics (binomial, for any distribution). It counts
+infinite values: a run that never settles is later than all others.
 """
 
 import math
@@ -24,7 +24,7 @@ class Estimate(NamedTuple):
 
     draws: int
     finite: int
-    """Draws in which it is finite; mean and interval are of these."""
+    """Draws in which the metric is finite; mean and interval are of these."""
     mean: float
     halfwidth: float
     """Of the mean's 95 % confidence interval."""
@@ -44,7 +44,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
 
     Args:
         values: (k,), without NaN.
-        finite: those of them that count for the mean; all finite ones unless given.
+        finite: the values that count for the mean; all finite ones unless given.
     """
     finite = values[np.isfinite(values)] if finite is None else finite
     mean, halfwidth = float(finite.mean()) if len(finite) else math.inf, math.inf
@@ -54,7 +54,7 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         halfwidth = _student(len(finite)) * deviation / math.sqrt(len(finite))
     ordered = np.sort(values)
     q05, q25, median, q75, q95 = _quantiles(values, QUANTILES)
-    low, high = _median_ranks(len(values))
+    low, high = interval_ranks(len(values), 0.5)
     return Estimate(
         len(values),
         len(finite),
@@ -65,8 +65,8 @@ def estimate(values: Vector, finite: Vector | None = None) -> Estimate:
         median,
         q75,
         q95,
-        float(ordered[low]) if low is not None else -math.inf,
-        float(ordered[high]) if high is not None else math.inf,
+        float(ordered[low]) if low >= 0 else -math.inf,
+        float(ordered[high]) if high < len(ordered) else math.inf,
         float(ordered[-1]),
     )
 
@@ -91,7 +91,7 @@ def paired(values: Vector, reference: Vector) -> Vector:
 
 
 class PairedDifference(NamedTuple):
-    """A metric at one grid point minus at another, draw by draw."""
+    """Difference of a metric between two grid points, draw by draw."""
 
     estimate: Estimate
     larger: float
@@ -103,7 +103,7 @@ class PairedDifference(NamedTuple):
 def difference(values: Vector, reference: Vector) -> PairedDifference:
     """Estimate ``values`` − ``reference``, (k,) each.
 
-    Where both are infinite the difference is 0 for quantiles, and does not count for the mean.
+    Where both are infinite, the difference is 0 for quantiles and does not count for the mean.
     """
     differences = paired(values, reference)
     both = np.isfinite(values) & np.isfinite(reference)
@@ -116,7 +116,7 @@ def difference(values: Vector, reference: Vector) -> PairedDifference:
 
 @cache
 def _student(count: int) -> float:
-    """What the standard error of a mean of so many values is multiplied by."""
+    """Student's factor t of the standard error of a mean of this many values."""
     from scipy.special import stdtrit
 
     return float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
@@ -126,9 +126,19 @@ def _quantiles(values: Vector, shares: Sequence[float]) -> list[float]:
     return [float(value) for value in np.quantile(values, shares, method="inverted_cdf")]
 
 
-def _median_ranks(count: int) -> tuple[int | None, int | None]:
-    """Ranks between which the median lies with 95 % confidence; None where no rank will do."""
+def interval_ranks(count: int, share: float) -> tuple[int, int]:
+    """Ranks, from 0, of the ends of a quantile's 95 % confidence interval (order statistics).
+
+    Args:
+        count: draws.
+        share: of the quantile, in (0, 1).
+
+    Returns:
+        Lower and upper rank; −1 and ``count`` where no draw bounds the quantile.
+    """
     from scipy.stats import binom
 
-    low = int(binom.ppf((1 - CONFIDENCE) / 2, count, 0.5)) - 1
-    return (low, count - 1 - low) if low >= 0 else (None, None)
+    # At least the j-th of all draws, from 1, exceeds the quantile if fewer than j lie below it.
+    tail = (1.0 - CONFIDENCE) / 2
+    low, high = (int(binom.ppf(level, count, share)) for level in (tail, 1.0 - tail))
+    return low - 1, min(high, count)

@@ -1,4 +1,4 @@
-"""What is measured of a candidate: transmissions and settling over draws, certified bounds."""
+"""Measures of a candidate: transmissions and settling over draws, and certified bounds."""
 
 import math
 from collections.abc import Mapping
@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from cosim.simulation.batch.batch_interface import Population, run_batch, setting_of
-from cosim.studies.campaign.draw_statistics import CONFIDENCE
+from cosim.studies.campaign.draw_statistics import estimate, interval_ranks
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
@@ -24,19 +24,17 @@ Bounded = Literal["state", "error"]
 Bounds = Mapping[Bounded, float]
 """sup‖x‖ and sup‖e_c‖, Euclidean; infinite if none is certified."""
 
-_Z = 1.959963984540054
-
 
 @dataclass(frozen=True)
 class DesignLimits:
-    """What a design must meet.
+    """The limits of a design.
 
     Args:
-        settling_s: the quantile of the settling times is at most this.
-        quantile: which.
+        settling_s: upper limit of the quantile of the settling times.
+        quantile: the share of draws that must settle within it.
         settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
-        bounds: certified bounds are at most these.
-        schedule: they are certified under the scenario's schedule, not the paper's conditions.
+        bounds: upper limits of the certified bounds.
+        schedule: bounds are certified under the scenario's schedule, not the paper's conditions.
     """
 
     settling_s: float
@@ -46,25 +44,25 @@ class DesignLimits:
     schedule: bool = False
 
     def excess(self, settling_s: float, bounds: Bounds) -> float:
-        """0 if all are met, else how far the worst is missed: 1 − limit/value."""
+        """Return 0 if all limits are met, else the largest 1 − limit/value."""
         pairs = [(settling_s, self.settling_s)]
         pairs += [(bounds[name], limit) for name, limit in self.bounds.items() if name in bounds]
         return max(0.0, *(1.0 - limit / value if value > 0 else 0.0 for value, limit in pairs))
 
 
 class CandidateMeasures(NamedTuple):
-    """Of k draws; intervals have 95 % confidence."""
+    """Measures of a candidate over k draws; intervals have 95 % confidence."""
 
     draws: int
     transmissions: float
     """Mean."""
     halfwidth: float
-    """Of the mean's interval (normal)."""
+    """Of the mean's confidence interval."""
     settling_s: float
-    """The quantile; infinite if too many runs do not settle within the horizon."""
+    """Quantile of the settling times; infinite if too many runs do not settle."""
     settling_low_s: float
     settling_high_s: float
-    """Its interval, of order statistics: free of any distribution."""
+    """Ends of its interval, of order statistics."""
     settled: float
     """The share of runs that settle within the limit."""
 
@@ -77,33 +75,19 @@ def measure(scenario: Scenario, limits: DesignLimits, population: Population) ->
     """
     setting = replace(setting_of(resolve(scenario)), settle=limits.settle)
     rows = run_batch(setting, population)
-    sent = rows["transmissions"].astype(np.float64)
+    sent = estimate(rows["transmissions"].astype(np.float64))
     settling_s = np.where(np.isnan(rows["settling_s"]), math.inf, rows["settling_s"])
     ordered = np.append(np.sort(settling_s), math.inf)
-    at, low, high = ranks(len(rows), limits.quantile)
+    low, high = interval_ranks(len(rows), limits.quantile)
     return CandidateMeasures(
         len(rows),
-        float(sent.mean()),
-        _Z * float(sent.std(ddof=1)) / math.sqrt(len(sent)),
-        float(ordered[at]),
+        sent.mean,
+        sent.halfwidth,
+        float(np.quantile(settling_s, limits.quantile, method="inverted_cdf")),
         float(ordered[low]) if low >= 0 else 0.0,
         float(ordered[high]),
         float(np.mean(settling_s <= limits.settling_s)),
     )
-
-
-def ranks(count: int, quantile: float) -> tuple[int, int, int]:
-    """Ranks, from 0, of a quantile among so many values, and of its interval's ends.
-
-    The lower end is −1 where there is none, the upper one then is ``count``.
-    """
-    from scipy.stats import binom
-
-    # The j-th of all, from 1, is at least the quantile if fewer than j lie below it.
-    tail = (1.0 - CONFIDENCE) / 2
-    low = int(binom.ppf(tail, count, quantile)) - 1
-    high = int(binom.ppf(1.0 - tail, count, quantile))
-    return max(math.ceil(quantile * count) - 1, 0), low, min(high, count)
 
 
 def require_draws(draws: int, quantile: float) -> None:
@@ -112,26 +96,24 @@ def require_draws(draws: int, quantile: float) -> None:
     Raises:
         CallerError: they are too few.
     """
-    if ranks(draws, quantile)[2] < draws:
+    if interval_ranks(draws, quantile)[1] < draws:
         return
     enough = draws
-    while ranks(enough, quantile)[2] == enough:
+    while interval_ranks(enough, quantile)[1] == enough:
         enough += max(enough // 50, 1)
     raise CallerError(
-        f"--draws: {draws} say too little of the quantile {quantile:g}; {enough} are enough"
+        f"--draws: {draws} are too few for the quantile {quantile:g}; {enough} are enough"
     )
 
 
 def require_certifiable(scenario: Scenario) -> None:
-    """Require that a certificate covers what is drawn.
+    """Require that a certificate covers all plants and initial states that are drawn.
 
     Raises:
         CallerError: it would not.
     """
     if scenario.plant.initial_state_halfwidth is not None:
-        raise CallerError(
-            "--bound: is certified for one x(0); leave out plant.initial_state_halfwidth"
-        )
+        raise CallerError("--bound: needs one x(0); leave out plant.initial_state_halfwidth")
     outside = outside_box(resolve(scenario))
     if outside is not None:
         raise CallerError(f"--bound: {outside}")

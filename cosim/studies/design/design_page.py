@@ -1,39 +1,37 @@
 """The page of a design: one file of HTML with figure and tables, and the table of a terminal."""
 
-from functools import cache
 from pathlib import Path
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from cosim.output import report
 from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
+from cosim.output.report.report_page import templates
 from cosim.studies.design.design_figure import trade_off
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
 
 _CAPTION = (
-    "Each candidate's mean number of transmissions and the quantile of its settling times, all on "
-    "the same draws; those that settle too rarely to have a quantile are left out. The star is the "
-    "chosen one on fresh draws."
+    "Mean number of transmissions and quantile of the settling times of each candidate, all on the "
+    "same draws. Candidates that settle too rarely to have a quantile are left out. The star is "
+    "the chosen candidate on new draws."
 )
 _MOST_ROWS = 20
 HEADINGS = ("transmissions", "settling time", "α [1/s]", "β", "weight", "gain")
 
 
 def page(found: DesignResult) -> str:
-    """Return the page as HTML; whatever is not the figure is escaped."""
+    """Return the page as HTML; all text but the figure is escaped."""
     limits, bounds = found.limits, found.bounds or {}
     lines = [
         f"{100 * limits.quantile:g} % of draws settle to {limits.settle:g} ‖x(0)‖ "
         f"within {limits.settling_s:g} s",
         *(f"{WORDS[name]} ≤ {limit:g}, certified" for name, limit in limits.bounds.items()),
     ]
-    return _templates().get_template("design.html.jinja").render(
+    return templates(Path(__file__).parent).get_template("design.html.jinja").render(
         title=found.space.families[0].scenario.name,
         subtitle=f"{len(found.trials):,} candidates, {found.fresh.draws:,} draws, "
         f"seed {found.seed}",
@@ -70,8 +68,8 @@ def rows(found: DesignResult) -> list[tuple[str, ...]]:
 
 def print_found(console: Console, found: DesignResult) -> None:
     """Print the trade-off curve, thinned if it is long, and the verdict."""
-    title = f"{found.space.families[0].scenario.name}: trade-off, no other is smaller in both"
-    # All of it in 80 columns, no figure cut off.
+    title = f"{found.space.families[0].scenario.name}: trade-off of transmissions and settling time"
+    # It must fit into 80 columns.
     table = Table(
         title=title, title_justify="left", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=False
     )
@@ -87,7 +85,7 @@ def print_found(console: Console, found: DesignResult) -> None:
         console.print(found.verdict(), highlight=False, markup=False, soft_wrap=True)
         console.print(
             f"chosen among {len(found.trials):,} candidates on {found.best.measured.draws:,} "
-            f"draws; the figures are of {found.fresh.draws:,} others",
+            f"draws; the numbers are from {found.fresh.draws:,} other draws",
             highlight=False,
             soft_wrap=True,
         )
@@ -95,14 +93,3 @@ def print_found(console: Console, found: DesignResult) -> None:
     if bounds:
         text = f"certified {found.conditions}: {', '.join(bounds)}"
         console.print(text, highlight=False, soft_wrap=True)
-
-
-@cache
-def _templates() -> Environment:
-    return Environment(
-        loader=FileSystemLoader([Path(__file__).parent, Path(report.__file__).parent]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )

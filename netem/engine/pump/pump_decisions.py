@@ -1,4 +1,6 @@
-"""What becomes of the datagrams at hand, and what was delayed and is due."""
+"""Decides for the packets at hand, and lets those out that were delayed and are due."""
+
+from typing import Any
 
 from netem.engine.pump.client_table import find, key_of
 from netem.engine.pump.libc_calls import ENOMEM, array_at
@@ -15,24 +17,25 @@ from netem.engine.pump.pump_layout import (
     STORE_FULL,
     Memory,
 )
-from netem.rule_records import PacketDecision
-from netem.rules.link_rules import LinkMemory, LinkProgram, admit, leave
-from netem.rules.mansd import NEVER_NS
+from netem.rules.link_rules import admit, leave
+from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
 
 _HEAD_BYTES = 16
 """Of a control message: its length, its level and its kind."""
 _STAMP = 1 | 35 << 32
 """Level and kind: SOL_SOCKET, SCM_TIMESTAMPNS."""
 _NS = 1_000_000_000
+_NO_CLIENT = -1
+_REFUSED = -2
 
 
 def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
-    """Line up what is due; return why this ends: CARRY_ON, or what there is no room for.
+    """Line up what is due; return why this ends: CARRY_ON, or what is full.
 
     Args:
         memory: the pump's.
         state_like: a state; only its types count.
-        until_ns: what is due by then is.
+        until_ns: packets are let out that are due by then.
     """
     pump = memory.pump[0]
     while pump.heap > 0 and memory.heap[0].release_ns <= until_ns:
@@ -42,122 +45,138 @@ def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
             return LEAVING_FULL
         if not has_room(memory, slot.size_bytes):
             return EVENTS_FULL
-        release_ns, number = entry.release_ns, entry.slot
+        leaving = memory.leaving[pump.leaving]
+        leaving.slot = entry.slot
+        leaving.release_ns = entry.release_ns
         pop(memory)
-        pump.now_ns = max(pump.now_ns, release_ns)
+        pump.now_ns = max(pump.now_ns, leaving.release_ns)
         memory.clients[slot.client].in_flight -= 1
-        _line_up(
-            memory, state_like, slot.direction, slot.client, slot.packet, slot.arrival_ns,
-            release_ns, slot.size_bytes, 0, number, slot.bit, slot.copy, slot.fate, 1, slot.counts,
-        )  # fmt: skip
+        leaving.address = 0
+        leaving.packet = slot.packet
+        leaving.arrival_ns = slot.arrival_ns
+        leaving.bit = slot.bit
+        leaving.size_bytes = slot.size_bytes
+        leaving.direction = slot.direction
+        leaving.client = slot.client
+        leaving.delayed = 1
+        leaving.copy = slot.copy
+        leaving.fate = slot.fate
+        leaving.counts = slot.counts
+        _line_up(memory, state_like)
     return CARRY_ON
 
 
 def decide(
-    memory: Memory, program_like: LinkProgram, state_like: LinkMemory, verdict: PacketDecision
+    memory: Memory, program_like: LinkProgram, state_like: LinkMemory, decision: PacketDecision
 ) -> int:
-    """Decide on the datagrams at hand, all from one socket; return why this ends.
+    """Decide for the packets at hand, all from one socket; return why this ends.
 
     Args:
         memory: the pump's.
         program_like: a program; only its types count.
         state_like: a state; likewise.
-        verdict: room for one.
+        decision: a row that is overwritten.
     """
     pump = memory.pump[0]
-    back = pump.batch_socket >= pump.first_path
-    client_row = pump.batch_socket - pump.first_path
-    link = memory.clients[client_row].link if back else pump.batch_socket
-    way = 2 * link + back
-    direction = memory.directions[way]
-    program = LinkProgram(
-        array_at(program_like.stages, direction.stages, direction.stages_rows, 0),
-        array_at(program_like.chances, direction.chances, direction.chances_rows, 0),
-        array_at(program_like.chains, direction.chains, direction.chains_rows, 0),
-        array_at(program_like.four_states, direction.four_states, direction.four_states_rows, 0),
-        array_at(program_like.scripts, direction.scripts, direction.scripts_rows, 0),
-        array_at(program_like.waits, direction.waits, direction.waits_rows, 0),
-        array_at(program_like.bottlenecks, direction.bottlenecks, direction.bottlenecks_rows, 0),
-        array_at(program_like.darknesses, direction.darknesses, direction.darknesses_rows, 0),
-        array_at(program_like.integers, direction.integers, direction.integers_rows, 0),
-        array_at(program_like.reals, direction.reals, direction.reals_rows, 0),
-        array_at(program_like.decisions, direction.decisions, direction.decisions_rows, 0),
-        array_at(
-            program_like.decisions_begin, direction.decisions_begin,
-            direction.decisions_begin_rows, 0,
-        ),
-        direction.mansd,
-        direction.limit,
-        direction.scored != 0,
-        direction.tracks != 0,
-    )  # fmt: skip
-    state = LinkMemory(
-        array_at(state_like.flows, direction.flows, direction.rows, 0),
-        array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
-        array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
-        array_at(state_like.queues, direction.queues, direction.queue_rows, 0),
-        array_at(state_like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
-        memory.link_states[way],
-        memory.counters[way],
-    )
+    reverse = pump.batch_socket >= pump.first_path
+    path = pump.batch_socket - pump.first_path
+    link = memory.clients[path].link if reverse else pump.batch_socket
+    number = 2 * link + reverse
+    direction = memory.directions[number]
+    program = _program_at(program_like, direction)
+    state = _state_at(memory, state_like, number)
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
-        # Never before what was decided already; so what is due between two datagrams leaves there.
+        # Never before an earlier decision; so a packet that is due between two arrivals leaves
+        # there.
         now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
         reason = let_out_due(memory, state_like, now_ns)
         if reason != CARRY_ON:
             return reason
         pump.now_ns = now_ns
         size_bytes = header.size_bytes
-        address = memory.in_vectors[pump.batch_next].base
         if pump.leaving + 2 > len(memory.leaving):
             return LEAVING_FULL
         if not has_room(memory, size_bytes):
             return EVENTS_FULL
-        taken = True
-        if direction.keeps != 0 and (
-            pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes)
-        ):
+        client_row = path
+        if direction.keeps != 0 and _store_is_full(memory, size_bytes):
             if pump.no_memory == 0:
                 return STORE_FULL
-            memory.errors[way, ENOMEM] += 1
-            taken = False
-        elif not back:
-            name = memory.in_names[pump.batch_next]
-            key0, key1, key2, key3 = key_of(name, link)
-            client_row = find(memory.table, memory.clients, key0, key1, key2, key3)
-            if client_row < 0:
-                if direction.full == 0:
-                    return NEW_CLIENT
-                direction.refused += 1
-                taken = False
-        if taken:
+            memory.errors[number, ENOMEM] += 1
+            client_row = _REFUSED
+        elif not reverse:
+            client_row = _client_at_hand(memory, direction, link)
+            if client_row == _NO_CLIENT:
+                return NEW_CLIENT
+        if client_row >= 0:
             client = memory.clients[client_row]
             client.last_ns = now_ns
-            admit(program, state, client.place, size_bytes, now_ns, verdict)
+            admit(program, state, client.place, size_bytes, now_ns, decision)
+            address = memory.in_vectors[pump.batch_next].base
             if pump.taps != 0:
-                tell_arrival(memory, way, client_row, size_bytes, address, verdict)
-            if verdict.release_ns != NEVER_NS:
-                intact = verdict.bit < 0
-                _release(
-                    memory, state_like, way, client_row, address, size_bytes, verdict.packet,
-                    verdict.fate, verdict.release_ns, verdict.bit, False, intact,
-                )  # fmt: skip
-                if verdict.copy_ns != NEVER_NS:
-                    _release(
-                        memory, state_like, way, client_row, address, size_bytes, verdict.packet,
-                        verdict.fate, verdict.copy_ns, verdict.copy_bit, True,
-                        not intact and verdict.copy_bit < 0,
-                    )  # fmt: skip
+                tell_arrival(memory, number, client_row, address, decision)
+            if decision.release_ns != NEVER_NS:
+                _release(memory, state_like, number, client_row, address, decision, 0)
+            if decision.copy_ns != NEVER_NS:
+                _release(memory, state_like, number, client_row, address, decision, 1)
         header.name_bytes = NAME_BYTES
         header.control_bytes = pump.control_bytes
         pump.batch_next += 1
     return CARRY_ON
 
 
+def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
+    """Return the program of a direction."""
+    return LinkProgram(
+        array_at(like.stages, direction.stages, direction.stages_rows, 0),
+        array_at(like.integers, direction.integers, direction.integers_rows, 0),
+        array_at(like.reals, direction.reals, direction.reals_rows, 0),
+        array_at(like.decisions, direction.decisions, direction.decisions_rows, 0),
+        array_at(
+            like.decisions_begin, direction.decisions_begin, direction.decisions_begin_rows, 0
+        ),
+        direction.mansd,
+        direction.limit,
+        direction.tracks != 0,
+    )
+
+
+def _state_at(memory: Memory, like: LinkMemory, number: int) -> LinkMemory:
+    """Return the state of direction ``number``."""
+    direction = memory.directions[number]
+    return LinkMemory(
+        array_at(like.flows, direction.flows, direction.rows, 0),
+        array_at(like.memory, direction.memory, direction.rows, direction.stages_rows),
+        array_at(like.recent_ns, direction.recent_ns, direction.rows, direction.width),
+        array_at(like.queues, direction.queues, direction.stages_rows, 0),
+        array_at(like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
+        memory.link_states[number],
+        memory.counters[number],
+    )
+
+
+def _store_is_full(memory: Memory, size_bytes: int) -> bool:
+    """Whether a packet of this size and its copy might not fit into the store."""
+    pump = memory.pump[0]
+    return pump.free_slots < 2 or pump.free_blocks < 2 * blocks_for(size_bytes)
+
+
+def _client_at_hand(memory: Memory, direction: Any, link: int) -> int:
+    """Return the row of the client that sent the packet at hand; a refused one is counted."""
+    key0, key1, key2, key3 = key_of(memory.in_names[memory.pump[0].batch_next], link)
+    row = find(memory.table, memory.clients, key0, key1, key2, key3)
+    if row < 0:
+        if direction.full == 0:
+            return _NO_CLIENT
+        direction.refused += 1
+        return _REFUSED
+    return row
+
+
 def _read_arrival(memory: Memory) -> None:
-    """Read when the datagram at hand came."""
+    """Read when the packet at hand arrived."""
     pump = memory.pump[0]
     header, words = memory.in_headers[pump.batch_next], memory.in_controls[pump.batch_next]
     pump.arrival_ns = pump.read_ns
@@ -173,93 +192,72 @@ def _read_arrival(memory: Memory) -> None:
 def _release(
     memory: Memory,
     state_like: LinkMemory,
-    way: int,
+    direction: int,
     client: int,
     address: int,
-    size_bytes: int,
-    packet: int,
-    fate: int,
-    release_ns: int,
-    bit: int,
-    copy: bool,
-    counts: bool,
+    decision: PacketDecision,
+    copy: int,
 ) -> None:
-    """Line up a datagram that leaves now, or keep it until it is due."""
+    """Line up a packet, or its copy, that leaves now, or keep it until it is due."""
     pump = memory.pump[0]
+    release_ns, bit, counts = decision.release_ns, decision.bit, decision.bit < 0
+    if copy != 0:
+        release_ns, bit = decision.copy_ns, decision.copy_bit
+        counts = not counts and bit < 0
     number = -1
     delayed = release_ns > pump.now_ns
     if delayed or bit >= 0:
-        number = keep(memory, address, size_bytes, bit)
+        number = keep(memory, address, decision.size_bytes, bit)
     if delayed:
         slot = memory.slots[number]
-        slot.packet = packet
+        slot.packet = decision.packet
         slot.arrival_ns = pump.now_ns
-        slot.direction = way
+        slot.direction = direction
         slot.client = client
         slot.copy = copy
         slot.counts = counts
-        slot.fate = fate
+        slot.fate = decision.fate
         pump.put += 1
         push(memory, release_ns, pump.put, number)
         memory.clients[client].in_flight += 1
-    else:
-        _line_up(
-            memory, state_like, way, client, packet, pump.now_ns, release_ns, size_bytes, address,
-            number, bit, copy, fate, 0, counts,
-        )  # fmt: skip
-
-
-def _line_up(
-    memory: Memory,
-    state_like: LinkMemory,
-    way: int,
-    client: int,
-    packet: int,
-    arrival_ns: int,
-    release_ns: int,
-    size_bytes: int,
-    address: int,
-    slot: int,
-    bit: int,
-    copy: int,
-    fate: int,
-    delayed: int,
-    counts: int,
-) -> None:
-    """Line up a datagram to be sent, and take note that it leaves."""
-    pump, direction = memory.pump[0], memory.directions[way]
-    place = memory.clients[client].place
-    state = LinkMemory(
-        array_at(state_like.flows, direction.flows, direction.rows, 0),
-        state_like.memory,
-        state_like.recent_ns,
-        state_like.queues,
-        state_like.departures_ns,
-        memory.link_states[way],
-        memory.counters[way],
-    )
-    stale = leave(state, place, packet, size_bytes, delayed != 0, counts != 0)
+        return
     leaving = memory.leaving[pump.leaving]
-    pump.leaving += 1
-    pump.leaving_bytes += size_bytes
     leaving.address = address
-    leaving.packet = packet
-    leaving.arrival_ns = arrival_ns
+    leaving.packet = decision.packet
+    leaving.arrival_ns = pump.now_ns
     leaving.release_ns = release_ns
     leaving.bit = bit
-    leaving.size_bytes = size_bytes
-    leaving.slot = slot
-    link = way >> 1
+    leaving.size_bytes = decision.size_bytes
+    leaving.slot = number
+    leaving.direction = direction
+    leaving.client = client
+    leaving.delayed = 0
+    leaving.copy = copy
+    leaving.fate = decision.fate
+    leaving.counts = counts
+    _line_up(memory, state_like)
+
+
+def _line_up(memory: Memory, state_like: LinkMemory) -> None:
+    """Line up the packet that has been filled in to be sent, and note that it leaves."""
+    pump = memory.pump[0]
+    leaving = memory.leaving[pump.leaving]
+    number = leaving.direction
+    leaving.stale = leave(
+        _state_at(memory, state_like, number),
+        memory.clients[leaving.client].place,
+        leaving.packet,
+        leaving.size_bytes,
+        leaving.delayed != 0,
+        leaving.counts != 0,
+    )
+    leaving.error = 0
+    pump.leaving += 1
+    pump.leaving_bytes += leaving.size_bytes
+    direction, link = memory.directions[number], number >> 1
     if direction.sends == NO_NAME:
-        leaving.socket = pump.first_path + client
+        leaving.socket = pump.first_path + leaving.client
     elif direction.sends == SERVER_NAME:
         leaving.socket = len(memory.directions) // 2 + link
     else:
         leaving.socket = link
-    leaving.direction = way
-    leaving.client = client
-    leaving.error = 0
-    leaving.delayed = delayed
-    leaving.copy = copy
-    leaving.fate = fate
-    leaving.stale = stale

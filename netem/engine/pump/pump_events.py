@@ -6,8 +6,7 @@ from netem.engine.pump.libc_calls import address_of, array_at, memcpy
 from netem.engine.pump.payload_store import block_address
 from netem.engine.pump.pump_layout import BLOCK_BYTES, CLIENT, DIRECTION, Memory
 from netem.relay_events import EVENT
-from netem.rule_records import PacketDecision
-from netem.rules.mansd import NEVER_NS
+from noack.impairments.link_records import NEVER_NS, PacketDecision
 
 _EVENT_BYTES = EVENT.itemsize
 _SOURCE = EVENT.fields["source"][1]  # type: ignore[index]
@@ -32,7 +31,7 @@ def has_room(memory: Memory, size_bytes: int) -> bool:
 
 
 def tell_arrival(
-    memory: Memory, way: int, client: int, size_bytes: int, address: int, verdict: PacketDecision
+    memory: Memory, way: int, client: int, address: int, decision: PacketDecision
 ) -> None:
     """Tell that a datagram has come, and what was decided.
 
@@ -40,23 +39,22 @@ def tell_arrival(
         memory: the pump's.
         way: number of the direction.
         client: row of the client.
-        size_bytes: of the payload.
         address: of the payload.
-        verdict: what was decided.
+        decision: what was decided.
     """
-    pump = memory.pump[0]
+    pump, size_bytes = memory.pump[0], decision.size_bytes
     event = memory.events[pump.events]
-    _fill(memory, event, way, client, pump.now_ns, verdict.packet, verdict.fate, size_bytes)
-    event.run = verdict.run
+    _fill(memory, event, way, client, pump.now_ns, decision.packet, decision.fate, size_bytes)
+    event.run = decision.consecutive_losses
     event.delay_ns = -1
     event.copy_delay_ns = -1
-    if verdict.release_ns != NEVER_NS:
-        event.delay_ns = verdict.release_ns - pump.now_ns
-    if verdict.copy_ns != NEVER_NS:
-        event.copy_delay_ns = verdict.copy_ns - pump.now_ns
-    event.hold_back_ns = verdict.hold_back_ns
-    event.bit = verdict.bit
-    event.copy_bit = verdict.copy_bit
+    if decision.release_ns != NEVER_NS:
+        event.delay_ns = decision.release_ns - pump.now_ns
+    if decision.copy_ns != NEVER_NS:
+        event.copy_delay_ns = decision.copy_ns - pump.now_ns
+    event.hold_back_ns = decision.hold_back_ns
+    event.bit = decision.bit
+    event.copy_bit = decision.copy_bit
     event.departure = 0
     event.copy = 0
     event.stale = 0

@@ -98,22 +98,18 @@ CLIENT = np.dtype(
         ("local", "u1", (NAME_BYTES,)),  # address of its return path
     ]
 )
-TABLES = (
-    "stages", "chances", "chains", "four_states", "scripts", "waits", "bottlenecks",
-    "darknesses", "integers", "reals", "decisions", "decisions_begin",
-)  # fmt: skip
+TABLES = ("stages", "integers", "reals", "decisions", "decisions_begin")
+STATES = ("flows", "memory", "recent_ns", "queues", "departures_ns")
 DIRECTION = np.dtype(
     [
         *((name, "<i8") for name in TABLES),
         *((f"{name}_rows", "<i8") for name in TABLES),
-        *((name, "<i8") for name in ("flows", "memory", "recent_ns", "queues", "departures_ns")),
+        *((name, "<i8") for name in STATES),
         ("rows", "<i8"),
         ("width", "<i8"),  # of recent_ns
-        ("queue_rows", "<i8"),
         ("departure_rows", "<i8"),
         ("mansd", "<i8"),
         ("limit", "<i8"),
-        ("scored", "<i8"),
         ("tracks", "<i8"),
         ("keeps", "<i8"),  # 1: what it lets out may have to be kept
         ("sends", "<i8"),  # NO_NAME, SERVER_NAME or CLIENT_NAME
@@ -144,6 +140,8 @@ LEAVING = np.dtype(
         ("copy", "u1"),
         ("fate", "u1"),
         ("stale", "u1"),
+        ("counts", "u1"),  # it is the first intact copy
+        ("unused", "u1", (3,)),
     ]
 )
 """A datagram that is about to be sent."""
@@ -200,9 +198,9 @@ class Memory(NamedTuple):
     directions: Array
     """(2 · links,) The way forward and the way back of each link in turn."""
     link_states: Array
-    """(2 · links,) :class:`netem.rule_records.LinkState`."""
+    """(2 · links,) :class:`noack.impairments.link_records.LinkState`."""
     counters: Array
-    """(2 · links,) :class:`netem.rule_records.Counters`."""
+    """(2 · links,) :class:`noack.impairments.link_records.Counters`."""
     delays: Array
     """(2 · links, BUCKETS) Histograms."""
     lateness: Array

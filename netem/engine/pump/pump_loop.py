@@ -24,8 +24,7 @@ from netem.engine.pump.pump_layout import (
     Memory,
 )
 from netem.engine.pump.pump_send import send
-from netem.rule_records import PacketDecision
-from netem.rules.link_rules import LinkMemory, LinkProgram
+from noack.impairments.link_records import LinkMemory, LinkProgram, PacketDecision
 
 _HEADER_BYTES = HEADER.itemsize
 _EPOLLERR = 8

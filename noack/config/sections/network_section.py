@@ -4,15 +4,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from noack.config.impairments import (
-    Impairment,
-    LinkSettings,
-    Loss,
-    LossOf,
-    Mansd,
-    NoLoss,
-    require_scores,
-)
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings, Mansd, require_scores
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.lossless import NoLoss
 from noack.settings.section import ScenarioSection
 
 
@@ -23,7 +19,7 @@ class AcknowledgementSection(ScenarioSection):
     """What is lost of the acknowledgements."""
     mansd: Mansd | None = None
     """At most so many successive acknowledgements are lost; without it, any number."""
-    impairments: tuple[Impairment, ...] = ()
+    impairments: tuple[AnyImpairment, ...] = ()
     """What else happens to them, in this order, after the loss."""
     timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
     """After a transmission, the sensor waits so long for its acknowledgement before it transmits
@@ -49,7 +45,7 @@ class NetworkSection(ScenarioSection):
     """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
     loss: Loss
     """What is lost, before the cap."""
-    impairments: tuple[Impairment, ...] = ()
+    impairments: tuple[AnyImpairment, ...] = ()
     """What else happens to the updates, in this order, after the loss."""
     limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
     """At most so many updates are delayed at once; more are dropped."""

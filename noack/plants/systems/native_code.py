@@ -1,13 +1,14 @@
 """What running somebody else's native code needs: a folder to unpack it in, and quiet around it."""
 
 import ctypes
-import fcntl
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from noack.core.file_lock import lock
 
 _PREFIX = "noack-native-"
 _STREAMS = (1, 2)
@@ -46,17 +47,16 @@ def _remove_if_left(folder: Path) -> None:
 
 
 def _locked(folder: Path) -> int | None:
-    """A lock on a folder, as a file descriptor; None if there is one already, or no folder."""
+    """Lock a folder; return its descriptor, None if another holds a lock or there is no folder."""
     try:
-        lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     except OSError:
         return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(lock)
-        return None
-    return lock
+    with suppress(OSError):
+        if lock(descriptor):
+            return descriptor
+    os.close(descriptor)
+    return None
 
 
 @contextmanager

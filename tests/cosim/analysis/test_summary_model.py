@@ -57,7 +57,7 @@ FULL = {
     "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_burst": 1, "received": 2},
     "lateness_us": {"plant": QUANTILES | {"steps": 3, "late_steps": 3}},
     "latency_us": QUANTILES | {"updates": 3},
-    "realtime": {"plant": {"sched_fifo": "granted"}},
+    "realtime": {"plant": {"sched_fifo": "applied"}},
     "linearisation": {"A": [[1.0]], "B": [[1.0]], "eigenvalues": [[1.0, 0.0]], "off_A": [[1.0]],
                       "off_B": [[1.0]], "in_box": True},
     "replay": DIFFERS,

@@ -26,7 +26,7 @@ PROMPT = Lateness(1000, 30.0, 100.0, 300.0, 0)
 ALL = ("sched_fifo", "memory_lock", "timer_slack", "affinity", "cpu_dma_latency")
 IDEAL = MachineFacts(
     cores=4, cores_online=4, load=0.1, governor="performance",
-    granted=dict.fromkeys(ALL, "granted"),
+    granted=dict.fromkeys(ALL, "applied"),
     timer_resolution_ns=1, timer_slack_ns=50_000, plain=PROMPT, realtime=PROMPT,
     round_trips=RoundTrips(1000, 0, 20.0, 60.0), buffer=Buffer(10_000, 8_388_608, 4_194_304),
     ports_taken=(), control=1e-3, disk=Disk("runs", 10**10, 10**7, 5e8), runtime_folder=None,
@@ -52,7 +52,7 @@ def test_a_machine_that_grants_everything_is_good() -> None:
     ("cores", {"load": 7.0}, FindingStatus.LIMITED),
     ("cores", {"governor": "powersave"}, FindingStatus.LIMITED),
     ("cores", {"load": None, "governor": None}, FindingStatus.GOOD),
-    ("real-time", {"granted": {"sched_fifo": "refused: no"}}, FindingStatus.LIMITED),
+    ("real-time", {"granted": {"sched_fifo": "not permitted: no"}}, FindingStatus.LIMITED),
     ("timers", {"timer_resolution_ns": 4_000_000}, FindingStatus.LIMITED),
     ("UDP", {"round_trips": "datagrams on the loopback are lost"}, FindingStatus.BAD),
     ("UDP", {"round_trips": RoundTrips(1000, 1, 20.0, 60.0)}, FindingStatus.LIMITED),
@@ -103,7 +103,7 @@ def test_what_is_not_in_force_limits_nothing() -> None:
     without = WANTED._replace(realtime=False)
     assert about("wake-ups", without, plain=late).verdict is FindingStatus.LIMITED
     assert about("wake-ups", without, realtime=late).verdict is FindingStatus.GOOD
-    refused = {"sched_fifo": "refused: Operation not permitted"}
+    refused = {"sched_fifo": "not permitted: Operation not permitted"}
     assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
 
 

@@ -1,17 +1,18 @@
 """Which processes a launcher restarts, when it ends the run instead, and with which reason."""
 
+import time
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from cosim.live.child_processes import ChildProcesses, Failure
-from cosim.live.launcher import Watcher, _Run, longest_s
+from cosim.live.launcher import Watcher, _Run, launch, longest_s
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
-from noack.core.errors import ExitStatus, MachineError
+from noack.core.errors import CallerError, ExitStatus, MachineError
 from noack.protocol.topology import RECORDER, ROLES
-from noack.runtime.join_ticket import new_ticket
+from noack.runtime.join_ticket import new_ticket, published
 from noack.runtime.signals import Signals
 
 KILLED = "sensor died: killed by SIGKILL"
@@ -157,6 +158,16 @@ def test_a_restart_that_fails_ends_the_run(case: Case) -> None:
     assert case.run(children, FakeCoordinator(0.5))._policy.check() == (ExitStatus.FAILED, reason)
 
 
+def test_a_process_that_nobody_restarts_ends_the_run(
+    case: Case, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = case.run(case.children(-9), FakeCoordinator(0.5))._policy
+    assert policy.check() is None
+    now_s = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now_s + 61.0)
+    assert policy.check() == (ExitStatus.FAILED, f"{KILLED}; not restarted within 60 s")
+
+
 def test_a_restarted_process_that_fails_ends_the_run_with_both_reasons(case: Case) -> None:
     children = case.children(-9)
     policy = case.run(children, FakeCoordinator(0.5))._policy
@@ -211,3 +222,14 @@ def test_a_progress_report_that_arrives_with_the_end_is_shown(case: Case) -> Non
     run = case.run(children, Ending(1.0), progress=shown.append)
     assert run.watch(Signals(), lambda status, reason: None)[0] is ExitStatus.OK
     assert shown == [{"void": ["late"]}]
+
+
+def test_a_refused_session_leaves_no_run_directory(
+    content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    scenario = validate(content | {"ports": {}}, "")
+    ticket = new_ticket(resolve(scenario), "tcp/127.0.0.1:1", tmp_path, launched=False)
+    with published(ticket, "lab"), pytest.raises(CallerError, match="another run is open in it"):
+        launch(scenario, tmp_path / "runs", spawn=(), session="lab")
+    assert list((tmp_path / "runs").iterdir()) == []

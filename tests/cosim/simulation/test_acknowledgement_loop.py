@@ -19,11 +19,13 @@ from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.virtual_time import simulate
 from netem.duplex_link import ACKNOWLEDGEMENT_LINK, Duplex, network_of
 from netem.link_machine import Datagram, Link
-from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
 from noack.config.resolution import resolve
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import dumps, load
 from noack.core.errors import CallerError
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.protocol.machine_interface import Record
 from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,

@@ -5,7 +5,7 @@ from typing import Any
 
 from netem.control.control_server import ControlServer, SettingsChange
 from netem.engine.relay_interface import DIRECTIONS
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import Vocabulary, edited, vocabulary
 from tests.fuzz.parsers.words import EXAMPLES, sentence

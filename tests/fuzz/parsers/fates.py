@@ -11,7 +11,7 @@ from netem.fates.fate_replay import read_fates
 from netem.fates.fate_trace import METADATA, SCHEMA, description
 from netem.link_machine import Link
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import Choices
 from tests.fuzz.edits import Vocabulary, edited
 from tests.fuzz.harness import refusal, workspace

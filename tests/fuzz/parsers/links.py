@@ -9,9 +9,8 @@ from unittest.mock import patch
 import tomli_w
 
 from netem.words.links_file import json_schema, load_links
-from netem.words.settings_to_words import text_of
-from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from netem.words.words_to_settings import settings_of, text_of
+from noack.impairments.link_settings import LinkSettings
 from tests.fuzz.choices import EDITS, Choices
 from tests.fuzz.edits import edited, vocabulary
 from tests.fuzz.files import NAMED, quoted, write_named

@@ -77,7 +77,7 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     folder.mkdir()
     (folder / SCENARIO_FILE).write_text(dumps(resolved))
     reports = {
-        role: {**report, "pid": 1, "realtime": {"sched_fifo": "granted"}} if live else report
+        role: {**report, "pid": 1, "realtime": {"sched_fifo": "applied"}} if live else report
         for role, report in record.reports.items()
     }
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
@@ -163,11 +163,11 @@ def _spool(choices: Choices, name: str, data: bytes) -> bytes:
 def _show(run_dir: Path) -> None:
     """What `noack summary` does with a summary that is there."""
 
-    def conclude(ending: RunEnding) -> Outcome:
+    def finalize(ending: RunEnding) -> Outcome:
         assert isinstance(ending.reason, str)
         return Outcome(run_dir, ending.status, ending.reason, {})
 
-    with patch("cosim.live.finalize.conclude", conclude):
+    with patch("cosim.live.finalize.finalize", finalize):
         outcome = reopen(run_dir)
     changed_since(run_dir)
     if outcome.summary:

@@ -2,8 +2,10 @@
 
 import json
 
-from noack.config.impairment_files import read_files
-from noack.config.impairments import Delay, LinkSettings, LossOf, TraceLoss
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.loss_models.trace import TraceLoss
 from tests.fuzz.harness import refusal, workspace
 
 SEEDS = [

@@ -11,7 +11,7 @@ from netem.capture.packet_blocks import Bytes, Events
 from netem.capture.pcapng import PcapngInterface, PcapngSection
 from netem.engine.relay_interface import LinkSpec
 from netem.relay_events import EVENT
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 
 T_NS = 1_767_225_600_123_456_789
 SPECS = [

@@ -15,7 +15,7 @@ from netem.cli.explain_links import DirectionExplanation, Explanation, LinkExpla
 from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import load_links
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 
 PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
 MUCH = (
@@ -77,18 +77,22 @@ def one_line(text: str) -> str:
 
 def test_words_are_explained(explain: Explain) -> None:
     out = one_line(explain("loss burst 5% 3 mansd 2 first"))
-    assert "bad times begin with probability 1.75439% per datagram" in out
-    assert "mansd 2 the cap: at most 2 successive datagrams of a flow are not delivered" in out
-    assert "first the first datagram of each flow is delivered" in out
+    assert "the bad state begins with probability 1.75439% per packet" in out
+    assert (
+        "mansd 2 the cap (M − 1): at most 2 consecutive packets of a flow are not delivered" in out
+    )
+    assert "first the first packet of each flow is delivered" in out
     assert "expected loss rate: 3.947% (without the cap 5%)" in out
     assert "tc qdisc add dev DEVICE root netem limit 16384 loss gemodel" in out
-    assert "tc lacks: mansd 2 (a cap on successive losses), first (that the first" in out
+    assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out
 
 
 def test_what_the_prediction_does_not_count_is_said(explain: Explain) -> None:
     out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
-    assert "33.33% (without the cap 50%), not counting what is overtaken (stale)" in out
-    assert "what would be below 0 is 0 (25% of the draws)" in out
+    assert (
+        "33.33% (without the cap 50%), not counting packets delivered out of order (stale)" in out
+    )
+    assert "negative delays become 0 (25% of the draws)" in out
 
 
 def test_where_tc_can_do_nothing_that_is_said(explain: Explain) -> None:
@@ -124,7 +128,7 @@ def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) ->
     uplink, video = out.split("\n\nvideo: 127.0.0.1:9002 → 127.0.0.1:9003\n")
     assert uplink.startswith("uplink: 127.0.0.1:9000 → [::1]:9001, seed 7\n")
     assert "loses 50%" in uplink
-    assert "holds each datagram back by 10ms" in uplink
+    assert "delays each packet by 10ms" in uplink
     assert "loses 20%" in video
     assert video.endswith("reverse: not relayed; the server's answers are discarded\n")
 
@@ -185,7 +189,7 @@ def test_links_are_explained_as_json(explain: Explain, links_file: Path) -> None
     assert uplink["forward"]["predicted_loss"] == pytest.approx(15 / 31)
     assert uplink["forward"]["predicted_loss_without_cap"] == pytest.approx(0.5)
     assert uplink["forward"]["tc"] == "limit 16384 loss random 50%"
-    assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on successive losses)"]
+    assert uplink["forward"]["tc_lacks"] == ["mansd 4 (a cap on consecutive losses)"]
     assert uplink["reverse"] is not None
     assert uplink["reverse"]["words"] == "delay 10ms"
     assert (video["forward"]["words"], video["reverse"]) == ("loss 20%", None)

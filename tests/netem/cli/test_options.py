@@ -11,11 +11,11 @@ import pytest
 from netem.__main__ import main
 from netem.cli.emulator_options import parsed, parser, specs_of
 from netem.engine.relay_interface import LinkSpec
-from netem.words.loss_words import LOSS_MODELS
-from netem.words.word_examples import EXAMPLES
-from netem.words.words_to_settings import KEYWORDS, parse, settings_of
-from noack.config.impairments import LinkSettings, LossOf, ScriptedLoss
+from netem.words.words_to_settings import EXAMPLES, KEYWORDS, parse, settings_of
 from noack.core.errors import CallerError
+from noack.impairments.kinds.loss import LOSS_WORDS, LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.scripted import ScriptedLoss
 
 ADDRESSES = ["--listen", ":9000", "--to", ":9001"]
 NOTHING = LinkSettings()
@@ -127,18 +127,18 @@ def test_links_come_from_a_file(tmp_path: Path) -> None:
         ([*ADDRESSES, "loss", "trace", "no.txt"], "no.txt: cannot be read: No such file"),
         (
             [*ADDRESSES, "--loss", "bernoulli:0.3"],
-            "--loss: words stand without the dashes, e.g. loss 30%",
+            "--loss: write words without the dashes, e.g. loss 30%",
         ),
-        ([*ADDRESSES, "--mansd=4"], "--mansd=4: words stand without the dashes, e.g. mansd 4"),
-        ([*ADDRESSES, "--reverse", "--delay", "5ms"], "--delay: words stand without the dashes"),
-        ([*ADDRESSES, "-loss", "5%"], "-loss: words stand without the dashes"),
+        ([*ADDRESSES, "--mansd=4"], "--mansd=4: write words without the dashes, e.g. mansd 4"),
+        ([*ADDRESSES, "--reverse", "--delay", "5ms"], "--delay: write words without the dashes"),
+        ([*ADDRESSES, "-loss", "5%"], "-loss: write words without the dashes"),
         (
             [*ADDRESSES, "loss", "bernoulli:0.3"],
-            "loss bernoulli:0.3: no such word; here it is loss PERCENT, e.g. loss 30%",
+            "loss bernoulli:0.3: no such word; here it is loss 30%",
         ),
         (
             [*ADDRESSES, "loss", "gilbert_elliott"],
-            "loss gilbert_elliott: no such word; here it is loss gemodel or loss burst",
+            "loss gilbert_elliott: no such word; here it is loss gemodel 1% 10%",
         ),
         (
             [*ADDRESSES, "loss", "worst_case"],
@@ -218,7 +218,7 @@ def test_the_help_fits_into_a_terminal(monkeypatch: pytest.MonkeyPatch, columns:
 
 def test_the_help_has_every_word() -> None:
     text = parser().format_help()
-    for word in (*KEYWORDS, *LOSS_MODELS):
+    for word in (*KEYWORDS, *LOSS_WORDS):
         # Other words for the same stand in the documentation.
         assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
 

@@ -20,9 +20,9 @@ from netem.engine.relay_interface import (
     LinkSpec,
     Relay,
 )
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import LinkSettings
 
 SETTINGS = settings_of("loss 10% delay 10ms mansd 2")
 HERE: Address = ("127.0.0.1", 5000)

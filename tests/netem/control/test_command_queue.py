@@ -3,9 +3,9 @@ import threading
 import pytest
 
 from netem.control.command_queue import CommandQueue
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
+from noack.impairments.link_records import Counters
 from tests.netem.control.relays import FakeRelay
 
 

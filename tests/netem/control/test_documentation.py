@@ -23,7 +23,7 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_trace import SCHEMA
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from tests.netem.control.relays import FakeRelay, running
 
 NOTHING = LinkSettings()

@@ -13,10 +13,10 @@ from netem.control.command_queue import CommandQueue
 from netem.control.control_client import Client
 from netem.control.control_server import ControlServer, secret_of
 from netem.control.emulator_session import Session, find, running
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
-from noack.config.impairments import LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.link_records import Counters
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.private_folder import private_folder
 from noack.runtime.zenoh_session import open_session, session_config
 from tests.netem.control.relays import SETTINGS, FakeRelay

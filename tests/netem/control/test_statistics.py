@@ -12,9 +12,9 @@ from netem.control.emulator_statistics import (
     statistics,
 )
 from netem.engine.relay_interface import DIRECTIONS, FlowReport
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
+from noack.impairments.link_records import Counters
 from tests.netem.control.relays import FakeRelay, times
 
 UNIX_NS = 1_790_000_000 * NS_PER_S + 250_000_000

@@ -11,9 +11,9 @@ from netem.control.emulator_statistics import Statistics, statistics
 from netem.control.statistics_history import History
 from netem.control.statistics_view import plain_lines, render
 from netem.engine.relay_interface import LinkSpec
-from netem.rule_records import Counters
 from netem.words.words_to_settings import settings_of
 from noack.core.clock import NS_PER_S
+from noack.impairments.link_records import Counters
 from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_interface import Address, LinkReport, LinkSpec, Relay, Tap
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60

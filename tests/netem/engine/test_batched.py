@@ -16,7 +16,11 @@ from netem.engine.pump.payload_store import drop, keep, pop, push
 from netem.engine.pump_memory import PumpMemory
 from netem.engine.relay_sockets import place_of
 from netem.engine.socket_names import address_of_name, name_of
-from noack.config.impairments import BernoulliLoss, Delay, Duplicate, LinkSettings, LossOf
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from tests.netem.engine.relays import HOSTS, drain, endpoints, link, running
 from tests.netem.engine.relays import name_of as bound_name
 
@@ -128,7 +132,7 @@ import socket
 from netem.engine import batched_engine
 from netem.engine.relay_interface import LinkSpec
 from netem.engine.engine_choice import open_relay
-from noack.config.impairments import LinkSettings
+from noack.impairments.link_settings import LinkSettings
 def checked(specs, bind=batched_engine.open_links):
     # What came to an open port would wait until all is compiled.
     assert specs[0].name == "none" or batched_engine.functions().run_pump.signatures

@@ -12,18 +12,19 @@ from netem.engine.compiled_rules import compile_rule, compiled_program, compiled
 from netem.engine.many_decisions import admit_many
 from netem.link_machine import Link
 from netem.rule_program import empty_state, program_of, recent_width
-from netem.rule_records import (
+from netem.rules.settings_change import carry
+from noack.impairments.link_records import (
     Counters,
     FlowState,
+    LinkMemory,
+    LinkProgram,
     PacketDecision,
     RecordedDecision,
     array_of,
     dtype_of,
 )
-from netem.rules.link_rules import LinkMemory, LinkProgram
-from netem.rules.settings_change import carry
-from noack.config.impairments import LinkSettings
-from tests.netem.engine import impairments
+from noack.impairments.link_settings import LinkSettings
+from tests.netem import any_settings
 
 FLOWS = 4
 arrivals = st.lists(
@@ -75,7 +76,7 @@ def ascending(batch: list[tuple[int, int, int]]) -> list[tuple[int, int, int]]:
 
 
 @settings(max_examples=120)
-@given(own=impairments.settings, other=st.none() | impairments.settings, batch=arrivals)
+@given(own=any_settings.harsh, other=st.none() | any_settings.harsh, batch=arrivals)
 def test_compiled_and_plain_rules_agree(
     own: LinkSettings, other: LinkSettings | None, batch: list[tuple[int, int, int]]
 ) -> None:
@@ -96,7 +97,7 @@ def test_compiled_and_plain_rules_agree(
 
 
 @settings(max_examples=50)
-@given(own=impairments.settings, batch=arrivals, sizes=st.lists(st.integers(1, 30), min_size=1))
+@given(own=any_settings.harsh, batch=arrivals, sizes=st.lists(st.integers(1, 30), min_size=1))
 def test_batches_do_not_matter(
     own: LinkSettings, batch: list[tuple[int, int, int]], sizes: list[int]
 ) -> None:
@@ -122,5 +123,5 @@ def test_recorded_decisions_are_repeated_by_flow_not_by_row(mansd: int | None) -
 
 
 def test_records_and_rows_hold_the_same() -> None:
-    rows = array_of(PacketDecision, [PacketDecision(*range(9))])
-    assert [rows[0][name] for name in dtype_of(PacketDecision).names or ()] == list(range(9))
+    rows = array_of(dtype_of(PacketDecision), [PacketDecision(*range(13))])
+    assert [rows[0][name] for name in dtype_of(PacketDecision).names or ()] == list(range(13))

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from netem.engine.engine_choice import Engine
-from noack.config.impairments import LinkSettings
-from tests.netem.engine import impairments
+from noack.impairments.link_settings import LinkSettings
+from tests.netem import any_settings
 from tests.netem.engine.relays import drain, endpoints, link, name_of, running
 
 CLIENTS = 4
@@ -42,10 +42,10 @@ def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
 @pytest.mark.parametrize("engine", ["batched", "plain"])
 @settings(max_examples=60)
 @given(
-    forward=impairments.capped,
-    reverse=impairments.capped,
+    forward=any_settings.capped,
+    reverse=any_settings.capped,
     rounds=st.lists(st.integers(1, 40), min_size=1, max_size=4),
-    other=st.none() | impairments.capped,
+    other=st.none() | any_settings.capped,
     segment=st.booleans(),
 )
 def test_the_cap_holds_in_both_directions_for_every_client(

@@ -21,18 +21,16 @@ from netem.engine import engine_choice as starting
 from netem.engine.engine_choice import Engine, open_relay
 from netem.engine.relay_interface import LinkSpec
 from netem.engine.relay_sockets import raise_file_limit
-from netem.rule_records import RecordedDecision
-from noack.config.impairments import (
-    BernoulliLoss,
-    Corrupt,
-    Delay,
-    Duplicate,
-    LinkSettings,
-    LossOf,
-    PeriodicLoss,
-    WorstCaseLoss,
-)
 from noack.core.errors import CallerError
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_records import RecordedDecision
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from tests.netem.engine.relays import HOSTS, KeepAll, drain, endpoints, link, name_of, running
 

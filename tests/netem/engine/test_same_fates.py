@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from netem.engine.engine_choice import Engine
 from netem.engine.relay_interface import LinkSpec
 from netem.link_machine import Datagram, Link
-from noack.config.impairments import LinkSettings
-from tests.netem.engine import impairments
+from noack.impairments.link_settings import LinkSettings
+from tests.netem import any_settings
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
 
 CLIENTS = 3
@@ -54,8 +54,8 @@ def replayed(
 @pytest.mark.parametrize("engine", ["batched", "plain"])
 @settings(max_examples=60)
 @given(
-    forward=impairments.settings,
-    reverse=impairments.settings,
+    forward=any_settings.harsh,
+    reverse=any_settings.harsh,
     sizes=st.lists(st.sampled_from([0, 1, 8, 72, 1472, 9000]), min_size=30, max_size=150),
     segment=st.booleans(),
 )

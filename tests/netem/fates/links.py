@@ -13,23 +13,21 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
-from netem.rule_records import PacketDecision
-from noack.config.impairments import (
-    BernoulliLoss,
-    Blackout,
-    Corrupt,
-    Delay,
-    Duplicate,
-    GilbertElliottLoss,
-    Impairment,
-    LinkSettings,
-    LossOf,
-    PeriodicLoss,
-    Rate,
-    Reorder,
-    ScriptedLoss,
-    WorstCaseLoss,
-)
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_records import PacketDecision
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 US = 1e-6
 shares = st.floats(0, 1)
@@ -41,7 +39,7 @@ losses = st.one_of(
     st.builds(ScriptedLoss, lost=st.sets(st.integers(0, 30)).map(sorted).map(tuple)),
     st.just(WorstCaseLoss()),
 )
-impairments: st.SearchStrategy[Impairment] = st.one_of(
+impairments: st.SearchStrategy[AnyImpairment] = st.one_of(
     st.builds(LossOf, loss=losses),
     st.builds(Duplicate, probability=shares),
     st.builds(Corrupt, probability=shares),
@@ -137,7 +135,7 @@ def drive(link: Link, came: Sequence[Arrival]) -> Run:
         data = payload(arrival.flow, counts[arrival.flow], arrival.size_bytes)
         counts[arrival.flow] += 1
         leaves(now_ns, link.handle(Datagram(arrival.flow, data), now_ns))
-        run.verdicts.append(PacketDecision(**asdict(link.verdict)))
+        run.verdicts.append(PacketDecision(**asdict(link.decision)))
         run.arrivals.append((now_ns, arrival.flow, arrival.size_bytes))
     release(float("inf"))
     return run

@@ -16,8 +16,9 @@ from netem.fates.fate_recorder import FateRecorder
 from netem.fates.fate_replay import read_fates
 from netem.fates.fate_trace import METADATA
 from netem.relay_events import EVENT
-from noack.config.impairments import Corrupt, LinkSettings
 from noack.core.errors import CallerError
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
 from tests.netem.fates.links import Arrival, record, spec_of
 

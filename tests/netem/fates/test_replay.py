@@ -10,17 +10,15 @@ from hypothesis import strategies as st
 
 from netem.fates.fate_replay import read_fates
 from netem.link_machine import Link
-from netem.rule_records import RecordedDecision
-from noack.config.impairments import (
-    Corrupt,
-    Delay,
-    Duplicate,
-    GilbertElliottLoss,
-    LinkSettings,
-    LossOf,
-    Rate,
-    WorstCaseLoss,
-)
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_records import RecordedDecision
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from tests.netem.fates.links import Arrival, Run, arrivals, drive, payload, record, settings
 
@@ -50,7 +48,15 @@ def fates_of(folder: Path) -> Sequence[Sequence[RecordedDecision]]:
 def seen(run: Run) -> list[tuple[int, ...]]:
     """What a datagram's sender and receiver could tell."""
     return [
-        (one.fate, one.packet, one.run, one.release_ns, one.copy_ns, one.bit, one.copy_bit)
+        (
+            one.fate,
+            one.packet,
+            one.consecutive_losses,
+            one.release_ns,
+            one.copy_ns,
+            one.bit,
+            one.copy_bit,
+        )
         for one in run.verdicts
     ]
 

@@ -4,7 +4,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.impairments import BernoulliLoss, LinkSettings, LossOf
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.8])

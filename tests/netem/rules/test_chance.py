@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from noack.config.impairments import BernoulliLoss, LossOf
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 
 COUNT = 400_000
 

@@ -6,7 +6,9 @@ import pytest
 from scipy import stats
 
 from netem.link_machine import flipped
-from noack.config.impairments import Corrupt, Duplicate, LinkSettings
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.link_settings import LinkSettings
 
 
 @pytest.mark.parametrize("size_bytes", [1, 2, 100, 65_507])

@@ -11,15 +11,12 @@ from scipy import stats
 from scipy.integrate import quad
 
 from netem.rule_program import program_of
-from netem.rules.delay import quantile_ns
-from noack.config.impairments import (
-    BernoulliLoss,
-    Delay,
-    Duplicate,
-    GilbertElliottLoss,
-    LinkSettings,
-    LossOf,
-)
+from noack.impairments.kinds.delay import Delay, quantile_ns
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 
 COUNT = 100_000
 FIXED_NS, JITTER_NS = 50_000_000, 2_000_000
@@ -68,7 +65,7 @@ def test_the_mixture_is_one_of_quantiles() -> None:
     delay = Delay(jitter_s=1e-9, distribution="paretonormal")
     program = program_of(LinkSettings(impairments=(delay,)), 0, "a")
     for u in np.linspace(0.001, 0.999, 99).tolist():
-        found = quantile_ns(program.waits[0], program.reals, u)
+        found = quantile_ns(program.stages[0], program.reals, u)
         assert found == pytest.approx(mixed(u) / np.sqrt(variance), rel=1e-7, abs=1e-9)
 
 

@@ -3,7 +3,10 @@ from typing import Any
 
 import numpy as np
 
-from noack.config.impairments import BernoulliLoss, Delay, Duplicate, LossOf
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
 
 
 def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> None:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.impairments import FourStateLoss, LossOf
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.loss_models.four_state import FourStateLoss
 
 LOSES = np.array([False, False, True, True])
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from noack.config.impairments import GilbertElliottLoss, LossOf
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 
 ERRORS = 5
 

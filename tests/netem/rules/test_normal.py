@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
 
-from netem.rules.normal import cdf, score
+from noack.impairments.normal import cdf, score
 
 HALF = np.concatenate([np.geomspace(2.0**-54, 0.4999, 4000), np.linspace(0.001, 0.5, 4000)])
 

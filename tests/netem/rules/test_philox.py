@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from netem.engine.compiled_rules import compile_rule
-from netem.rules.philox import philox, uniforms
+from noack.impairments.philox import philox, uniforms
 
 ONES = 0xFFFFFFFF
 WORDS = st.integers(0, ONES)

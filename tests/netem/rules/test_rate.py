@@ -11,8 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.rule_program import empty_state, program_of
-from netem.rules.rate import enters, serve
-from noack.config.impairments import Duplicate, LinkSettings, LossOf, Rate, WorstCaseLoss
+from noack.impairments.bottleneck import enters, serve
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 NS = 10**9
 Queue = tuple[Rate, list[tuple[int, int, bool]]]
@@ -73,7 +77,7 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     state = empty_state(program)
     found: list[int | None] = []
     for t_ns, size_bytes, forced in arrivals:
-        own = program.bottlenecks[1], state.queues[1], state.departures_ns
+        own = program.stages[1], state.queues[1], state.departures_ns
         room = enters(*own, t_ns)
         found.append(serve(*own, size_bytes) if room or forced else None)
     assert found == departures(rate, arrivals)
@@ -139,4 +143,4 @@ def test_however_many_must_pass_they_leave_at_a_time_that_there_is(decide: Any) 
     assert np.all(np.diff(decided.verdicts["release_ns"]) >= 0)
     assert decided.verdicts["release_ns"][0] == (65_507 + 28) * 1001 * 8 * NS
     assert decided.verdicts["release_ns"][-1] == 2**61
-    assert np.all(decided.verdicts["run"] == 0)
+    assert np.all(decided.verdicts["consecutive_losses"] == 0)

@@ -4,7 +4,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from noack.config.impairments import Delay, LinkSettings, Reorder
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings
 
 FIXED = Delay(delay_s=0.01)
 

@@ -6,22 +6,26 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from netem.rule_program import program_of
-from netem.rules.scripted_losses import lost
-from noack.config.impairments import (
-    LinkSettings,
-    Loss,
-    LossOf,
-    PeriodicLoss,
-    ScriptedLoss,
-    WorstCaseLoss,
-)
+from netem.link_machine import Link
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 
 def flags(loss: Loss, packets: Any) -> list[bool]:
-    settings = LinkSettings(impairments=(LossOf(loss=ScriptedLoss(lost=(1, 4))), LossOf(loss=loss)))
-    program = program_of(settings, 0, "a")
-    return [lost(program.scripts[1], program.integers, packet) for packet in packets]
+    """Which packets are lost; another script stands first, so that the table begins elsewhere."""
+    other = LossOf(loss=ScriptedLoss(lost=(2**39, 2**39 + 1)))
+    link = Link(LinkSettings(impairments=(other, LossOf(loss=loss))), 0, "a")
+    link.decide(0, 1, 0)
+    flow = link.flow(0)
+    assert flow is not None
+    found = []
+    for flow.packets in packets:
+        found.append(link.decide(0, 1, 0).fate == 1)
+    return found
 
 
 @given(st.sets(st.integers(0, 60)), st.integers(0, 40))

@@ -7,9 +7,23 @@ from hypothesis import strategies as st
 
 from netem.words.tc_command import tc_command
 from netem.words.words_to_settings import settings_of
-from noack.config import impairments as imp
 from noack.core.errors import CallerError
-from tests.netem import any_settings
+from noack.impairments.disciplines.tail_drop import TailDrop
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.lossless import NoLoss
+from tests.netem.any_settings import settings as any_settings
+from tests.netem.any_settings import varied
 from tests.netem.words.tc_request import Request, Tc
 
 pytestmark = pytest.mark.skipif(not Tc.available(), reason="needs tc and gcc")
@@ -26,34 +40,34 @@ def tc(tmp_path_factory: pytest.TempPathFactory) -> Tc:
     return Tc(tmp_path_factory.mktemp("tc"))
 
 
-def assert_the_same(settings: imp.LinkSettings, request: Request | None, overhead: int) -> None:
+def assert_the_same(settings: LinkSettings, request: Request | None, overhead: int) -> None:
     assert request is not None
     kinds = {one.kind: one for one in settings.impairments}
     assert len(kinds) == len(settings.impairments)
     assert request.limit == settings.limit
 
-    delay = kinds.get("delay", imp.Delay())
-    assert isinstance(delay, imp.Delay)
+    delay = kinds.get("delay", Delay())
+    assert isinstance(delay, Delay)
     assert request.delay_s == pytest.approx(delay.delay_s, abs=TIME_S)
     assert request.jitter_s == pytest.approx(delay.jitter_s, abs=TIME_S)
     assert request.delay_correlation == pytest.approx(delay.correlation, abs=SHARE)
 
-    loss = kinds.get("loss", imp.LossOf(loss=imp.NoLoss()))
-    assert isinstance(loss, imp.LossOf)
+    loss = kinds.get("loss", LossOf(loss=NoLoss()))
+    assert isinstance(loss, LossOf)
     assert_the_same_loss(loss.loss, request)
 
-    duplicate = kinds.get("duplicate", imp.Duplicate(probability=0))
-    assert isinstance(duplicate, imp.Duplicate)
+    duplicate = kinds.get("duplicate", Duplicate(probability=0))
+    assert isinstance(duplicate, Duplicate)
     assert request.duplicate == pytest.approx(duplicate.probability, abs=SHARE)
     for kind, found in (("corrupt", request.corrupt), ("reorder", request.reorder)):
-        chance = kinds.get(kind, imp.Corrupt(probability=0))
-        assert isinstance(chance, imp.Corrupt | imp.Reorder)
+        chance = kinds.get(kind, Corrupt(probability=0))
+        assert isinstance(chance, Corrupt | Reorder)
         assert found == pytest.approx((chance.probability, chance.correlation), abs=SHARE)
-        if isinstance(chance, imp.Reorder):
+        if isinstance(chance, Reorder):
             assert request.gap == chance.gap
 
     rate = kinds.get("rate")
-    if isinstance(rate, imp.Rate):
+    if isinstance(rate, Rate):
         assert request.rate is not None
         bytes_per_s, *numbers = request.rate
         assert bytes_per_s == min(rate.rate_bps // 8, 2**32 - 1)
@@ -62,19 +76,19 @@ def assert_the_same(settings: imp.LinkSettings, request: Request | None, overhea
         ]  # fmt: skip
 
 
-def assert_the_same_loss(loss: imp.Loss, request: Request) -> None:
-    if isinstance(loss, imp.BernoulliLoss):
+def assert_the_same_loss(loss: Loss, request: Request) -> None:
+    if isinstance(loss, BernoulliLoss):
         found = (request.loss, request.loss_correlation)
         assert found == pytest.approx((loss.probability, loss.correlation), abs=SHARE)
-    elif isinstance(loss, imp.GilbertElliottLoss):
+    elif isinstance(loss, GilbertElliottLoss):
         p, r = loss.transitions
         expected = (p, r, 1 - loss.loss_in_bad, loss.loss_in_good)
         assert request.gemodel == pytest.approx(expected, abs=SHARE)
-    elif isinstance(loss, imp.FourStateLoss):
+    elif isinstance(loss, FourStateLoss):
         order = (loss.p13, loss.p31, loss.p32, loss.p14, loss.p23)
         assert request.state == pytest.approx(order, abs=SHARE)
     else:
-        assert isinstance(loss, imp.NoLoss)
+        assert isinstance(loss, NoLoss)
         assert (request.loss, request.gemodel, request.state) == (0, None, None)
 
 
@@ -86,7 +100,7 @@ def assert_the_same_loss(loss: imp.Loss, request: Request) -> None:
         "loss 0.3%", "loss 0.3% 25%", "loss random 1e1%", "drop 7% 50",
         "loss state 10%", "loss state 10% 20%", "loss state 10% 20% 3%", "loss state 1 2 3 4",
         "loss state 10% 20% 3% 40% 5%", "loss gemodel 1%", "loss gemodel 1% 10%",
-        "loss gemodel 1% 10% 70%", "loss gemodel 1% 10% 70% 0.1%", "duplicate 1%", "dup 3",
+        "loss gemodel 1% 10% 70%", "loss gemodel 1% 10% 70% 0.1%", "duplicate 1%",
         "corrupt 0.1%", "corrupt 0.1% 10%", "delay 10ms reorder 25% 50%",
         "delay 10ms reorder 25% 50% gap 5", "delay 10ms reorder 25%", "rate 1mbit 0",
         "rate 5kbit 20 100 5", "rate 100kbps 0", "rate 1Mibit -14", "rate 80 0", "rate 1.5MBps 4",
@@ -122,42 +136,37 @@ def test_what_tc_takes_and_this_emulator_cannot_do_is_refused(tc: Tc, words: str
 
 times_s = st.floats(3e-6, 200)
 """From tc's smallest to its largest, of 32 bits."""
+probabilities = st.floats(0, 1)
+correlations = st.floats(0, 1, exclude_max=True)
 tcs_losses = st.one_of(
-    st.just(imp.NoLoss()),
-    st.builds(
-        imp.BernoulliLoss,
-        probability=any_settings.probabilities,
-        correlation=any_settings.correlations,
-    ),
-    any_settings.gilbert_elliott,
-    any_settings.four_states(),
+    [varied(model) for model in (NoLoss, BernoulliLoss, GilbertElliottLoss, FourStateLoss)]
 )
 tcs_delays = st.builds(
-    imp.Delay,
+    Delay,
     delay_s=times_s,
     jitter_s=times_s,
-    correlation=any_settings.correlations,
+    correlation=correlations,
     distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
 )
 tcs_reorders = st.builds(
-    imp.Reorder,
+    Reorder,
     probability=st.floats(1e-6, 1),
-    correlation=any_settings.correlations,
+    correlation=correlations,
     gap=st.integers(1, 2**32 - 1),
 )
 
 
 @st.composite
-def tcs_settings(draw: st.DrawFn) -> imp.LinkSettings:
+def tcs_settings(draw: st.DrawFn) -> LinkSettings:
     """What tc can do; a reorder after a delay, everything else anywhere."""
-    chance = {"probability": any_settings.probabilities}
-    chain: list[imp.Impairment] = draw(
+    chance = {"probability": probabilities}
+    chain: list[AnyImpairment] = draw(
         st.lists(
             st.one_of(
-                st.builds(imp.LossOf, loss=tcs_losses),
-                st.builds(imp.Duplicate, **chance),
-                st.builds(imp.Corrupt, **chance, correlation=any_settings.correlations),
-                any_settings.rates,
+                st.builds(LossOf, loss=tcs_losses),
+                st.builds(Duplicate, **chance),
+                st.builds(Corrupt, **chance, correlation=correlations),
+                varied(Rate).filter(lambda rate: isinstance(rate.discipline, TailDrop)),
             ),
             unique_by=lambda one: one.kind,
         )
@@ -167,21 +176,21 @@ def tcs_settings(draw: st.DrawFn) -> imp.LinkSettings:
         chain.insert(place, draw(tcs_delays))
         if draw(st.booleans()):
             chain.insert(draw(st.integers(place + 1, len(chain))), draw(tcs_reorders))
-    return imp.LinkSettings(impairments=tuple(chain), limit=draw(st.integers(1, 1_000_000)))
+    return LinkSettings(impairments=tuple(chain), limit=draw(st.integers(1, 1_000_000)))
 
 
 @example_settings(max_examples=80)
 @given(settings=tcs_settings())
-def test_tc_understands_the_command_that_it_is_given(tc: Tc, settings: imp.LinkSettings) -> None:
+def test_tc_understands_the_command_that_it_is_given(tc: Tc, settings: LinkSettings) -> None:
     command = tc_command(settings)
     assert command.words is not None
     assert command.lacks == ()
     assert_the_same(settings, tc.request(command.words), ETHERNET_BYTES)
 
 
-CAP = "mansd 4 (a cap on successive losses)"
-FIRST = "first (that the first datagram of each flow is delivered)"
-NUMBERS = "losses by the datagrams' numbers"
+CAP = "mansd 4 (a cap on consecutive losses)"
+FIRST = "first (that the first packet of each flow is delivered)"
+NUMBERS = "losses by the packets' numbers"
 
 
 @pytest.mark.parametrize(
@@ -224,10 +233,10 @@ def test_where_nothing_remains_there_is_no_command(words: str) -> None:
 
 
 @example_settings(max_examples=80)
-@given(settings=any_settings.settings)
-def test_nothing_is_left_out_in_silence(settings: imp.LinkSettings) -> None:
+@given(settings=any_settings)
+def test_nothing_is_left_out_in_silence(settings: LinkSettings) -> None:
     command = tc_command(settings)
-    wanted = [one for one in settings.impairments if one != imp.LossOf(loss=imp.NoLoss())]
+    wanted = [one for one in settings.impairments if one != LossOf(loss=NoLoss())]
     kept = 0
     if command.words is not None:
         kinds = ("loss", "delay", "duplicate", "corrupt", "reorder", "rate")

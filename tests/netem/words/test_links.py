@@ -13,11 +13,13 @@ from hypothesis import given
 
 from netem.engine.relay_interface import LinkSpec
 from netem.words.links_file import LinksFile, json_schema, load_links
-from netem.words.settings_to_words import text_of
-from netem.words.words_to_settings import settings_of
+from netem.words.words_to_settings import settings_of, text_of
 from noack.config import toml_file
-from noack.config.impairments import Delay, LinkSettings, LossOf, ScriptedLoss
 from noack.core.errors import CallerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.scripted import ScriptedLoss
 from tests.netem.any_settings import settings, words_can_say
 
 ROOT = Path(__file__).parents[3]
@@ -99,7 +101,7 @@ LINK = {"name": "a", "listen": ":9000", "to": ":9001"}
         ({"words": 3}, "words = 3: should be a table"),
         ({"reverse": {"mandsd": 3}}, "reverse.mandsd = 3: unknown key; did you mean mansd?"),
         ({"reverse": {"impairments": [{"kind": "dely"}]}}, 'reverse.impairments.0.kind = "dely": '
-         "must be one of loss, duplicate, corrupt, delay, reorder, rate, blackout; did you mean "
+         "must be one of blackout, corrupt, delay, duplicate, loss, rate, reorder; did you mean "
          "delay?"),
         ({"forward": {"impairments": [{"kind": "loss", "loss": {"model": "bernoulli",
           "probability": 2}}]}}, "forward.impairments.0.loss.probability = 2: should be less than "

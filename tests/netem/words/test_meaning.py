@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from netem.link_machine import Link
-from netem.words.explanation import meaning_of, settings_meaning
+from netem.words.explanation import settings_meaning
 from netem.words.words_to_settings import settings_of
 
 DRAWS = 20_000
@@ -27,7 +27,7 @@ DRAWS = 20_000
 def test_a_delay_that_is_cut_at_zero_says_how_often(words: str) -> None:
     settings = settings_of(words)
     (delay,) = settings.impairments
-    said = re.search(r"what would be below 0 is 0 \((.*)% of the draws\)", meaning_of(delay))
+    said = re.search(r"negative delays become 0 \((.*)% of the draws\)", delay.meaning())
     assert said is not None
     share = float(said[1]) / 100
     # Each flow has its own draw, so that they are independent under a correlation, too.
@@ -49,11 +49,11 @@ def test_a_delay_that_is_cut_at_zero_says_how_often(words: str) -> None:
 )
 def test_a_delay_that_is_hardly_cut_says_nothing_of_it(words: str) -> None:
     (delay,) = settings_of(words).impairments
-    assert "below 0" not in meaning_of(delay)
+    assert "negative" not in delay.meaning()
 
 
 def test_the_first_datagram_is_no_cap() -> None:
     (first,) = settings_meaning(settings_of("loss 5% first"))
     assert first[0] == "first"
     ((word, cap),) = settings_meaning(settings_of("loss 5% mansd 3"))
-    assert (word, cap.partition(":")[0]) == ("mansd 3", "the cap")
+    assert (word, cap.partition(":")[0]) == ("mansd 3", "the cap (M − 1)")

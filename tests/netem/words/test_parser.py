@@ -6,34 +6,38 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from netem.words.quantities import OWN_TIME_S, PERCENT, RATE_BPS, TIME_S, percent_text, time_text
-from netem.words.settings_to_words import text_of
-from netem.words.words_to_settings import parse, settings_of
-from noack.config.impairments import (
-    BernoulliLoss,
-    Blackout,
-    Corrupt,
-    Delay,
-    Duplicate,
-    FourStateLoss,
-    GilbertElliottLoss,
-    Impairment,
-    LinkSettings,
-    Loss,
-    LossOf,
-    NoLoss,
-    PeriodicLoss,
-    Rate,
-    Reorder,
-    ScriptedLoss,
-    TraceLoss,
-    WorstCaseLoss,
-)
+from netem.words.words_to_settings import parse, settings_of, text_of
 from noack.core.errors import CallerError
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.blackout import Blackout
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.kinds.reorder import Reorder
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.lossless import NoLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.trace import TraceLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
+from noack.impairments.quantities import (
+    OWN_TIME_S,
+    PERCENT,
+    RATE_BPS,
+    TIME_S,
+    percent_text,
+    time_text,
+)
 from tests.netem.any_settings import settings, words_can_say
 
 
-def loss(model: Loss) -> tuple[Impairment, ...]:
+def loss(model: Loss) -> tuple[AnyImpairment, ...]:
     return (LossOf(loss=model),)
 
 
@@ -126,12 +130,12 @@ def loss(model: Loss) -> tuple[Impairment, ...]:
         ),
         # Words may be shortened as long as it is clear which is meant.
         (
-            "dup 1% lo 5%",
+            "duplicate 1% loss 5%",
             (Duplicate(probability=0.01), LossOf(loss=BernoulliLoss(probability=0.05))),
         ),
     ],
 )
-def test_what_words_say(words: str, impairments: tuple[Impairment, ...]) -> None:
+def test_what_words_say(words: str, impairments: tuple[AnyImpairment, ...]) -> None:
     said = parse(words)
     assert said.settings == LinkSettings(impairments=impairments)
     assert said.seed is None
@@ -208,8 +212,8 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
     ("words", "says"),
     [
         ("lsos 5%", "lsos: no such word; did you mean loss?"),
-        ("jitter 5ms", "jitter: no such word; expected one of loss, delay, "),
-        ("d 5ms", "d: may be delay or drop or duplicate"),
+        ("jitter 5ms", "jitter: goes right after delay TIME"),
+        ("d 5ms", "d: words are not shortened; did you mean delay or drop or duplicate?"),
         ("loss gemodle 1%", "loss gemodle: no such word; did you mean gemodel?"),
         ("loss", "loss: expected after it: a percentage, e.g. 5%, or one of random, state,"),
         ("loss 5 %", "%: no such word; expected one of"),
@@ -220,10 +224,10 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("loss random", "loss random: expected after it: a percentage from 0% to 100%"),
         ("loss state 90% 20% 81%", "loss state 90% 20% 81%: p31: p31 + p32 must not exceed 1"),
         ("loss burst 90% 2", "loss burst 90% 2: mean_burst: so much loss needs longer bursts"),
-        ("loss periodic 2", "loss periodic 2: expected losses per datagrams, e.g. 2/100"),
+        ("loss periodic 2", "loss periodic 2: expected losses per packets, e.g. 2/100"),
         ("loss periodic 3/2", "loss periodic 3/2: burst: must not exceed the period, 2"),
         ("loss script 3,2", "loss script 3,2: lost: the numbers must ascend"),
-        ("loss script 3,x", "loss script 3,x: expected the numbers of the lost datagrams"),
+        ("loss script 3,x", "loss script 3,x: expected the numbers of the lost packets"),
         ("loss trace", "loss trace: expected after it: a file of zeros and ones"),
         ("delay", "delay: expected after it: a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 10mm", "delay 10mm: expected a time in s, ms, us or ns, e.g. 10ms"),
@@ -233,14 +237,17 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 1e99999999999999999999ms", "ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 1ms distribution", "expected after it: one of uniform, normal, pareto, paretono"),
-        ("delay 1ms distribution normal", "distribution normal: says nothing without jitter"),
-        ("delay 1ms 1ms dist normal dist pareto", "dist: this delay has one already"),
+        ("delay 1ms distribution normal", "distribution normal: has no effect without jitter"),
+        (
+            "delay 1ms 1ms distribution normal distribution pareto",
+            "distribution: this delay has one already",
+        ),
         ("delay 1ms lossrel 5%", "lossrel: needs a loss before it"),
         ("delay 1ms loss 5% lossrel 5%", "lossrel: goes right after delay TIME"),
         ("delay 1ms samples 1,2", "delay 1ms samples 1,2: expected delays with their units"),
         ("delay 1ms samples 1ms", "samples 1ms: samples_s should have at least 2 items"),
         ("delay 1ms reorder", "reorder: expected after it: a percentage"),
-        ("reorder 25%", "reorder 25%: nothing before it delays a datagram; it goes after delay"),
+        ("reorder 25%", "reorder 25%: nothing before it delays a packet; it goes after delay"),
         (
             "delay 1ms gap 5 reorder 25%",
             "reorder 25%: there is a reorder, or a gap, before it; wri",
@@ -264,9 +271,9 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("mansd 4 mansd 4", "mansd: given twice"),
         ("seed 18446744073709551616", "seed 18446744073709551616: should be less than 1844674"),
         ("limit 0", "limit 0: limit should be greater than or equal to 1"),
-        ("slot 800us", "slot: this emulator does not gather datagrams into slots"),
-        ("loss 5% ecn", "loss 5% ecn: this emulator cannot mark datagrams"),
-        ("loss 5% delay 1ms ecn", "ecn: this emulator cannot mark datagrams"),
+        ("slot 800us", "slot: this emulator does not gather packets into slots"),
+        ("loss 5% ecn", "loss 5% ecn: this emulator cannot mark packets"),
+        ("loss 5% delay 1ms ecn", "ecn: this emulator cannot mark packets"),
         ("loss trace 'a", "loss trace 'a: a quotation is not closed"),
     ],
 )

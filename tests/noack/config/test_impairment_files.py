@@ -11,11 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from netem.link_machine import Link
-from noack.config.impairment_files import read_files, read_loss
-from noack.config.impairments import Delay, LinkSettings, LossOf, Rate, ScriptedLoss, TraceLoss
 from noack.config.resolution import resolve
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings, read_files
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.trace import TraceLoss
 from noack.protocol.record_tables import Fate
 
 
@@ -40,7 +44,7 @@ def test_a_trace_loses_what_it_marks(repeat: bool, tmp_path: Path) -> None:
 def test_any_trace(tmp_path_factory: pytest.TempPathFactory, lost: list[bool]) -> None:
     path = tmp_path_factory.getbasetemp() / "any.txt"
     path.write_text("\n".join("01"[flag] for flag in lost))
-    script = read_loss(TraceLoss(file=str(path)), Path("/"))
+    script = TraceLoss(file=str(path)).without_files(Path("/"), "")
     assert isinstance(script, ScriptedLoss)
     assert script.repeat_every == len(lost)
     assert [number in script.lost for number in range(len(lost))] == lost
@@ -104,7 +108,7 @@ def test_what_names_no_file_stays_as_it_is(tmp_path: Path) -> None:
         (None, "cannot be read: No such file or directory"),
         (b"01x1", "has a 'x'; a trace is of 0 and 1, and white space"),
         (b"01\xff", "has a 'ÿ'; a trace is of 0 and 1"),
-        (b" \n", "is empty; a trace has a 1 for each lost datagram"),
+        (b" \n", "is empty; a trace has a 1 for each lost packet"),
     ],
 )
 def test_a_mistake_in_a_trace_gets_one_line(
@@ -129,7 +133,7 @@ def test_a_mistake_in_a_trace_gets_one_line(
         ("t", 0.0, None, "cannot be read: No such file or directory"),
         ("t", 0.0, "0.01\nslow\n", "line 2: slow: expected one delay, e.g. 0.0125 or 12.5ms"),
         ("t", 0.0, "0.01\n1h\n", "line 2: 1h: expected one delay"),
-        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; 2 to 1000000 are of use"),
+        ("t", 0.0, "# nothing\n0.01\n", "has 1 delays; expected 2 to 1000000"),
         ("t", 0.0, "0.01\n4000\n", "has a delay beyond 3600 s"),
         ("t", 0.001, "0.01\n0.02\n", "observed delays are taken as they are, and have no jitter"),
         ("t.dist", 0.0, "1 2 3", "a distribution table is scaled by the jitter, which is 0"),

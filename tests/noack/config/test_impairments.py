@@ -8,10 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from noack.config.impairments import Delay, GilbertElliottLoss, Impairment, LinkSettings, Loss, Rate
+from noack.impairments.kinds import AnyImpairment
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models import Loss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 
 LOSS: TypeAdapter[Loss] = TypeAdapter(Loss)
-ONE: TypeAdapter[Impairment] = TypeAdapter(Impairment)
+ONE: TypeAdapter[AnyImpairment] = TypeAdapter(AnyImpairment)
 
 LOSS_MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"model": "bernoulli"}, "Field required"),
@@ -79,7 +84,7 @@ MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"kind": "rate", "rate_bps": 1000, "queue": 0}, "greater than or equal to 1"),
     (
         {"kind": "rate", "rate_bps": 1, "queue": 1_000_000},
-        "rate_bps: a full queue of the longest datagrams would take more than a century",
+        "rate_bps: a full queue of the longest packets would take more than a century",
     ),
     ({"kind": "blackout", "intervals_s": []}, "at least 1 item"),
     (

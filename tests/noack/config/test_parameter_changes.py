@@ -4,7 +4,6 @@ from typing import Any
 
 import pytest
 
-from noack.config.impairments import BernoulliLoss, GilbertElliottLoss
 from noack.config.parameter_changes import (
     ChangeSchedule,
     ParameterChange,
@@ -19,6 +18,8 @@ from noack.config.scenario import Scenario
 from noack.config.scenario_changes import content_with_settings
 from noack.config.scenario_file import dumps, load, validate
 from noack.core.errors import CallerError
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.protocol.machine_interface import Notice, Record
 from noack.protocol.record_tables import CHANGE_BYTES
 

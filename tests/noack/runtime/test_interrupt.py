@@ -25,17 +25,8 @@ runpy.run_module(module, run_name="__main__", alter_sys=True)
     [
         ["cosim.cli", "typer", "--version"],
         ["cosim.cli", "noack.config.scenario", "check", "lane_following"],
-        [
-            "cosim.cli",
-            "cosim.output.certificate_report",
-            "certify",
-            "lane_following",
-        ],  # which the command imports
-        ["cosim.cli", "netem.run_relay", "netem", "--help"],
         ["netem", "netem.run_relay", "--help"],
         ["plant_server", "noack.runtime.process_life", "--help"],
-        ["sensor_node", "noack.runtime.process_life", "--help"],
-        ["controller_node", "noack.runtime.process_life", "--help"],
     ],
 )
 def test_interrupt_during_imports_leaves_no_traceback(words: list[str]) -> None:

@@ -4,9 +4,11 @@ from typing import Any
 
 import pytest
 
-from noack.config.impairments import Delay, LinkSettings, Rate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
 from noack.theory.assumptions import assumptions
 from noack.theory.run_conditions import nominal_conditions
 

@@ -9,20 +9,18 @@ import numpy as np
 from cosim.simulation.batch.batch_interface import Population, Setting
 from cosim.simulation.continuous.continuous_run import ContinuousRun, simulate_continuous
 from netem.link_machine import UPDATE_LINK, Link
-from noack.config.impairments import (
-    BernoulliLoss,
-    Corrupt,
-    FourStateLoss,
-    GilbertElliottLoss,
-    LinkSettings,
-    LossOf,
-    NoLoss,
-    PeriodicLoss,
-    ScriptedLoss,
-    WorstCaseLoss,
-)
 from noack.config.resolution import LoopMatrices
 from noack.core.linear_systems import Vector
+from noack.impairments.kinds.corrupt import Corrupt
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.bernoulli import BernoulliLoss
+from noack.impairments.loss_models.four_state import FourStateLoss
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from noack.impairments.loss_models.lossless import NoLoss
+from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.scripted import ScriptedLoss
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from noack.trigger.decaying import DecayingTrigger
 

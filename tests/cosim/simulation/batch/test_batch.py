@@ -18,10 +18,11 @@ from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.continuous.continuous_loop import continuous_loop_of
 from cosim.simulation.continuous.continuous_run import simulate_continuous
 from cosim.simulation.continuous.network_fates import network_fates
-from noack.config.impairments import Delay, LinkSettings
 from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
+from noack.impairments.kinds.delay import Delay
+from noack.impairments.link_settings import LinkSettings
 from noack.trigger.decaying import DecayingTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from tests.cosim.simulation.batch.exact import (

@@ -10,8 +10,10 @@ import pytest
 from cosim.simulation.batch.batch_interface import Population, Setting, run_batch, run_events
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS, UNDECIDED
 from cosim.simulation.continuous.continuous_run import TooManyEventsError
-from noack.config.impairments import LinkSettings, LossOf, WorstCaseLoss
 from noack.core.linear_systems import Matrix
+from noack.impairments.kinds.loss import LossOf
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.trigger.absolute import AbsoluteTrigger
 from noack.trigger.deadline import DeadlineTrigger
 from noack.trigger.decaying import DecayingTrigger

@@ -272,7 +272,7 @@ def test_a_distribution_reaches_the_share_that_is_finite() -> None:
 
 def test_numbers_are_written_with_their_interval() -> None:
     assert written(estimate(np.array([1.0, 3.0]))) == "2 ± 13"
-    assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (in 50 %)"
+    assert written(estimate(np.array([-1.0, math.inf]))) == "−1 (50 % of runs)"
     assert written(estimate(np.array([math.inf]))) == "never"
     assert set(METRICS) >= {"cost", "settling_s"}
 
@@ -291,7 +291,7 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
     assert "[/b]" in result.stdout
     told = " ".join(result.stdout.split())
     assert f"At policy {name}, beta 0.1 not all runs reached the horizon: 2 too many" in told
-    assert "continuous time: the trigger watches always, and the network takes none" in told
+    assert "continuous time: the trigger acts at once and the network has no delay" in told
 
 
 @pytest.mark.parametrize("width", range(40, 120))
@@ -299,7 +299,7 @@ def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [
         SummaryRow(
-            ["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (in 97.5 %)"]
+            ["MB-ET", "0.1"], ["36 ± 16", "0.159 ± 0.016", "12 ± 16", "11.2 ± 8.4 (97.5 % of runs)"]
         ),
         SummaryRow(["ZOH-ET", "10"], ["549 ± 44", "0.0310 ± 0.0039", "never", "–"]),
     ]
@@ -315,4 +315,4 @@ def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
     for heading in headings:
         assert all(any(word in line for line in lines) for word in heading.split())
     assert all(len(line) <= width for line in lines)
-    assert (len(found) == 1) == (width > 83)
+    assert (len(found) == 1) == (width > 88)

@@ -75,7 +75,7 @@ def test_limits_that_cannot_be_met_write_no_scenario(mass: Path, tmp_path: Path)
         (["--settling", "9", "--weights", "best"], "identity, given, chosen"),
         (["--settling", "9", "--Q", "[1, 1]"], "for --gain lqr only"),
         (["--settling", "9", "--gain", "lqr", "--Q", "[1]"], "2 x 2 numbers by rows"),
-        (["--settling", "9", "--draws", "20"], "say too little of the quantile 0.95"),
+        (["--settling", "9", "--draws", "20"], "are too few for the quantile 0.95"),
         (["--settling", "9", "--set", "model.gain=[[1.0, 1.0]]"], "u = -K x does: give -K"),
         (["--settling", "9", "--set", "plant.initial_state=[0.0, 0.0]"], "initial_state: is 0"),
         (["--settling", "9", "--set", 'trigger={policy="absolute", delta=1.0}'], "trigger.policy"),

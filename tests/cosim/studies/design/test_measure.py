@@ -1,10 +1,11 @@
-"""Quantiles with their intervals, and what a limit is."""
+"""The limits of a design, and the draws that a quantile needs."""
 
 import math
 
 import pytest
 
-from cosim.studies.design.candidate_measures import DesignLimits, ranks, require_draws
+from cosim.studies.campaign.draw_statistics import interval_ranks
+from cosim.studies.design.candidate_measures import DesignLimits, require_draws
 from noack.core.errors import CallerError
 
 
@@ -17,19 +18,18 @@ def at_most(j: int, count: int, share: float) -> float:
 
 @pytest.mark.parametrize(("count", "quantile"), [(100, 0.5), (200, 0.9), (400, 0.95)])
 def test_ranks_are_the_nearest_that_cover_with_the_confidence(count: int, quantile: float) -> None:
-    at, low, high = ranks(count, quantile)
-    assert at == math.ceil(quantile * count) - 1
+    low, high = interval_ranks(count, quantile)
     # The value of rank r (from 0) is above the quantile if at most r values are below it.
     assert at_most(high, count, quantile) >= 0.975 > at_most(high - 1, count, quantile)
     assert at_most(low, count, quantile) <= 0.025 < at_most(low + 1, count, quantile)
 
 
 def test_too_few_draws_for_a_quantile_are_refused_and_enough_are_named() -> None:
-    with pytest.raises(CallerError, match="--draws: 50 say too little") as caught:
+    with pytest.raises(CallerError, match="--draws: 50 are too few") as caught:
         require_draws(50, 0.95)
     enough = int(str(caught.value).split()[-3])
     require_draws(enough, 0.95)
-    assert 1 - 0.95**enough >= 0.975  # the largest of all exceeds the quantile so surely
+    assert 1 - 0.95**enough >= 0.975  # P(the largest value exceeds the quantile)
 
 
 def test_the_worst_limit_counts() -> None:

@@ -5,7 +5,7 @@ the same bits.
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, DecimalException
 from typing import Generic, TypeVar
@@ -42,7 +42,7 @@ class Quantity(Generic[T]):
     expected: str
     """What a word of it is, with an example: ``a time, e.g. 10ms``."""
     read: Callable[[str], T]
-    """Reads a word; raises ValueError if it is none."""
+    """Reads a word; raises ValueError if the word is no such quantity."""
 
 
 def _split(text: str) -> tuple[Decimal, str]:
@@ -63,7 +63,7 @@ def _exact(read: Callable[[str], T]) -> Callable[[str], T]:
     def reading(text: str) -> T:
         try:
             return read(text)
-        except (DecimalException, OverflowError):  # an exponent beyond all reason
+        except (DecimalException, OverflowError):  # an exponent that is far too large
             raise ValueError from None
 
     return reading
@@ -155,6 +155,19 @@ def percent_text(share: float) -> str:
     return _digits(Decimal(repr(share)).scaleb(2)) + "%"
 
 
+def brief_percent(share: float) -> str:
+    """A share in percent, with six digits."""
+    return percent_text(float(f"{share:.6g}"))
+
+
+def percents_text(shares: Sequence[float], defaults: Sequence[float | None]) -> str:
+    """Percentages, without those at the end that have their default value."""
+    count = len(shares)
+    while shares[count - 1] == defaults[count - 1]:
+        count -= 1
+    return " ".join(map(percent_text, shares[:count]))
+
+
 def time_text(time_s: float) -> str:
     """``10ms`` for 0.01, in the unit that makes it shortest; read back, it is the same float."""
     exact = Decimal(repr(time_s))
@@ -165,7 +178,7 @@ def time_text(time_s: float) -> str:
 
 
 def _ease(text: str) -> tuple[int, bool]:
-    """How easy a number is to read: short, and whole."""
+    """Shorter numbers first, then whole ones."""
     return len(text), "." in text
 
 
@@ -180,3 +193,8 @@ def rate_text(rate_bps: int) -> str:
 def number_text(number: float) -> str:
     """A number in full."""
     return _digits(Decimal(repr(number)))
+
+
+def brief_number(number: float) -> str:
+    """A number with four digits."""
+    return number_text(float(f"{number:.4g}"))

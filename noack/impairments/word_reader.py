@@ -1,4 +1,4 @@
-"""Takes words one after the other, and says what is wrong with one."""
+"""Reads words one after the other; a message names the word that is wrong."""
 
 import difflib
 import shlex
@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from typing import NoReturn, TypeVar
 
-from netem.words.quantities import Quantity
 from noack.core.errors import CallerError, printable
+from noack.impairments.quantities import Quantity
 
 T = TypeVar("T")
 
@@ -89,19 +89,11 @@ class WordReader:
         self._take()
         return True
 
-    def choose(self, word: str, known: Collection[str]) -> str:
-        """Return the known word that ``word``, taken last, is; or the only one that it begins."""
-        if word in known:
-            return word
-        begun = sorted(one for one in known if one.startswith(word))
-        if len(begun) == 1:
-            return begun[0]
-        if begun:
-            self.wrong(f"may be {' or '.join(begun)}")
-        return self.unknown(word, known)
-
     def unknown(self, word: str, known: Collection[str]) -> NoReturn:
-        """Raise a CallerError: no such word; name the nearest."""
+        """Raise a CallerError: there is no such word; name the nearest."""
+        longer = sorted(one for one in known if one.startswith(word))
+        if longer:
+            self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")
         close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]}?" if close else f"expected one of {', '.join(known)}"
         self.wrong(f"no such word; {hint}")

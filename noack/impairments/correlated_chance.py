@@ -1,0 +1,103 @@
+"""Something that happens to a packet with a probability, and more alike to successive packets.
+
+The latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian process, and something
+happens when z_i exceeds the normal quantile of 1 − p: with probability p exactly, for every ρ.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from noack.impairments.link_records import RuleStage, StageMemory
+from noack.impairments.normal import score
+from noack.impairments.quantities import CORRELATION, PERCENT, brief_percent, percent_text
+from noack.impairments.word_reader import WordReader
+
+
+@dataclass(slots=True, kw_only=True)
+class ChanceStage(RuleStage):
+    """A probability and a correlation, as numbers."""
+
+    probability: float
+    threshold: float
+    """z with 1 − Φ(z) = probability; infinite if that is 0 or 1."""
+    correlation: float
+    innovation: float
+    """√(1 − correlation²)."""
+    gap: int = 1
+    """Only one in so many packets can be affected."""
+    scored: int = 0
+    """1: a later delay is correlated with what happens here."""
+
+
+class Chance(Protocol):
+    """Settings with a probability and a correlation."""
+
+    @property
+    def probability(self) -> float:
+        """Probability."""
+
+    @property
+    def correlation(self) -> float:
+        """Between the latent variables of successive packets."""
+
+
+def latent(correlation: float, innovation: float, memory: StageMemory, u: float) -> float:
+    """Advance a latent process by one packet and return z, standard normal.
+
+    Args:
+        correlation: ρ.
+        innovation: √(1 − ρ²).
+        memory: of the flow.
+        u: a uniform number.
+    """
+    z = -score(u)
+    if correlation != 0.0:
+        if memory.phase != 0:
+            z = correlation * memory.score + innovation * z
+        memory.phase = 1
+        memory.score = z
+    return z
+
+
+def happens(stage: ChanceStage, memory: StageMemory, u: float) -> bool:
+    """Whether it happens to the next packet; ``u`` is a uniform number."""
+    if stage.correlation == 0.0:
+        return u < stage.probability
+    return latent(stage.correlation, stage.innovation, memory, u) > stage.threshold
+
+
+def chance_stage(chance: Chance, *, gap: int = 1, scored: bool = False) -> ChanceStage:
+    """Return a probability and a correlation as numbers."""
+    p, correlation = chance.probability, chance.correlation
+    return ChanceStage(
+        probability=p,
+        threshold=-score(p) if 0 < p < 1 else math.copysign(math.inf, 0.5 - p),
+        correlation=correlation,
+        innovation=math.sqrt(1 - correlation**2),
+        gap=gap,
+        scored=int(scored),
+    )
+
+
+def read_chance(reader: WordReader) -> dict[str, float]:
+    """Read ``PERCENT [CORRELATION]``."""
+    table = {"probability": reader.value(PERCENT)}
+    if reader.number_follows():
+        table["correlation"] = reader.value(CORRELATION)
+    return table
+
+
+def chance_text(chance: Chance) -> str:
+    """Return the words that :func:`read_chance` reads."""
+    correlation = f" {percent_text(chance.correlation)}" if chance.correlation else ""
+    return percent_text(chance.probability) + correlation
+
+
+def correlation_meaning(correlation: float) -> str:
+    """Say that successive packets fare alike."""
+    return f", correlation {brief_percent(correlation)}" if correlation else ""
+
+
+TC_CORRELATION = "its correlation changes the probability, or the spread, of what it is given"
+"""What ``tc netem`` does differently."""

@@ -1,0 +1,62 @@
+"""Tail drop: a packet that finds the queue full is lost."""
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, Self
+
+from noack.impairments.bottleneck import BottleneckStage, enters, serve
+from noack.impairments.feature import Behaviour, QueueDiscipline
+from noack.impairments.link_records import (
+    DELIVERED,
+    NEVER_NS,
+    OVERFLOWED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    StageMemory,
+    refuse,
+)
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: BottleneckStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Put the packet into the queue, and its copy behind it; a packet lost before takes no part."""
+    if decision.fate != DELIVERED:
+        return
+    queue, ring_ns = state.queues[stage.place], state.departures_ns
+    if not enters(stage, queue, ring_ns, decision.release_ns):
+        refuse(decision, OVERFLOWED)
+    if decision.fate == DELIVERED:
+        decision.release_ns = serve(stage, queue, ring_ns, decision.size_bytes)
+    if decision.copy_ns != NEVER_NS:
+        if decision.fate == DELIVERED and enters(stage, queue, ring_ns, decision.copy_ns):
+            decision.copy_ns = serve(stage, queue, ring_ns, decision.size_bytes)
+        else:
+            decision.copy_ns = NEVER_NS
+
+
+class TailDrop(QueueDiscipline):
+    """A packet that finds the queue full is lost."""
+
+    kind: Literal["tail_drop"] = "tail_drop"
+
+    behaviour: ClassVar = Behaviour(BottleneckStage, apply)
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        return (cls(),)
+
+    def text(self) -> str:
+        return ""
+
+    def meaning(self) -> str:
+        return "more are dropped"
+
+    def queue_stage(self, bottleneck: Mapping[str, int]) -> BottleneckStage:
+        return BottleneckStage(**bottleneck)

@@ -1,0 +1,346 @@
+"""Delay: a constant, and a random part drawn by the quantile of a uniform number.
+
+Random parts have mean 0: uniform within ± jitter; normal, Pareto (shape 3) and their mixture with
+the jitter as standard deviation; empirical ones are drawn between the observed values.
+"""
+
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, Self, get_args
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.core.clock import NS_PER_S
+from noack.impairments.correlated_chance import TC_CORRELATION, latent
+from noack.impairments.delay_files import read_samples
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
+from noack.impairments.link_records import (
+    NEVER_NS,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    RuleStage,
+    StageMemory,
+)
+from noack.impairments.normal import cdf, score
+from noack.impairments.philox import uniforms
+from noack.impairments.quantities import (
+    CORRELATION,
+    OWN_TIME_S,
+    SIGNED_PERCENT,
+    TIME_S,
+    brief_percent,
+    percent_text,
+    time_text,
+)
+from noack.impairments.word_reader import WordReader
+from noack.settings.section import Correlation
+
+Distribution = Literal["uniform", "normal", "pareto", "paretonormal", "empirical"]
+SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical")
+"""Names of distributions; any other word after ``distribution`` is a file's name."""
+UNIFORM, NORMAL, PARETO, PARETONORMAL, EMPIRICAL = range(5)
+MOST_DELAY_S = 3600.0
+"""So that a few delays together, drawn from a Pareto distribution, fit into 64 bits of ns."""
+
+_PARETO_MEAN = 1.5
+_PARETO_DEVIATION = 0.8660254037844386
+"""Mean 3/2 and variance 3/4 of the Pareto distribution with shape 3 and scale 1."""
+_MIXED_DEVIATION = 0.937753856873566
+"""Of N/4 + 3P/4 with quantiles N normal and P Pareto: √(5/8 + 3/8 E NP), E NP = 0.678352789549…"""
+_LONGEST_NS = 1e15
+"""11.6 days; the Pareto distribution has no end, and integers have."""
+_NOTEWORTHY = 1e-4
+"""Share of delays that are cut at 0. A normal distribution has no end, so that some always are."""
+
+
+@dataclass(slots=True, kw_only=True)
+class DelayStage(RuleStage):
+    """A delay as numbers."""
+
+    constant_ns: float
+    jitter_ns: float
+    shape: int
+    """A place in ``Distribution``."""
+    begin: int
+    """Place of an empirical quantile table, in ns, in the program's table of reals."""
+    end: int
+    correlation: float
+    innovation: float
+    loss_correlation: float
+    loss_innovation: float
+
+
+def pareto(u: float) -> float:
+    """Quantile of the Pareto distribution with shape 3, mean 0 and standard deviation 1."""
+    return (math.pow(1.0 - u, -1.0 / 3.0) - _PARETO_MEAN) / _PARETO_DEVIATION
+
+
+def quantile_ns(stage: DelayStage, table_ns: Sequence[float], u: float) -> float:
+    """Quantile of the random part, in ns; ``u`` in [0, 1)."""
+    if stage.shape == NORMAL:
+        return stage.jitter_ns * score(u)
+    if stage.shape == PARETO:
+        return stage.jitter_ns * pareto(u)
+    if stage.shape == PARETONORMAL:
+        return stage.jitter_ns * (0.25 * score(u) + 0.75 * pareto(u)) / _MIXED_DEVIATION
+    if stage.shape == EMPIRICAL:
+        place = u * (stage.end - stage.begin - 1)
+        knot = min(int(place), stage.end - stage.begin - 2)
+        low, high = table_ns[stage.begin + knot], table_ns[stage.begin + knot + 1]
+        return low + (high - low) * (place - knot)
+    return stage.jitter_ns * (2.0 * u - 1.0)
+
+
+def drawn_ns(
+    stage: DelayStage, table_ns: Sequence[float], memory: StageMemory, flow: FlowState, u: float
+) -> int:
+    """Draw a delay, in whole ns; ``u`` is a uniform number.
+
+    A correlated delay goes through normal scores, which keeps its distribution: with ρ the
+    correlation with the loss model's score s, z = ρ s + √(1 − ρ²) z', and the quantile is Φ(z)'s.
+    """
+    if stage.correlation != 0.0 or stage.loss_correlation != 0.0:
+        z = latent(stage.correlation, stage.innovation, memory, u)
+        if stage.loss_correlation != 0.0:
+            z = stage.loss_correlation * flow.score + stage.loss_innovation * z
+        u = min(cdf(z), 0.9999999999999999)
+    return int(min(max(stage.constant_ns + quantile_ns(stage, table_ns, u), 0.0), _LONGEST_NS))
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: DelayStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Delay the packet, and its copy as if it were the next packet."""
+    u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    decision.release_ns += drawn_ns(stage, program.reals, memory, flow, u)
+    if decision.copy_ns != NEVER_NS:
+        # The next packet's delay must not depend on whether there is a copy.
+        phase, latest = memory.phase, memory.score
+        decision.copy_ns += drawn_ns(stage, program.reals, memory, flow, v)
+        memory.phase, memory.score = phase, latest
+
+
+def _read(reader: WordReader) -> Table:
+    """``delay TIME [JITTER [CORRELATION]] [distribution NAME | samples TIMES] [lossrel PERCENT]``.
+
+    The clauses at the end may stand in any order.
+    """
+    table: Table = {"delay_s": reader.value(TIME_S)}
+    if reader.number_follows():
+        table["jitter_s"] = reader.value(TIME_S)
+        if reader.number_follows():
+            table["correlation"] = reader.value(CORRELATION)
+    while True:
+        if reader.accept("distribution"):
+            _once(reader, table, "distribution")
+            _read_distribution(reader, table)
+        elif reader.accept("samples"):
+            _once(reader, table, "distribution")
+            table["distribution"] = "empirical"
+            expected = "delays with their units, e.g. 1ms,2ms,10ms"
+            table["samples_s"] = reader.values(OWN_TIME_S, expected)
+        elif reader.accept("lossrel"):
+            _once(reader, table, "loss_correlation")
+            table["loss_correlation"] = reader.value(SIGNED_PERCENT)
+        else:
+            return table
+
+
+def _once(reader: WordReader, table: Table, key: str) -> None:
+    if key in table:
+        reader.wrong("this delay has one already")
+
+
+def _read_distribution(reader: WordReader, table: Table) -> None:
+    name = reader.file(f"one of {', '.join(SHAPES)}, or a file")
+    if name not in SHAPES:
+        table |= {"distribution": "empirical", "file": name}
+        return
+    table["distribution"] = name
+    if "jitter_s" not in table:
+        reader.wrong("has no effect without jitter; write delay TIME JITTER distribution NAME")
+
+
+_DelayS = Annotated[FiniteFloat, Field(ge=0, le=MOST_DELAY_S)]
+_Samples = Annotated[
+    tuple[Annotated[FiniteFloat, Field(ge=-MOST_DELAY_S, le=MOST_DELAY_S)], ...],
+    Field(min_length=2, max_length=1_000_000),
+]
+
+
+class Delay(Impairment):
+    """Delays a packet by a constant time and a random one; never by less than 0."""
+
+    kind: Literal["delay"] = "delay"
+    delay_s: _DelayS = 0.0
+    """The constant part (and the mean, unless times below 0 are cut)."""
+    jitter_s: _DelayS = 0.0
+    """Of the random part: the half-width if uniform, else the standard deviation."""
+    distribution: Distribution = "uniform"
+    """Of the random part; paretonormal is a quarter normal, three quarters Pareto; empirical draws
+    from samples_s or file."""
+    samples_s: _Samples | None = None
+    """Observed delays, which are added to delay_s and may be below 0: drawn between them by their
+    quantiles."""
+    file: Annotated[str, Field(min_length=1)] | None = None
+    """A text file of observed delays, one per line, in seconds unless it says ms or us; or a
+    distribution table of tc (*.dist), which is scaled by jitter_s."""
+    correlation: Correlation = 0.0
+    """Between the random parts of successive packets of a flow."""
+    loss_correlation: Annotated[FiniteFloat, Field(ge=-1, le=1)] = 0.0
+    """With the loss model before it: how far a packet is also late if the loss model's state is
+    bad."""
+
+    words: ClassVar = (
+        Word("delay", "delay 10ms", _read),
+        Word("latency", "delay 10ms", _read),
+        Word("jitter", "delay 10ms 2ms", after="delay TIME"),
+        Word("distribution", "delay 10ms 2ms distribution normal", after="delay TIME JITTER"),
+        Word("samples", "delay 0s samples 1ms,2ms,10ms", after="delay TIME"),
+        Word("lossrel", "loss 5% delay 10ms 2ms lossrel 50%", after="delay TIME"),
+    )
+    behaviour: ClassVar = Behaviour(DelayStage, apply)
+    delays: ClassVar = True
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        given = (self.samples_s is not None) + (self.file is not None)
+        if self.distribution == "empirical" and given != 1:
+            raise ValueError("samples_s: an empirical distribution needs samples_s, or a file")
+        if self.distribution != "empirical" and given:
+            raise ValueError('samples_s: goes with distribution = "empirical"')
+        return self
+
+    @property
+    def longest_s(self) -> float:
+        if self.samples_s is not None:
+            return self.delay_s + max(self.samples_s)
+        return self.delay_s + self.jitter_s * (1 if self.distribution == "uniform" else 4)
+
+    @property
+    def is_bounded(self) -> bool:
+        return not self.jitter_s or self.distribution in ("uniform", "empirical")
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        varies = bool(self.jitter_s or self.samples_s or self.file)
+        return delayed or varies or self.delay_s > 0, reordered or varies
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        shapes: tuple[Distribution, ...] = ("uniform", "normal", "pareto", "paretonormal")
+        return [
+            cls(delay_s=0.0005),
+            *(cls(delay_s=0.004, jitter_s=0.004, distribution=shape) for shape in shapes),
+            cls(jitter_s=0.0005, correlation=0.7),
+            cls(distribution="empirical", samples_s=(0.0, 0.001, 0.002, 0.009)),
+        ]
+
+    def text(self) -> str:
+        words = ["delay", time_text(self.delay_s)]
+        shaped = self.distribution in SHAPES and self.distribution != "uniform"
+        if self.jitter_s or self.correlation or shaped:
+            words.append(time_text(self.jitter_s))
+        if self.correlation:
+            words.append(percent_text(self.correlation))
+        if shaped:
+            words += ["distribution", self.distribution]
+        elif self.file is not None:
+            name = f"./{self.file}" if self.file in SHAPES else self.file
+            words += ["distribution", shlex.quote(name)]
+        elif self.samples_s is not None:
+            words += ["samples", ",".join(map(time_text, self.samples_s))]
+        if self.loss_correlation:
+            words += ["lossrel", percent_text(self.loss_correlation)]
+        return " ".join(words)
+
+    def meaning(self) -> str:
+        text = f"delays each packet by {time_text(self.delay_s)}"
+        if self.file is not None:
+            text += f" and by what is in {self.file}"
+        elif self.samples_s is not None:
+            low, high = min(self.samples_s), max(self.samples_s)
+            text += (
+                f" and between {time_text(low)} and {time_text(high)} more, as "
+                f"{len(self.samples_s)} observed delays are distributed"
+            )
+        elif self.jitter_s and self.distribution == "uniform":
+            text += f" ± {time_text(self.jitter_s)}, uniformly distributed"
+        elif self.jitter_s:
+            text += (
+                f", with a standard deviation of {time_text(self.jitter_s)} ({self.distribution})"
+            )
+        below = self._share_below_zero()
+        if below >= _NOTEWORTHY:
+            share = percent_text(float(f"{below:.2g}"))
+            text += f"; negative delays become 0 ({share} of the draws)"
+        if self.correlation:
+            text += f"; correlation {brief_percent(self.correlation)}"
+        if self.loss_correlation:
+            text += f"; correlation {brief_percent(self.loss_correlation)} with the loss before it"
+        return text
+
+    def _share_below_zero(self) -> float:
+        """Share of the drawn delays that would be below 0."""
+        if self.file is not None:
+            return 0.0
+        tables = StageTables()
+        stage = self.stage(tables)
+        low, high = 0.0, 1.0
+        for _ in range(50):  # quantiles ascend
+            middle = (low + high) / 2
+            if stage.constant_ns + quantile_ns(stage, tables.reals, middle) < 0:
+                low = middle
+            else:
+                high = middle
+        return low
+
+    def stage(self, tables: StageTables) -> DelayStage:
+        if self.file is not None:
+            raise ValueError(f"{self.file}: the delays have not been read")
+        begin, end = tables.add_reals(sorted(t_s * NS_PER_S for t_s in self.samples_s or ()))
+        return DelayStage(
+            constant_ns=float(round(self.delay_s * NS_PER_S)),
+            jitter_ns=self.jitter_s * NS_PER_S,
+            shape=get_args(Distribution).index(self.distribution),
+            begin=begin,
+            end=end,
+            correlation=self.correlation,
+            innovation=math.sqrt(1 - self.correlation**2),
+            loss_correlation=self.loss_correlation,
+            loss_innovation=math.sqrt(1 - self.loss_correlation**2),
+        )
+
+    def without_files(self, folder: Path, place: str) -> Self:
+        if self.file is None:
+            return self
+        samples_s = read_samples(self.file, self.jitter_s, MOST_DELAY_S, folder, place)
+        return self.model_copy(update={"samples_s": samples_s, "file": None, "jitter_s": 0.0})
+
+    def tc_text(self) -> str:
+        without = self.model_copy(update={"loss_correlation": 0.0})
+        if self.distribution == "uniform" and not self.jitter_s:
+            return f"delay {time_text(self.delay_s)}"
+        return without.text()
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        if self.distribution not in SHAPES:
+            return "such a table of delays"
+        if self.distribution != "uniform" and not (self.delay_s and self.jitter_s):
+            return "a distribution without a delay and a jitter"
+        return ""
+
+    def tc_notes(self) -> Sequence[str]:
+        notes = [TC_CORRELATION] if self.correlation else []
+        if "pareto" in self.distribution:
+            notes.append("its table of the Pareto distribution ends at four times the jitter")
+        return notes

@@ -1,0 +1,152 @@
+"""A bottleneck with a finite queue, and a discipline for the queue."""
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from noack.impairments.disciplines import DISCIPLINES, Discipline
+from noack.impairments.disciplines.tail_drop import TailDrop
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
+from noack.impairments.link_records import RuleStage
+from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_text
+from noack.impairments.word_reader import WordReader
+
+_TC_HEADERS_BYTES = 42
+"""What tc counts beside the payload on an Ethernet device: the headers of Ethernet, IPv4, UDP."""
+
+
+def _read(reader: WordReader) -> Table:
+    """``rate RATE [OVERHEAD [CELL [CELL_OVERHEAD]]] [queue PACKETS] [DISCIPLINE ...]``."""
+    table: Table = {"rate_bps": reader.value(RATE_BPS)}
+    for key, signs in (("overhead_bytes", "-"), ("cell_bytes", ""), ("cell_overhead_bytes", "-")):
+        if not reader.number_follows(signs):
+            break
+        table[key] = reader.value(SIGNED_COUNT)
+    if reader.accept("queue"):
+        table["queue"] = reader.value(COUNT)
+    for discipline in DISCIPLINES:
+        for word in discipline.words:
+            if word.read is not None and reader.accept(word.name):
+                kind = discipline.model_fields["kind"].default
+                table["discipline"] = {"kind": kind, **word.read(reader)}
+    return table
+
+
+class Rate(Impairment):
+    """A bottleneck: one packet after the other, with a finite queue before it."""
+
+    kind: Literal["rate"] = "rate"
+    rate_bps: Annotated[int, Field(ge=1, le=10**12)]
+    """Bits per second."""
+    queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
+    """At most so many packets wait or are being sent; more are dropped."""
+    overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = 28
+    """Added to each payload: 28 counts the headers of UDP and IPv4."""
+    cell_bytes: Annotated[int, Field(ge=0, le=65_535)] = 0
+    """Payload of a link-layer cell, e.g. 48; 0 has no cells."""
+    cell_overhead_bytes: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Header of a cell, e.g. 5."""
+    discipline: Discipline = TailDrop()
+    """Which packets the queue drops."""
+
+    words: ClassVar = (
+        Word("rate", "rate 1mbit", _read),
+        Word("queue", "rate 1mbit queue 20", after="rate RATE"),
+        *(
+            word._replace(read=None, after=word.after or "rate RATE")
+            for discipline in DISCIPLINES for word in discipline.words
+        ),
+    )  # fmt: skip
+    delays: ClassVar = True
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        line_bytes = max(65_535 + self.overhead_bytes, 0)
+        if self.cell_bytes:
+            cells = -(-line_bytes // self.cell_bytes)
+            line_bytes = cells * (self.cell_bytes + self.cell_overhead_bytes)
+        # In 64 bits with a sign, the work on one packet and the time for a full queue.
+        work = line_bytes * 8 * 10**9 + self.rate_bps
+        if max(work, self.queue * work // self.rate_bps) > 2**62:
+            raise ValueError(
+                "rate_bps: a full queue of the longest packets would take more than a century; "
+                "more rate, a shorter queue or fewer bytes of overhead per cell"
+            )
+        return self
+
+    @property
+    def rule(self) -> Behaviour | None:
+        return type(self.discipline).behaviour
+
+    @property
+    def longest_s(self) -> float:
+        """How long a full queue of packets of 1,500 bytes takes, in seconds."""
+        return self.queue * 8 * 1500 / self.rate_bps
+
+    @property
+    def is_bounded(self) -> bool:
+        return False
+
+    @property
+    def prediction_note(self) -> str:
+        return self.discipline.prediction_note or "as long as no queue overflows"
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        return True, False  # it serves in the order of arrival
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        disciplines = [one for kind in DISCIPLINES for one in kind.examples()]
+        rates = ((5_000_000, 1), (5_000_000, 50), (10**8, 5))
+        return [
+            *(
+                cls(rate_bps=rate_bps, queue=queue, discipline=one)
+                for rate_bps, queue in rates for one in disciplines
+            ),
+            cls(rate_bps=10**9, overhead_bytes=-10, cell_bytes=48, cell_overhead_bytes=5),
+        ]  # fmt: skip
+
+    def text(self) -> str:
+        fields = type(self).model_fields
+        words = ["rate", rate_text(self.rate_bps)]
+        cells = (self.cell_bytes, self.cell_overhead_bytes)
+        if self.overhead_bytes != fields["overhead_bytes"].default or any(cells):
+            words.append(str(self.overhead_bytes))
+        if any(cells):
+            words.append(str(self.cell_bytes))
+        if self.cell_overhead_bytes:
+            words.append(str(self.cell_overhead_bytes))
+        if self.queue != fields["queue"].default:
+            words.append(f"queue {self.queue}")
+        return " ".join([*words, *filter(None, [self.discipline.text()])])
+
+    def meaning(self) -> str:
+        text = (
+            f"forwards {rate_text(self.rate_bps)} per second, one packet after the other, each "
+            f"with {self.overhead_bytes} bytes beside its payload; {self.queue} may wait, "
+            f"{self.discipline.meaning()}"
+        )
+        if self.cell_bytes:
+            text += f"; in cells of {self.cell_bytes} + {self.cell_overhead_bytes} bytes"
+        return text
+
+    def stage(self, tables: StageTables) -> RuleStage:
+        return self.discipline.queue_stage({
+            "rate_bps": self.rate_bps,
+            "queue_places": self.queue,
+            "overhead_bytes": self.overhead_bytes,
+            "cell_bytes": self.cell_bytes,
+            "cell_overhead_bytes": self.cell_overhead_bytes,
+        })  # fmt: skip
+
+    def tc_text(self) -> str:
+        cells = (self.cell_bytes, self.cell_overhead_bytes)
+        numbers = (self.overhead_bytes - _TC_HEADERS_BYTES, *(cells if any(cells) else ()))
+        return " ".join(["rate", rate_text(self.rate_bps), *map(str, numbers)])
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return self.discipline.tc_lacks(before)
+
+    def tc_notes(self) -> Sequence[str]:
+        return ("its queue is the limit; its overhead is for an Ethernet device, with IPv4",)

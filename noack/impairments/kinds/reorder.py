@@ -1,0 +1,105 @@
+"""Reordering: a packet leaves at once, however long it should be delayed."""
+
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field
+
+from noack.impairments.correlated_chance import (
+    TC_CORRELATION,
+    ChanceStage,
+    chance_stage,
+    chance_text,
+    correlation_meaning,
+    happens,
+    read_chance,
+)
+from noack.impairments.feature import Behaviour, Impairment, StageTables, Table, Word
+from noack.impairments.link_records import (
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    StageMemory,
+)
+from noack.impairments.philox import uniforms
+from noack.impairments.quantities import COUNT, brief_percent
+from noack.impairments.word_reader import WordReader
+from noack.settings.section import Correlation, Probability
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: ChanceStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Undo the delay of every gap-th packet, or not; every packet advances the chance."""
+    u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    if happens(stage, memory, u) and (decision.packet + 1) % stage.gap == 0:
+        decision.release_ns = decision.arrival_ns
+
+
+def _read(reader: WordReader) -> Table:
+    """``reorder PERCENT [CORRELATION] [gap N]``."""
+    table: Table = {**read_chance(reader)}
+    if reader.accept("gap"):
+        table["gap"] = reader.value(COUNT)
+    return table
+
+
+def _read_gap(reader: WordReader) -> Table:
+    """``gap N``."""
+    return {"gap": reader.value(COUNT)}
+
+
+class Reorder(Impairment):
+    """Lets a packet leave at once, before packets that arrived earlier and are delayed."""
+
+    kind: Literal["reorder"] = "reorder"
+    probability: Probability = 1.0
+    """Probability, for every ``gap``-th packet."""
+    correlation: Correlation = 0.0
+    """Between successive packets."""
+    gap: Annotated[int, Field(ge=1, le=2**40)] = 1
+    """Only every ``gap``-th packet can be reordered."""
+
+    words: ClassVar = (
+        Word("reorder", "delay 10ms reorder 5%", _read),
+        Word("gap", "delay 10ms gap 5", _read_gap),
+    )
+    behaviour: ClassVar = Behaviour(ChanceStage, apply)
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        chances = ((0.0, 1), (0.5, 1), (0.9, 2), (1.0, 4))
+        alone = [cls(probability=p, gap=gap) for p, gap in chances]
+        return [*alone, cls(probability=0.5, correlation=0.7, gap=3)]
+
+    def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
+        return delayed, reordered or (delayed and self.probability > 0)
+
+    def text(self) -> str:
+        gap = f" gap {self.gap}" if self.gap != 1 else ""
+        return f"reorder {chance_text(self)}{gap}"
+
+    def meaning(self) -> str:
+        which = f"{brief_percent(self.probability)} of the packets"
+        if self.gap != 1:
+            which = f"every {self.gap}th packet"
+            if self.probability < 1:
+                which += f", with probability {brief_percent(self.probability)},"
+        how = correlation_meaning(self.correlation)
+        return f"sends {which} at once, before those that are delayed{how}"
+
+    def stage(self, tables: StageTables) -> ChanceStage:
+        return chance_stage(self, gap=self.gap)
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        delayed = any(getattr(one, "delay_s", 0) for one in before)
+        return "" if delayed else "reordering without a delay before it"
+
+    def tc_notes(self) -> Sequence[str]:
+        return (TC_CORRELATION,) if self.correlation else ()

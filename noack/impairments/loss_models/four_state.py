@@ -1,0 +1,149 @@
+"""Bursty losses with isolated ones: a Markov chain of four states (Salsano, Ludovici & Ordine).
+
+1 gap: delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss in a gap.
+From 4 the chain returns to 1. It starts in 1 and moves before each packet.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import (
+    DROPPED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    RuleStage,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.markov_chain import Chain
+from noack.impairments.philox import uniforms
+from noack.impairments.quantities import PERCENT, brief_percent, percent_text, percents_text
+from noack.impairments.word_reader import WordReader
+from noack.settings.section import Probability
+
+
+@dataclass(slots=True, kw_only=True)
+class FourStateStage(RuleStage):
+    """A Markov chain of four states as numbers."""
+
+    p13: float
+    p31: float
+    p32: float
+    p23: float
+    p14: float
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: FourStateStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Move the chain, and lose the packet or not."""
+    u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    now = memory.phase + 1
+    if now == 1:
+        if u < stage.p13:
+            now = 3
+        elif u < stage.p13 + stage.p14:
+            now = 4
+    elif now == 2:
+        if u < stage.p23:
+            now = 3
+    elif now == 3:
+        if u < stage.p31:
+            now = 1
+        elif u < stage.p31 + stage.p32:
+            now = 2
+    else:
+        now = 1
+    memory.phase = now - 1
+    if now >= 3:
+        refuse(decision, DROPPED)
+
+
+def _read(reader: WordReader) -> Table:
+    """``state p13 [p31 [p32 [p23 [p14]]]]``; p13 alone makes independent losses, as in tc."""
+    p13 = reader.value(PERCENT)
+    table: Table = {"p13": p13, "p31": 1 - p13}
+    for key in ("p31", "p32", "p23", "p14"):
+        if not reader.number_follows():
+            break
+        table[key] = reader.value(PERCENT)
+    return table
+
+
+class FourStateLoss(LossModel):
+    """Markov loss with four states (Salsano et al., GI model; ``loss state`` of tc).
+
+    State 1: gap, delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss
+    within a gap.
+    """
+
+    model: Literal["four_state"] = "four_state"
+    p13: Probability
+    """From a gap into a burst."""
+    p31: Probability
+    """From a burst back to a gap."""
+    p32: Probability = 0.0
+    """Within a burst: from lost to delivered."""
+    p23: Probability = 1.0
+    """Within a burst: from delivered to lost."""
+    p14: Probability = 0.0
+    """A single loss within a gap."""
+
+    words: ClassVar = (Word("state", "loss state 1% 10%", _read),)
+    behaviour: ClassVar = Behaviour(FourStateStage, apply)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.p31 + self.p32 > 1:
+            raise ValueError("p31: p31 + p32 must not exceed 1")
+        if self.p13 + self.p14 > 1:
+            raise ValueError("p13: p13 + p14 must not exceed 1")
+        return self
+
+    @property
+    def _shares(self) -> tuple[float, ...]:
+        return (self.p13, self.p31, self.p32, self.p23, self.p14)
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        return [cls(p13=0.3, p31=0.4, p32=0.2, p23=0.7, p14=0.1), cls(p13=0.1, p31=0.3)]
+
+    def text(self) -> str:
+        return f"state {percents_text(self._shares, (None, None, 0.0, 1.0, 0.0))}"
+
+    def meaning(self) -> str:
+        return (
+            "loses by a Markov chain of four states: bursts begin with probability "
+            f"{brief_percent(self.p13)} and end with {brief_percent(self.p31)}; within a burst, "
+            f"delivery begins with {brief_percent(self.p32)} and ends with "
+            f"{brief_percent(self.p23)}; single losses occur with {brief_percent(self.p14)}"
+        )
+
+    def stage(self, tables: StageTables) -> FourStateStage:
+        return FourStateStage(
+            p13=self.p13, p31=self.p31, p32=self.p32, p23=self.p23, p14=self.p14
+        )  # fmt: skip
+
+    def chains(self) -> Sequence[Chain]:
+        moves = np.array([
+            [1 - self.p13 - self.p14, 0.0, self.p13, self.p14],
+            [0.0, 1 - self.p23, self.p23, 0.0],
+            [self.p31, self.p32, 1 - self.p31 - self.p32, 0.0],
+            [1.0, 0.0, 0.0, 0.0],
+        ])  # fmt: skip
+        return (Chain(np.eye(4)[0], np.maximum(moves, 0.0), np.array([0.0, 0.0, 1.0, 1.0])),)
+
+    def tc_text(self) -> str:
+        return f"state {' '.join(map(percent_text, self._shares))}"

@@ -1,0 +1,210 @@
+"""Bursty losses: a two-state Markov chain (Gilbert, 1960; Elliott, 1963).
+
+The chain starts in the good state and may change its state before each packet: good → bad with
+probability p, bad → good with probability r. A packet is lost with probability 1 − k in the good
+state and 1 − h in the bad. In the stationary chain the loss rate is
+
+    (1 − k) r/(p + r) + (1 − h) p/(p + r).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.impairments.feature import Behaviour, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import (
+    DROPPED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    RuleStage,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.markov_chain import Chain
+from noack.impairments.normal import score
+from noack.impairments.philox import uniforms
+from noack.impairments.quantities import (
+    NUMBER,
+    PERCENT,
+    brief_number,
+    brief_percent,
+    number_text,
+    percent_text,
+    percents_text,
+)
+from noack.impairments.word_reader import WordReader
+from noack.settings.section import Probability
+
+GOOD = 0
+BAD = 1
+
+
+@dataclass(slots=True, kw_only=True)
+class GilbertElliottStage(RuleStage):
+    """A Gilbert–Elliott chain as numbers."""
+
+    good_to_bad: float
+    bad_to_good: float
+    loss_in_good: float
+    loss_in_bad: float
+    share_bad: float
+    """Share of packets in the bad state: p/(p + r)."""
+    scored: int
+    """1: a later delay is correlated with the state."""
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: GilbertElliottStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Move the chain, and lose the packet or not.
+
+    If a delay wants to know how bad the link's state is: a packet in the bad state is among the
+    worst p/(p + r).
+    """
+    u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
+    if memory.phase == BAD:
+        if u < stage.bad_to_good:
+            memory.phase = GOOD
+    elif u < stage.good_to_bad:
+        memory.phase = BAD
+    if stage.scored != 0:
+        w, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 1)
+        bad = stage.share_bad
+        flow.score = -score(w * bad if memory.phase == BAD else bad + w * (1.0 - bad))
+    if v < (stage.loss_in_bad if memory.phase == BAD else stage.loss_in_good):
+        refuse(decision, DROPPED)
+
+
+def _read_chain(reader: WordReader) -> Table:
+    """``gemodel p [r [1-h [1-k]]]``; p alone makes independent losses, as in tc."""
+    p = reader.value(PERCENT)
+    table: Table = {"good_to_bad": p, "bad_to_good": 1 - p}
+    for key in ("bad_to_good", "loss_in_bad", "loss_in_good"):
+        if not reader.number_follows():
+            break
+        table[key] = reader.value(PERCENT)
+    return table
+
+
+def _read_means(reader: WordReader) -> Table:
+    """``burst PERCENT LENGTH``."""
+    return {"mean_loss": reader.value(PERCENT), "mean_burst": reader.value(NUMBER)}
+
+
+class GilbertElliottLoss(LossModel):
+    """Two-state Markov loss: a good and a bad state, each with its own loss probability.
+
+    Either the probabilities of changing state, or ``mean_loss`` and ``mean_burst``.
+    """
+
+    model: Literal["gilbert_elliott"] = "gilbert_elliott"
+    good_to_bad: Probability | None = None
+    """Probability p of leaving the good state, per packet."""
+    bad_to_good: Probability | None = None
+    """Probability r of leaving the bad state, per packet."""
+    loss_in_good: Probability = 0.0
+    """Loss probability 1 − k in the good state."""
+    loss_in_bad: Probability = 1.0
+    """Loss probability 1 − h in the bad state."""
+    mean_loss: Annotated[FiniteFloat, Field(ge=0, lt=1)] | None = None
+    """Expected share of lost packets, instead of p and r."""
+    mean_burst: Annotated[FiniteFloat, Field(ge=1)] | None = None
+    """Mean number of consecutive losses, with mean_loss."""
+
+    words: ClassVar = (
+        Word("gemodel", "loss gemodel 1% 10%", _read_chain),
+        Word("burst", "loss burst 5% 3", _read_means),
+    )
+    behaviour: ClassVar = Behaviour(GilbertElliottStage, apply)
+    gives_score: ClassVar = True
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        chain = (self.good_to_bad, self.bad_to_good)
+        means = (self.mean_loss, self.mean_burst)
+        if (None in chain) == (None in means) or (None in chain and chain != (None, None)):
+            raise ValueError(
+                "good_to_bad: give good_to_bad and bad_to_good, or mean_loss and mean_burst"
+            )
+        if None in chain:
+            if (self.loss_in_good, self.loss_in_bad) != (0.0, 1.0):
+                raise ValueError(
+                    "mean_loss: mean_loss and mean_burst go with loss_in_good 0 and loss_in_bad 1"
+                )
+            if self.transitions[0] > 1:
+                raise ValueError(
+                    "mean_burst: so much loss needs longer bursts, at least "
+                    f"mean_loss/(1 − mean_loss) = {self._shortest_burst():.4g}"
+                )
+        elif means != (None, None):
+            raise ValueError("mean_loss: goes instead of good_to_bad and bad_to_good")
+        return self
+
+    def _shortest_burst(self) -> float:
+        loss = self.mean_loss or 0.0
+        return loss / (1 - loss)
+
+    @property
+    def transitions(self) -> tuple[float, float]:
+        """Probabilities p and r. In a Gilbert chain bursts last 1/r, and p/(p + r) is lost."""
+        if self.mean_loss is not None and self.mean_burst is not None:
+            return self._shortest_burst() / self.mean_burst, 1 / self.mean_burst
+        return self.good_to_bad or 0.0, self.bad_to_good or 0.0
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        shares = ((0.1, 0.5, 0.0, 1.0), (0.5, 0.1, 0.1, 0.9), (1.0, 0.0, 0.0, 1.0), (0, 0, 0.1, 1))
+        chains = [
+            cls(good_to_bad=p, bad_to_good=r, loss_in_good=good, loss_in_bad=bad)
+            for p, r, good, bad in shares
+        ]
+        return [*chains, cls(mean_loss=0.4, mean_burst=3.0)]
+
+    def text(self) -> str:
+        if self.mean_loss is not None and self.mean_burst is not None:
+            return f"burst {percent_text(self.mean_loss)} {number_text(self.mean_burst)}"
+        shares = (*self.transitions, self.loss_in_bad, self.loss_in_good)
+        return f"gemodel {percents_text(shares, (None, None, 1.0, 0.0))}"
+
+    def meaning(self) -> str:
+        p, r = self.transitions
+        bad = f"the bad state begins with probability {brief_percent(p)} per packet"
+        length = f" and lasts {brief_number(1 / r)} packets on average" if r else " and never ends"
+        if (self.loss_in_good, self.loss_in_bad) == (0.0, 1.0):
+            return f"loses all packets in the bad state; {bad}{length}"
+        return (
+            f"loses {brief_percent(self.loss_in_bad)} of the packets in the bad state and "
+            f"{brief_percent(self.loss_in_good)} in the good state; {bad}{length}"
+        )
+
+    def stage(self, tables: StageTables) -> GilbertElliottStage:
+        p, r = self.transitions
+        return GilbertElliottStage(
+            good_to_bad=p,
+            bad_to_good=r,
+            loss_in_good=self.loss_in_good,
+            loss_in_bad=self.loss_in_bad,
+            share_bad=p / (p + r) if p + r > 0 else 0.0,
+            scored=int(tables.scored),
+        )
+
+    def chains(self) -> Sequence[Chain]:
+        p, r = self.transitions
+        moves = np.array([[1 - p, p], [r, 1 - r]])
+        return (
+            Chain(np.array([1.0, 0.0]), moves, np.array([self.loss_in_good, self.loss_in_bad])),
+        )
+
+    def tc_text(self) -> str:
+        shares = (*self.transitions, self.loss_in_bad, self.loss_in_good)
+        return f"gemodel {' '.join(map(percent_text, shares))}"

@@ -1,0 +1,107 @@
+"""Periodic losses, by the packet's number in its flow."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from noack.impairments.feature import Behaviour, Impairment, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import (
+    DROPPED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    RuleStage,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.markov_chain import LONGEST_PATTERN, Pattern, pattern
+from noack.impairments.quantities import COUNT
+from noack.impairments.word_reader import WordReader
+
+_EXPECTED = "losses per packets, e.g. 2/100"
+
+
+@dataclass(slots=True, kw_only=True)
+class PeriodicStage(RuleStage):
+    """A periodic loss as numbers."""
+
+    period: int
+    burst: int
+    first: int
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: PeriodicStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Lose the packet if its number says so."""
+    number = decision.packet - stage.first
+    if number >= 0 and number % stage.period < stage.burst:
+        refuse(decision, DROPPED)
+
+
+def _read(reader: WordReader) -> Table:
+    """``periodic BURST/PERIOD [from NUMBER]``."""
+    found = re.fullmatch("([0-9]+)/([0-9]+)", reader.word(_EXPECTED))
+    if found is None:
+        reader.wrong(f"expected {_EXPECTED}")
+    burst, period = (reader.read(part, COUNT) for part in found.groups())
+    table: Table = {"burst": burst, "period": period}
+    if reader.accept("from"):
+        table["first"] = reader.value(COUNT)
+    return table
+
+
+class PeriodicLoss(LossModel):
+    """Of every ``period`` packets of a flow, ``burst`` consecutive ones are lost."""
+
+    model: Literal["periodic"] = "periodic"
+    period: Annotated[int, Field(ge=1, le=2**40)]
+    """Packets in a period."""
+    burst: Annotated[int, Field(ge=0, le=2**40)] = 1
+    """Losses in a period."""
+    first: Annotated[int, Field(ge=0, le=2**40)] = 0
+    """Number of the first packet that is lost."""
+
+    words: ClassVar = (
+        Word("periodic", "loss periodic 2/100", _read),
+        Word("from", "loss periodic 2/100 from 3", after="loss periodic BURST/PERIOD"),
+    )
+    behaviour: ClassVar = Behaviour(PeriodicStage, apply)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.burst > self.period:
+            raise ValueError(f"burst: must not exceed the period, {self.period}")
+        return self
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        numbers = ((3, 1, 0), (9, 3, 5), (4, 0, 0), (2, 2, 7))
+        return [cls(period=period, burst=burst, first=first) for period, burst, first in numbers]
+
+    def text(self) -> str:
+        first = f" from {self.first}" if self.first else ""
+        return f"periodic {self.burst}/{self.period}{first}"
+
+    def meaning(self) -> str:
+        first = f", from number {self.first} on" if self.first else ""
+        return f"loses {self.burst} consecutive packets of every {self.period} of a flow{first}"
+
+    def stage(self, tables: StageTables) -> PeriodicStage:
+        return PeriodicStage(period=self.period, burst=self.burst, first=self.first)
+
+    def chains(self) -> Sequence[Pattern]:
+        lost = range(self.first, self.first + min(self.burst, LONGEST_PATTERN))
+        return (pattern(self.period, (number % self.period for number in lost)),)
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return "losses by the packets' numbers"

@@ -1,0 +1,117 @@
+"""Losses that are written down, by the packet's number in its flow."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from noack.impairments.feature import Behaviour, Impairment, LossModel, StageTables, Table, Word
+from noack.impairments.link_records import (
+    DROPPED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    RuleStage,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.markov_chain import NotPredictableError, Pattern, pattern
+from noack.impairments.quantities import COUNT
+from noack.impairments.word_reader import WordReader
+
+MAX_SCRIPT = 10_000_000
+_EXPECTED = "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or none"
+
+
+@dataclass(slots=True, kw_only=True)
+class ScriptStage(RuleStage):
+    """A script as numbers: its place in the program's table of integers; they ascend."""
+
+    period: int
+    """0: played once."""
+    begin: int
+    end: int
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: ScriptStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Lose the packet if its number is in the script."""
+    numbers = program.integers
+    wanted = decision.packet % stage.period if stage.period > 0 else decision.packet
+    low, high = stage.begin, stage.end
+    while low < high:
+        middle = (low + high) // 2
+        if numbers[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    if low < stage.end and numbers[low] == wanted:
+        refuse(decision, DROPPED)
+
+
+def _read(reader: WordReader) -> Table:
+    """``script NUMBERS [every COUNT]``."""
+    table: Table = {"lost": [] if reader.accept("none") else reader.values(COUNT, _EXPECTED)}
+    if reader.accept("every"):
+        table["repeat_every"] = reader.value(COUNT)
+    return table
+
+
+class ScriptedLoss(LossModel):
+    """Exactly the named packets of each flow are lost, counted from 0."""
+
+    model: Literal["scripted"] = "scripted"
+    lost: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**40)], ...], Field(max_length=MAX_SCRIPT)]
+    """Numbers of the lost packets."""
+    repeat_every: Annotated[int, Field(ge=0, le=2**40)] = 0
+    """The script begins again after so many packets; 0 plays it once."""
+
+    words: ClassVar = (
+        Word("script", "loss script 3,4,17", _read),
+        Word("every", "loss script 3,4 every 20", after="loss script NUMBERS"),
+    )
+    behaviour: ClassVar = Behaviour(ScriptStage, apply)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if any(a >= b for a, b in pairwise(self.lost)):
+            raise ValueError("lost: the numbers must ascend")
+        if self.repeat_every and self.lost and self.lost[-1] >= self.repeat_every:
+            raise ValueError(f"repeat_every: the script is longer, up to {self.lost[-1]}")
+        return self
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        return [cls(lost=(0, 1, 2, 5, 8, 9)), cls(lost=(0, 1, 5), repeat_every=11), cls(lost=())]
+
+    def text(self) -> str:
+        every = f" every {self.repeat_every}" if self.repeat_every else ""
+        return f"script {','.join(map(str, self.lost)) or 'none'}{every}"
+
+    def meaning(self) -> str:
+        numbers = ", ".join(map(str, self.lost[:8])) + (", ..." if len(self.lost) > 8 else "")
+        again = f", and again every {self.repeat_every}" if self.repeat_every else ""
+        return f"loses the packets {numbers or '(none)'} of each flow{again}"
+
+    def stage(self, tables: StageTables) -> ScriptStage:
+        begin, end = tables.add_integers(self.lost)
+        return ScriptStage(period=self.repeat_every, begin=begin, end=end)
+
+    def chains(self) -> Sequence[Pattern]:
+        if not self.repeat_every:
+            raise NotPredictableError(
+                "a script that is played once loses the same packets however long a flow is"
+            )
+        return (pattern(self.repeat_every, self.lost),)
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return "losses by the packets' numbers"
