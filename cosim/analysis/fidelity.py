@@ -32,10 +32,11 @@ from cosim.simulation.continuous.continuous_run import (
 from cosim.simulation.continuous.plant_grid_loop import SampledLoop
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_format import percent
 from noack.protocol.record_tables import PLANT_STEP
 
 EXPLAINED = 0.1
-"""The share of the difference that may remain unexplained."""
+"""Largest residual, as a share of the difference, that counts as explained."""
 _ROUNDING = 1e-9
 """Relative to x: a difference below is rounding, and there is nothing to explain."""
 _NUDGE = 1e-13
@@ -45,7 +46,7 @@ _PARTED_PERIODS = 10
 _LARGEST = 1e100
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
 """A longer run is compared only if somebody asks: its end should not take longer than seconds."""
-_STAGES = ("sampling", "delay", "held actuation", "unexplained")
+_STAGES = ("sampling", "delay", "held actuation", "residual")
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Fidelity:
     """Live run minus the ideal loop."""
     stages: tuple[FidelityStage, ...]
     explained_relative: float
-    """RMS of what remains unexplained over the RMS of the whole difference."""
+    """RMS of the residual over the RMS of the whole difference."""
     events_ideal: int
     events_live: int
     max_event_difference_s: float | None
@@ -119,13 +120,12 @@ class Fidelity:
     def verdict(self) -> str:
         """One line for people."""
         if self._nothing_to_explain:
-            return "x is that of the ideal loop, to rounding"
+            return "x equals that of the ideal loop, to rounding"
         of_x = 100 * self.total.rms / self.rms_live
         shares = ", ".join(f"{stage.name} {percent(stage.share)}" for stage in self.stages[:-1])
         return (
-            f"x differs from the ideal loop by {of_x:.2g} % (RMS); of this {shares}; "
-            f"{100 * self.explained_relative:.2g} % unexplained"
-            + ("" if self.explained else ", which is too much")
+            f"x differs from the ideal loop by {of_x:.2g} % (RMS). Shares: {shares}. Residual "
+            f"{100 * self.explained_relative:.2g} %" + ("" if self.explained else ", too large")
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -252,13 +252,8 @@ def _ideal(
     return ideal
 
 
-def percent(share: float) -> str:
-    """A share for people, to a tenth of a per cent; the smallest have no sign."""
-    return f"{round(100 * share, 1) + 0.0:.1f} %"
-
-
 def is_against(share: float) -> bool:
-    """Whether a share, as people see it, takes away from what the others make."""
+    """Whether a share partly cancels the others, at the precision that is shown."""
     return round(100 * share, 1) < 0
 
 

@@ -140,8 +140,8 @@ def _signals(record: RunRecord, joined: AlignedRun) -> dict[str, Any]:
     largest = _or_none(np.max, residual[~np.isnan(residual)])
     scale = max(float(np.abs(joined.x_s).max(initial=0.0)), np.finfo(float).tiny)
     return {
-        "initial_state_norm": float(np.linalg.norm(states[0])) if len(states) else None,
-        "final_state_norm": float(np.linalg.norm(states[-1])) if len(states) else None,
+        "initial_state_norm": float(row_norms(states[:1])[0]) if len(states) else None,
+        "final_state_norm": float(row_norms(states[-1:])[0]) if len(states) else None,
         "sup_e_s_norm": _or_none(np.max, joined.e_s_norm),
         "sup_e_c_norm": _or_none(np.max, e_c_norm),
         "sup_e_c_at_s": _or_none(lambda e_c: common_s[np.argmax(e_c)], e_c_norm),

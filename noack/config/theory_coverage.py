@@ -95,7 +95,7 @@ class TheoryCoverage:
             )
 
     def require_exact(self) -> None:
-        """Check that the plant is linear and undisturbed, and that the sensor measures its state.
+        """Check that exact simulation covers the plant, the measurement and the trigger.
 
         Raises:
             CallerError: one of these is not so.
@@ -117,3 +117,5 @@ class TheoryCoverage:
                 "plant.measurement: needs a sensor without noise; "
                 "this scenario has noise_std or noise_bound"
             )
+        if (why := scenario.trigger.beyond_exact) is not None:
+            raise CallerError(why)

@@ -53,7 +53,7 @@ CLAIM = {
 }  # fmt: skip
 FIDELITY = {
     "reason": None, "explained": True, "explained_relative": 0.01, "rms_x": 0.1, "max_x": 0.2,
-    "rms_x_live": 1.0, "shares": {"sampling": 1.0, "unexplained": 0.0}, "events_ideal": 1,
+    "rms_x_live": 1.0, "shares": {"sampling": 1.0, "residual": 0.0}, "events_ideal": 1,
     "events_live": 1, "max_event_difference_s": None, "first_different_event": None,
 }  # fmt: skip
 KNOWN = Vocabulary(
