@@ -91,7 +91,7 @@ def written(
 
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
-    html = page(record.scenario, summarise(record, 0, "horizon") | more, [], "", {})
+    html = page(record.scenario, summarise(record, 0, "horizon").to_json() | more, [], "", {})
     found = Page(html)
     check(found, html)
     return found.text
