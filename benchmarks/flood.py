@@ -90,7 +90,7 @@ def flooded(case: Case, *, shielded: bool) -> Figures:
     settings += [] if case.asked else ["realtime.enabled=false"]
     with _environment(shielded):
         run = faulted_run(case.name, settings, BEGIN_S, partial(_flood, case))
-    shields = {report["channel"]["shielded"] for report in run.record.reports.values()}
+    shields = {report["channel"]["peer_sockets"] for report in run.record.reports.values()}
     if shields != {shielded}:
         raise MeasurementError(f"{case.name}: shielded {shields}, expected {shielded}")
     return figures_of(run)

@@ -196,6 +196,10 @@ def _why_failed(
     """Why a run that ended at its horizon failed; None if it did not fail."""
     if diverged is not None:
         return diverged.text
+    for notice in record.notices:
+        if notice["level"] == FAILED:
+            at_s = notice["t_ns"] * 1e-9
+            return f"the {notice['process']} failed at {at_s:g} s: {notice['text']}"
     # The last rows of a killed process do not count: a restarted process took its place.
     lacking = [f"{missing[table]:,} of {table}" for table in record.tables if missing[table] > 0]
     return f"rows are missing from the record: {', '.join(lacking)}" if lacking else None
