@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks._faulted_run import STEPS, FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, Figures, MeasurementError, Rounds, Row, say
-from cosim.analysis.run_summary import lateness_us
+from cosim.analysis.timing_statistics import lateness_us
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
 
@@ -73,7 +73,7 @@ def figures_of(run: FaultedRun[Flood]) -> Figures:
     return {
         "rate_hz": flood.rate_hz,
         "missed": np.setdiff1d(sent, record[SENSOR_MEASUREMENT]["sequence"]).size,
-        "lost": run.summary["lost_outside_netem"],
+        "lost": run.summary["unintended_losses"],
         "late_before_us": float(max(before)),
         "late_during_us": float(max(during)),
         "back_ms": 1e3 * run_recovery_s(record, end_s),

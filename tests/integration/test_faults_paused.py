@@ -79,7 +79,7 @@ def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == "recorder stopped responding"
     assert finished.summary["missing_samples"] == 0
-    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["unintended_losses"] == 0
     assert finished.summary["replay"]["bit_exact"]
     steps = load_record(finished.run_dir)["plant_step"]
     # All of the time that the plane was patient for, two seconds but for the last sign of life.
