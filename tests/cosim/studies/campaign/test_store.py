@@ -246,7 +246,7 @@ def test_a_manifest_that_is_none_is_one_line(
 ) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "campaign.json").write_text(text)
-    with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; give another --out"):
+    with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; give"):
         changed_folder(write, tmp_path / "out", plan)
 
 

@@ -114,7 +114,7 @@ def test_ctrl_c_ends_it_with_one_line_that_says_how_to_go_on(start: Start, tmp_p
     line = err.strip()
     done = len(files(tmp_path / "out"))
     assert line == (
-        f"noack: interrupted; {done} of 320 runs are in {tmp_path / 'out'}, "
+        f"noack: interrupted; {done} of 320 runs are in {tmp_path / 'out'}; "
         "the same command continues the campaign"
     )
     assert psutil.wait_procs(children, timeout=60)[1] == []
