@@ -47,6 +47,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     return [
         *([_closed_loop(loop)] if resolved.coverage.is_linear else _not_linear(loop, resolved)),
         *_trigger(loop, resolved),
+        *_control_law(resolved),
         *_protocol(resolved),
         *([_unstable_and_distinct(loop.A)] if resolved.coverage.is_linear else []),
         _mansd(resolved),
@@ -148,6 +149,18 @@ def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
         Assumption(
             "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", AssumptionStatus.VIOLATED,
             f'the policy is "{policy}": not covered by the theorems and the certificates',
+        )
+    ]  # fmt: skip
+
+
+def _control_law(resolved: Scenario) -> list[Assumption]:
+    if resolved.controller.is_linear:
+        return []
+    return [
+        Assumption(
+            "the input is u = K x_c", "eq:ModCont", AssumptionStatus.VIOLATED,
+            f'controller.kind = "{resolved.controller.kind}": the theorems and the certificates '
+            "do not cover it",
         )
     ]  # fmt: skip
 
