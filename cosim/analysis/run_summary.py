@@ -131,7 +131,7 @@ def _summarise(
         "diverged_at_s": None if diverged is None else diverged.at_s,
         "exit": {"status": int(exit_status), "reason": reason},
     }
-    if scenario.is_acknowledged:
+    if SENSOR_ACKNOWLEDGEMENT in record.tables:
         summary["acknowledgements"] = _acknowledgements(record)
     finite: Summary = _finite(summary)
     return finite
@@ -353,7 +353,7 @@ def _lost(record: RunRecord) -> dict[str, int]:
         ),
         "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
     }
-    if record.scenario.is_acknowledged:
+    if SENSOR_ACKNOWLEDGEMENT in record.tables:
         answers = crossing(record, Flow.ACKNOWLEDGEMENT)
         taken = record[CONTROLLER_DELIVERY]["sequence"]
         legs["acknowledgement to netem"] = (taken, answers.sequence)

@@ -33,12 +33,6 @@ ROUTES: Mapping[str, MessageRoute] = {
 SENDER: Mapping[str, str] = {leg.to: role for role, leg in ROUTES.items()}
 """From whom each process receives."""
 
-ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
-"""To whom each process sends acknowledgements, in the acknowledgement baseline alone."""
-
-ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
-"""From whom each process receives them."""
-
 LOOP_ROLES = tuple(ROUTES)
 PLANT = "plant"
 CHANGEABLE = ("sensor", "netem", "controller")

@@ -158,11 +158,7 @@ def _work(
     if campaign.time == "sampled":
         alone = in_virtual_time(scenario)
         return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
-    if resolved.is_acknowledged:
-        raise CallerError(
-            'network.protocol: continuous time is for the loop without acknowledgements, "none"; '
-            'with time = "sampled" a campaign runs both'
-        )
+    resolved.coverage.require_unacknowledged()
     _require_timeless(resolved)
     setting = replace(setting_of(resolved), Q=Q, R=R, settle=settle, most_events=most_events)
     return ContinuousWork(setting, box_of(scenario), campaign.seed), certified_error(resolved)

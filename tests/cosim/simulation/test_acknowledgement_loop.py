@@ -324,4 +324,4 @@ def test_settings_of_a_way_back_that_there_is_not_are_a_mistake() -> None:
 
 def test_a_way_back_is_of_no_effect_where_there_is_said_to_be_none() -> None:
     back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
-    assert not plain(*back).is_acknowledged
+    assert not plain(*back).protocol.acknowledges

@@ -156,7 +156,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(
         ),
         (
             {"settings": {"network.protocol": "ack"}},
-            "at policy = MB, beta = 0.1: network.protocol: continuous time is for the loop",
+            "at policy = MB, beta = 0.1: network.protocol: needs the loop without acknowledgements",
         ),
         ({"scenario": "none.toml"}, 'scenario = "none.toml": no such file'),
         ({"metrics": {"Q": [[1.0, 2.0], [0.0, 1.0]]}}, "metrics.Q: must be symmetric"),
