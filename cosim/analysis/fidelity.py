@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from cosim.analysis.step_schedule import IncomparableError, LiveRun, live_run
+from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import (
@@ -73,7 +74,7 @@ class FidelityStage:
     """Events with this effect, and all before it, in place."""
     max_event_difference_s: float | None
     """Largest difference in time to the same event in the stage before."""
-    parted_event: int | None
+    first_different_event: int | None
     """First event more than ten measurements from the stage before's, or that one of them lacks."""
 
 
@@ -98,7 +99,7 @@ class Fidelity:
     events_live: int
     max_event_difference_s: float | None
     """Between the ideal loop and the live run, over the events that both have."""
-    parted_event: int | None
+    first_different_event: int | None
     """First event that is more than ten measurements apart, or that one of the two lacks: from
     there on the same packet fates meet different events."""
     t_s: Vector
@@ -132,37 +133,33 @@ class Fidelity:
         figures = {k: v for k, v in asdict(self).items() if k not in ("t_s", "stage_norms")}
         return {**figures, "explained": self.explained, "verdict": self.verdict}
 
-    def compact(self) -> dict[str, Any]:
-        """The summary's share of it; ``docs/record.md`` documents the keys."""
-        return {
-            "explained": self.explained,
-            "explained_relative": self.explained_relative,
-            "rms_x": self.total.rms,
-            "max_x": self.total.max,
-            "rms_x_live": self.rms_live,
-            "shares": {stage.name.replace(" ", "_"): stage.share for stage in self.stages},
-            "events_ideal": self.events_ideal,
-            "events_live": self.events_live,
-            "max_event_difference_s": self.max_event_difference_s,
-            "parted_event": self.parted_event,
-            "reason": None,
-        }
+    def summary(self) -> FidelityPart:
+        """The part of the run's summary; ``docs/record.md`` explains the keys."""
+        return FidelityPart(
+            reason=None,
+            explained=self.explained,
+            explained_relative=self.explained_relative,
+            rms_x=self.total.rms,
+            max_x=self.total.max,
+            rms_x_live=self.rms_live,
+            shares={stage.name.replace(" ", "_"): stage.share for stage in self.stages},
+            events_ideal=self.events_ideal,
+            events_live=self.events_live,
+            max_event_difference_s=self.max_event_difference_s,
+            first_different_event=self.first_different_event,
+        )
 
 
-def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
-    """The comparison for a run's summary: all of it null but ``reason`` if there can be none."""
-    nothing: dict[str, Any] = dict.fromkeys(
-        ("explained", "explained_relative", "rms_x", "max_x", "rms_x_live", "shares",
-         "events_ideal", "events_live", "max_event_difference_s", "parted_event")
-    )  # fmt: skip
+def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
+    """The comparison for a run's summary, or the reason why there is none."""
     if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
-        return nothing | {"reason": "the run is long; `noack fidelity` compares it"}
+        return NoFidelityPart(reason="the run is long; `noack fidelity` compares it")
     try:
-        return compute_fidelity(record, _EVENTS_AT_THE_END).compact()
+        return compute_fidelity(record, _EVENTS_AT_THE_END).summary()
     except NoackError as error:
-        return nothing | {"reason": str(error)}
-    except Exception as error:  # whatever it is, the run itself went as it went
-        return nothing | {"reason": repr(error)}
+        return NoFidelityPart(reason=str(error))
+    except Exception as error:  # the run itself did not fail
+        return NoFidelityPart(reason=repr(error))
 
 
 def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
@@ -229,7 +226,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         events_ideal=len(ideal.event_s),
         events_live=len(live.event_s),
         max_event_difference_s=_largest(_apart(ideal.event_s, live.event_s)),
-        parted_event=_parted(ideal.event_s, live.event_s, part_s),
+        first_different_event=_parted(ideal.event_s, live.event_s, part_s),
         t_s=t_s,
         stage_norms=np.array([np.linalg.norm(effect, axis=1) for effect in effects]),
     )

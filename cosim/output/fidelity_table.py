@@ -25,7 +25,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
             percent(stage.share),
             str(stage.events),
             _milliseconds(stage.max_event_difference_s),
-            _event(stage.parted_event),
+            _event(stage.first_different_event),
         )
     table.add_section()
     table.add_row(
@@ -34,7 +34,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
         "100.0 %",
         str(fidelity.events_live),
         _milliseconds(fidelity.max_event_difference_s),
-        _event(fidelity.parted_event),
+        _event(fidelity.first_different_event),
     )
     console.print(table)
     console.print(_by_state(fidelity))

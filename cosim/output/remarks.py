@@ -1,7 +1,7 @@
 """Remarks on a run: what to know before trusting its numbers, a sentence each."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cosim.analysis.run_summary import Summary
 from cosim.output.run_tables import away, changes_in
@@ -24,7 +24,8 @@ def remarks(summary: Summary) -> Iterator[Remark]:
     violations = summary["assumption_violations"]
     for one in violations[:_MOST]:
         where = f"t = {one['t_s']:.3f} s (reported by {one['process']})"
-        yield Remark(f"assumption violated at {where}: {one['what']}", severe=True)
+        severe = one["cause"] in ("dropouts", "change")
+        yield Remark(f"assumption violated at {where}: {one['what']}", severe=severe)
     if len(violations) > _MOST:
         yield Remark(f"{len(violations) - _MOST} more violations of this kind", severe=True)
     if (summary.get("replay") or {}).get("bit_exact") is False:
@@ -49,9 +50,9 @@ def _warnings(summary: Summary) -> Iterator[str]:
     if summary["missing_samples"]:
         where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
         yield f"{summary['missing_samples']} samples are missing from the record: {where}"
-    if summary["lost_outside_netem"]:
-        where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
-        yield f"{summary['lost_outside_netem']} datagrams were lost elsewhere (kernel): {where}"
+    if summary["unintended_losses"]:
+        where = ", ".join(f"{n} on {leg}" for leg, n in summary["unintended_losses_by_leg"].items())
+        yield f"{summary['unintended_losses']} datagrams were lost elsewhere (kernel): {where}"
     for one in summary.get("restarts") or ():
         yield f"{one['process']} was restarted, {away(one)}; claims are void from then on"
     for when, what in changes_in(summary):
@@ -68,7 +69,6 @@ def _warnings(summary: Summary) -> Iterator[str]:
 
 def _was_late(summary: Summary) -> bool:
     """Whether claims are void because this machine was late."""
-    claims: list[dict[str, Any]] = summary.get("claims") or []
     undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
-    causes = [str(claim.get("why")) for claim in claims]
-    return undisturbed and any("felt after" in cause or " old" in cause for cause in causes)
+    causes = {one["cause"] for one in summary["assumption_violations"]}
+    return undisturbed and bool(causes & {"delay", "hold"})

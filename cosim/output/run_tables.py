@@ -73,13 +73,13 @@ def key_numbers(summary: Summary) -> Numbers:
         *_causes(summary),
         *_acknowledgements(summary.get("acknowledgements")),
         _longest_burst(summary),
-        ("loss bursts beyond M − 1", str(len(summary["assumption_violations"]))),
+        ("loss bursts beyond M − 1", str(_bursts_beyond_mansd(summary))),
         *_intervals(summary),
         *_norms(summary),
         ("numerical check of x_c − x_s (I1)", number(summary["identity_residual_relative"])),
         *_judged_until(summary.get("judged_until_s")),
         ("missing samples", str(summary["missing_samples"])),
-        ("lost elsewhere (kernel)", str(summary["lost_outside_netem"])),
+        ("lost elsewhere (kernel)", str(summary["unintended_losses"])),
         *_restarts(summary.get("restarts")),
         *changes_in(summary),
         *_watchdog(summary.get("watchdog")),
@@ -89,6 +89,10 @@ def key_numbers(summary: Summary) -> Numbers:
         *_replay_rows(summary.get("replay")),
         *summary_rows(summary.get("fidelity")),
     )  # fmt: skip
+
+
+def _bursts_beyond_mansd(summary: Summary) -> int:
+    return sum(one["cause"] == "dropouts" for one in summary["assumption_violations"])
 
 
 def _lost(summary: Summary) -> tuple[str, str]:

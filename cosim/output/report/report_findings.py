@@ -59,7 +59,7 @@ def _fidelity(found: Mapping[str, Any]) -> Iterator[str]:
 
 def _events(found: Mapping[str, Any]) -> str:
     counts = f"{found['events_live']} events, the ideal loop {found['events_ideal']}"
-    if (parted := found["parted_event"]) is not None:
+    if (parted := found["first_different_event"]) is not None:
         return (
             f"The run had {counts}. They agree up to event {parted}; from there on, the losses "
             "fall on other events."

@@ -7,13 +7,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.analysis.run_summary import latency_us, lateness_us
+from cosim.analysis.timing_statistics import latency_us, lateness_us
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.decimate import Reals
 from cosim.record.align import AlignedRun, join_all
 from cosim.record.estimation_error import true_states
-from cosim.record.packet_outcomes import crossing
+from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -89,7 +89,7 @@ def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
 
 
 def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
-    crossed = crossing(record)
+    crossed = packet_outcomes(record)
     measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
     events = measurements[measurements["event"] != NO_SEQUENCE]
     dropped = np.isin(events["event"], crossed.sequence[crossed.lost])

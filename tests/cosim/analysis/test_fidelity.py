@@ -62,7 +62,7 @@ def test_all_is_explained(fidelity: Fidelity) -> None:
     assert sum(stage.share for stage in fidelity.stages) == pytest.approx(1.0, rel=1e-9)
     assert fidelity.stages[2].events == fidelity.stages[3].events == fidelity.events_live
     assert fidelity.stages[3].max_event_difference_s == pytest.approx(0.0, abs=1e-9)
-    assert fidelity.stages[3].parted_event is None
+    assert fidelity.stages[3].first_different_event is None
 
 
 def test_the_figures_fit_together(fidelity: Fidelity) -> None:
@@ -192,7 +192,7 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
     """A sampled sensor that looks four times a second has fewer events than the paper's."""
     fidelity = compute_fidelity(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live
-    assert fidelity.parted_event is not None
+    assert fidelity.first_different_event is not None
     assert fidelity.explained_relative < 1e-9
 
 

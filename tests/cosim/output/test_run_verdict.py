@@ -99,7 +99,12 @@ def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) ->
 
 
 def test_what_breaks_the_guarantee_is_unmistakable(outcome: Outcome) -> None:
-    broken = {"t_s": 2.5, "process": "controller", "what": "MANSD violated: 6 lost"}
+    broken = {
+        "t_s": 2.5,
+        "process": "controller",
+        "cause": "dropouts",
+        "what": "MANSD violated: 6 lost",
+    }
     text = printed(outcome, assumption_violations=[broken] * 7)
     assert text.count("assumption violated at t = 2.500 s (reported by controller): MANSD") == 5
     assert "2 more violations of this kind" in text

@@ -82,7 +82,7 @@ def written(
     record: RunRecord, run_dir: Path, envelopes: Any = (), **more: Any
 ) -> tuple[Page, str, dict[str, Any]]:
     (run_dir / "scenario.toml").write_text(scenario_toml(record.scenario), encoding="utf-8")
-    summary = summarise(record, 0, "horizon") | more
+    summary = summarise(record, 0, "horizon").to_json() | more
     path = write_report(record, summary, run_dir, envelopes)
     html = path.read_text(encoding="utf-8")
     assert html.startswith("<!DOCTYPE html>")
@@ -91,7 +91,7 @@ def written(
 
 def shown(record: RunRecord, **more: Any) -> str:
     """The text of a report without figures, which take most of the time."""
-    html = page(record.scenario, summarise(record, 0, "horizon") | more, [], "", {})
+    html = page(record.scenario, summarise(record, 0, "horizon").to_json() | more, [], "", {})
     found = Page(html)
     check(found, html)
     return found.text
@@ -171,7 +171,7 @@ def test_what_the_user_writes_is_text(content: dict[str, Any], tmp_path: Path) -
         exit={"status": 1, "reason": HOSTILE},
         claims=[dict.fromkeys(("what", "source", "bound", "verdict", "why"), HOSTILE)],
         assumptions=[dict.fromkeys(("what", "source", "verdict", "why"), HOSTILE)],
-        assumption_violations=[{"t_s": 1.0, "process": HOSTILE, "what": HOSTILE}],
+        assumption_violations=[dict.fromkeys(("process", "cause", "what"), HOSTILE) | {"t_s": 1.0}],
         fidelity=dict.fromkeys(fidelity()) | {"reason": HOSTILE},
         replay={"bit_exact": None, "error": HOSTILE},
         rejected_datagrams={HOSTILE: {HOSTILE: 3}},
@@ -190,7 +190,7 @@ def fidelity(**changed: Any) -> dict[str, Any]:
     return {
         "explained": True, "explained_relative": 1e-9, "rms_x": 0.25, "max_x": 0.5,
         "rms_x_live": 2.0, "shares": shares, "events_ideal": 31, "events_live": 30,
-        "max_event_difference_s": 0.0125, "parted_event": None, "reason": None,
+        "max_event_difference_s": 0.0125, "first_different_event": None, "reason": None,
     } | changed  # fmt: skip
 
 
@@ -213,7 +213,7 @@ def test_the_difference_to_the_ideal_loop_is_explained(record: RunRecord) -> Non
     assert "Replay" not in text
     shares = {"sampling": 1.0, "delay": -1e-9, "held_actuation": 0.0, "residual": 0.0}
     text = shown(record, fidelity=fidelity(explained=False, explained_relative=0.4,
-                                           shares=shares, parted_event=7))  # fmt: skip
+                                           shares=shares, first_different_event=7))  # fmt: skip
     assert "do not explain the difference" in text
     assert "the residual is 40 % of the difference, which is too large" in text
     assert "They agree up to event 7" in text
