@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from noack.config.controllers import AnyController
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
-from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.network_section import NetworkSection
 from noack.config.triggers import AnyTrigger
 from noack.impairments.link_settings import Mansd, require_scores
@@ -23,7 +23,7 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     LOSS: TypeAdapter(Loss),
     MANSD: TypeAdapter(Mansd),
     "trigger": TypeAdapter(AnyTrigger),
-    "controller": TypeAdapter(ControllerSection),
+    "controller": TypeAdapter(AnyController),
 }
 """The parts of a scenario that may change during a run."""
 
@@ -40,7 +40,7 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
     Raises:
         ValueError: a key is not a runtime parameter, or the scenario would be invalid.
     """
-    if scenario.is_acknowledged:
+    if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
     require_runtime_parameters(settings, scenario.trigger)
     sections = {key.split(".")[0] for key in settings} - {"network"}

@@ -41,10 +41,12 @@ class TheoryCoverage:
     def beyond_theory(self) -> str | None:
         """The first setting that the theorems and certificates do not cover; None if all are."""
         scenario = self.scenario
-        if scenario.is_acknowledged:
+        if scenario.protocol.acknowledges:
             return 'network.protocol = "ack": updates are acknowledged'
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
+        if not scenario.controller.is_linear:
+            return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
         if scenario.plant.disturbances:
             kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
             return f"plant.disturbances ({kinds}): the plant is disturbed"
@@ -62,7 +64,7 @@ class TheoryCoverage:
         Raises:
             CallerError: this is the acknowledgement baseline.
         """
-        if self.scenario.is_acknowledged:
+        if self.scenario.protocol.acknowledges:
             raise CallerError(
                 'network.protocol: needs the loop without acknowledgements, "none"; '
                 'this scenario has "ack"'
@@ -95,13 +97,18 @@ class TheoryCoverage:
             )
 
     def require_exact(self) -> None:
-        """Check that exact simulation covers the plant, the measurement and the trigger.
+        """Check that exact simulation covers the plant, controller, measurement and trigger.
 
         Raises:
             CallerError: one of these is not so.
         """
         self.require_linear()
         scenario = self.scenario
+        if not scenario.controller.is_linear:
+            raise CallerError(
+                'controller.kind: needs the controller u = K x_c, "linear"; '
+                f'this scenario has "{scenario.controller.kind}"'
+            )
         if scenario.plant.disturbances:
             kinds = ", ".join(f'"{one.kind}"' for one in scenario.plant.disturbances)
             raise CallerError(

@@ -17,7 +17,7 @@ from tests.netem import any_settings
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
 
 CLIENTS = 3
-DECIDED = ("packet", "fate", "run", "hold_back_ns", "bit", "copy_bit")
+DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_bit")
 
 
 def replayed(
