@@ -26,6 +26,7 @@ from noack.config.observers import AnyObserver
 from noack.config.scenario import Scenario
 from noack.config.scenario_file import json_schema, load
 from noack.config.triggers import POLICIES
+from noack.controllers.controller_settings import ControllerSettings
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
