@@ -22,7 +22,7 @@ from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.four_state import FourStateLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.lossless import NoLoss
-from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.trace import TraceLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
@@ -215,28 +215,28 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("jitter 5ms", "jitter: goes right after delay TIME"),
         ("d 5ms", "d: words are not shortened; did you mean delay or drop or duplicate?"),
         ("loss gemodle 1%", "loss gemodle: no such word; did you mean gemodel?"),
-        ("loss", "loss: expected after it: a percentage, e.g. 5%, or one of random, state,"),
+        ("loss", "loss: a value is missing: a percentage, e.g. 5%, or one of random, state,"),
         ("loss 5 %", "%: no such word; expected one of"),
         ("loss 101%", "loss 101%: expected a percentage from 0% to 100%, e.g. 5%"),
         ("loss -1%", "loss -1%: no such word; expected one of"),
         ("loss nan%", "loss nan%: no such word; did you mean none?"),
         ("loss 5% 100%", "loss 5% 100%: expected a correlation from 0% to below 100%, e.g. 25%"),
-        ("loss random", "loss random: expected after it: a percentage from 0% to 100%"),
+        ("loss random", "loss random: a value is missing: a percentage from 0% to 100%"),
         ("loss state 90% 20% 81%", "loss state 90% 20% 81%: p31: p31 + p32 must not exceed 1"),
         ("loss burst 90% 2", "loss burst 90% 2: mean_burst: so much loss needs longer bursts"),
         ("loss periodic 2", "loss periodic 2: expected losses per packets, e.g. 2/100"),
         ("loss periodic 3/2", "loss periodic 3/2: burst: must not exceed the period, 2"),
         ("loss script 3,2", "loss script 3,2: lost: the numbers must ascend"),
         ("loss script 3,x", "loss script 3,x: expected the numbers of the lost packets"),
-        ("loss trace", "loss trace: expected after it: a file of zeros and ones"),
-        ("delay", "delay: expected after it: a time in s, ms, us or ns, e.g. 10ms"),
+        ("loss trace", "loss trace: a value is missing: a file of zeros and ones"),
+        ("delay", "delay: a value is missing: a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 10mm", "delay 10mm: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay -1ms", "delay -1ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 2h", "delay 2h: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 4000s", "delay 4000s: delay_s should be less than or equal to 3600"),
         ("delay 1e999ms", "delay 1e999ms: expected a time in s, ms, us or ns, e.g. 10ms"),
         ("delay 1e99999999999999999999ms", "ms: expected a time in s, ms, us or ns, e.g. 10ms"),
-        ("delay 1ms distribution", "expected after it: one of uniform, normal, pareto, paretono"),
+        ("delay 1ms distribution", "a value is missing: one of uniform, normal, pareto, paretono"),
         ("delay 1ms distribution normal", "distribution normal: has no effect without jitter"),
         (
             "delay 1ms 1ms distribution normal distribution pareto",
@@ -246,7 +246,7 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("delay 1ms loss 5% lossrel 5%", "lossrel: goes right after delay TIME"),
         ("delay 1ms samples 1,2", "delay 1ms samples 1,2: expected delays with their units"),
         ("delay 1ms samples 1ms", "samples 1ms: samples_s should have at least 2 items"),
-        ("delay 1ms reorder", "reorder: expected after it: a percentage"),
+        ("delay 1ms reorder", "reorder: a value is missing: a percentage"),
         ("reorder 25%", "reorder 25%: nothing before it delays a packet; it goes after delay"),
         (
             "delay 1ms gap 5 reorder 25%",
@@ -265,7 +265,7 @@ def test_rates_are_read_as_tc_reads_them(text: str, rate_bps: int) -> None:
         ("blackout 2s", "blackout 2s: expected intervals of time, e.g. 2s-3s,5s-5500ms"),
         ("blackout 3s-2s", "blackout 3s-2s: intervals_s: each must end after it begins"),
         ("blackout 1s-3s every 2s", "every_s: the intervals last longer, until 3 s"),
-        ("mansd", "mansd: expected after it: a whole number, e.g. 5"),
+        ("mansd", "mansd: a value is missing: a whole number, e.g. 5"),
         ("mansd -1", "mansd -1: expected a whole number, e.g. 5"),
         ("mansd 1000001", "mansd 1000001: mansd should be less than or equal to 1000000"),
         ("mansd 4 mansd 4", "mansd: given twice"),
