@@ -11,7 +11,7 @@ import psutil
 
 from benchmarks._report import MeasurementError
 from benchmarks.soak.watch import MODULES
-from cosim.analysis.run_summary import lateness_us, summarise
+from cosim.analysis.timing_statistics import lateness_us, summarise
 from cosim.cli import find_scenario
 from cosim.live.launcher import Watcher, launch
 from cosim.record.run_record import RunRecord, load_record
@@ -81,7 +81,7 @@ def faulted_run(
         if ending.status != ExitStatus.OK or ending.startup_s is None or not outcomes:
             raise MeasurementError(f"{name}: the run ended: {ending.reason}")
         record = load_record(ending.run_dir)
-        summary = summarise(record, ending.status, ending.reason)
+        summary = summarise(record, ending.status, ending.reason).to_json()
     back_s = backs_s[0] if backs_s else None
     return FaultedRun(record, summary, begun_s + ending.startup_s, outcomes[0], back_s)
 

@@ -18,7 +18,7 @@ def rows_of(summary: Mapping[str, Any]) -> list[Row]:
     nothing = Goal("==", 0)
     return [
         Row("missing samples", summary["missing_samples"], "samples", goal=nothing),
-        Row("lost outside netem", summary["lost_outside_netem"], "datagrams", goal=nothing),
+        Row("lost outside netem", summary["unintended_losses"], "datagrams", goal=nothing),
         Row("plant steps within one period", in_time, "%", goal=Goal(">=", 99.9)),
         *(Row(f"plant lateness, {name}", late[name], "µs") for name in ("p50", "p99", "max")),
     ]

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks._faulted_run import STEPS, FaultedRun, Processes, faulted_run, run_recovery_s
 from benchmarks._flood import Flood
 from benchmarks._report import Benchmark, Figures, MeasurementError, Rounds, Row, say
-from cosim.analysis.run_summary import lateness_us
+from cosim.analysis.timing_statistics import lateness_us
 from noack.protocol.record_tables import PLANT_STEP, SENSOR_MEASUREMENT
 from noack.protocol.topology import LOOP_ROLES
 
@@ -73,7 +73,7 @@ def figures_of(run: FaultedRun[Flood]) -> Figures:
     return {
         "rate_hz": flood.rate_hz,
         "missed": np.setdiff1d(sent, record[SENSOR_MEASUREMENT]["sequence"]).size,
-        "lost": run.summary["lost_outside_netem"],
+        "lost": run.summary["unintended_losses"],
         "late_before_us": float(max(before)),
         "late_during_us": float(max(during)),
         "back_ms": 1e3 * run_recovery_s(record, end_s),
@@ -90,7 +90,7 @@ def flooded(case: Case, *, shielded: bool) -> Figures:
     settings += [] if case.asked else ["realtime.enabled=false"]
     with _environment(shielded):
         run = faulted_run(case.name, settings, BEGIN_S, partial(_flood, case))
-    shields = {report["channel"]["shielded"] for report in run.record.reports.values()}
+    shields = {report["channel"]["peer_sockets"] for report in run.record.reports.values()}
     if shields != {shielded}:
         raise MeasurementError(f"{case.name}: shielded {shields}, expected {shielded}")
     return figures_of(run)

@@ -1,22 +1,33 @@
-"""The controller: runs the model x_c, reset only by the updates that survive (eq:ModCont).
+"""The controller: runs the model x_c, reset only by the updates that are delivered (eq:ModCont).
 
-An update in → x_c ← e^{H(t−t_i)} x(t_i), so that a late packet still restores x_c = x_s. Every
-tick: u = K x_c out, or a declared safe input as long as it knows no state: until its first update,
-if it does not know x(0). The model's time advances with ticks and updates and never runs backward:
-an update older than the last tick is propagated to it; one that is newer takes the model with it.
+At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late packet still restores x_c = x_s. At every
+tick it sends the input of its control law, u = K x_c unless the scenario names another law. Before
+its first update it sends a declared safe input, unless it knows x(0). The model's time advances
+with ticks and updates and never runs backward: an update older than the last tick is propagated to
+the tick; a newer one advances the model.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from noack.config.parameter_changes import ChangeSchedule, ParameterChange
 from noack.config.resolution import loop_of, setpoint_of
 from noack.config.scenario import Scenario
+from noack.controllers.controller_settings import ControlFailedError, ControlLaw, ControlModel
+from noack.core.clock import NS_PER_S
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.core.model_flow import ModelFlow
-from noack.protocol.machine_interface import BEGINNING, GENERATION, Notice, Output, Record, Start
+from noack.protocol.machine_interface import (
+    BEGINNING,
+    FAILED,
+    GENERATION,
+    Notice,
+    Output,
+    Record,
+    Start,
+)
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_SETTING, CONTROLLER_STEP
 from noack.protocol.wire_format import NO_VECTOR, Flow, Message
 
@@ -26,25 +37,27 @@ class Controller:
 
     Args:
         H: what the model integrates between updates, shape (n, n), per second.
-        K: gain, shape (m, n).
+        law: the control law.
+        inputs: m.
         period_ns: time between two control inputs.
         phase_ns: time of the first.
         horizon_ns: no tick is due after this time.
-        mansd: M − 1; more successive dropouts than this violate the assumption.
+        mansd: M − 1; more consecutive losses violate the assumption.
         x0: the state that sensor and controller both know at t = 0; None if they do not.
         acknowledges: whether it acknowledges the updates that it takes, as the baseline does.
-        start: where in the run it takes up its work.
-        safe_input: what it puts out while it knows no state, shape (m,); by default 0.
-        predictive: whether an actuation carries x_c, too, for the plant to go on with.
+        start: from where in the run it works.
+        safe_input: the input while it knows no state, shape (m,); by default 0.
+        predictive: whether an actuation carries x_c, too, for the plant's watchdog.
         setpoint: x_r and u_r, shapes (n,) and (m,): u = K(x_c − x_r) + u_r; None is 0.
-        schedule: what it knows of changes; None if there are none.
+        schedule: the announced changes of its settings; None if they cannot change.
     """
 
     def __init__(
         self,
         H: Matrix,
-        K: Matrix,
+        law: ControlLaw,
         *,
+        inputs: int,
         period_ns: int,
         phase_ns: int,
         horizon_ns: int,
@@ -63,21 +76,21 @@ class Controller:
         self._schedule = schedule
         self._reached_ns = -1
         self._newest_ns = 0
-        self._K = K
+        self._law: ControlLaw | None = law
         self._period_ns = period_ns
         self._phase_ns = phase_ns
         self._horizon_ns = horizon_ns
         self._mansd = mansd
         self._known_start = x0 is not None
         self._acknowledges = acknowledges
-        self._safe_input = np.zeros(len(K)) if safe_input is None else safe_input
+        self._safe_input = np.zeros(inputs) if safe_input is None else safe_input
         self._predictive = predictive
         self._knows_state = x0 is not None
         self._inputs = self._first_number = start.first_number
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
-        # What went by before a restart, nobody knows.
+        # After a restart the updates before it are unknown.
         self._newest: int | None = None if start.is_restart else -1
-        # A model without a state waits for the first tick, which is on record, as its start is not.
+        # A model without a state starts at the first tick, which is recorded; its start is not.
         self._model_ns = phase_ns + self._step * period_ns if start.is_restart else 0
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
 
@@ -87,32 +100,33 @@ class Controller:
         return t_ns if t_ns <= self._horizon_ns else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Take a change; it is in force from the first tick on that is not before T.
+        """Schedule a change; it takes effect at the first tick that is not before its time T.
 
-        x_c follows another set-point from T itself on.
+        x_c follows another set point from T itself on.
         """
         if self._schedule is None:
             raise CallerError("this controller's settings cannot be changed")
-        number = self._inputs
-        said = self._schedule.announce(CONTROLLER_SETTING, change, number, now_ns, self._reached_ns)
+        outputs = self._schedule.announce(
+            CONTROLLER_SETTING, change, self._inputs, now_ns, self._reached_ns
+        )
         self._inputs += 1
-        return said
+        return outputs
 
     def _change(self, t_ns: int) -> None:
-        """Apply what is in force at a time."""
-        while self._schedule is not None and (found := self._schedule.take(t_ns)) is not None:
-            self._mansd = found.scenario.network.mansd
-            self._setpoint = found.prepared
-            self._flow.change(found.since_ns, self._setpoint and self._setpoint[0])
+        """Apply the changes that are due at a time."""
+        while self._schedule is not None and (due := self._schedule.take(t_ns)) is not None:
+            self._mansd = due.scenario.network.mansd
+            self._setpoint = due.prepared
+            self._flow.change(due.since_ns, self._setpoint and self._setpoint[0])
 
     def _allowed(self, since_ns: int, now_ns: int) -> int:
-        """The most successive dropouts that any cap allows that was in force since a time."""
+        """The largest cap on consecutive losses that was in force since a time."""
         if self._schedule is None:
             return self._mansd
         return max(one.network.mansd for one in self._schedule.between(since_ns, now_ns))
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Take an update x(t_i); count the dropouts before it from the sequence numbers."""
+        """Process an update x(t_i); count the losses before it from the sequence numbers."""
         event_ns = message.t_ns
         model_ns = max(self._model_ns, event_ns)
         if self._schedule is not None and self._schedule.next_ns is not None:
@@ -122,40 +136,41 @@ class Controller:
         self._model_ns = self._reached_ns = model_ns
         self._knows_state = True
         newest, self._newest = self._newest, message.sequence
-        dropouts = 0 if newest is None else _between(newest, message.sequence)
+        losses = 0 if newest is None else _between(newest, message.sequence)
         row = (
             self._count(), message.sequence, event_ns, now_ns, model_ns,
-            message.vector, before, self.x_c, dropouts,
+            message.vector, before, self.x_c, losses,
         )  # fmt: skip
         outputs: list[Output] = [Record(CONTROLLER_DELIVERY, row)]
         if self._acknowledges:
             answer = Message(Flow.ACKNOWLEDGEMENT, message.sequence, event_ns, NO_VECTOR)
             outputs.insert(0, answer)
+        _, failed = self._apply(
+            event_ns, lambda law: law.update(event_ns / NS_PER_S, message.vector)
+        )
         newest_ns, self._newest_ns = self._newest_ns, event_ns
-        allowed = self._mansd
-        if dropouts > allowed:  # they may have been allowed when they happened
+        return [*outputs, *failed, *self._violations(message, newest, losses, newest_ns, now_ns)]
+
+    def _violations(
+        self, message: Message, newest: int | None, losses: int, newest_ns: int, now_ns: int
+    ) -> Sequence[Notice]:
+        """Compare the losses before an update with the cap that was in force."""
+        event_ns, allowed = message.t_ns, self._mansd
+        if losses > allowed:  # a larger cap may have been in force when they happened
             allowed = self._allowed(newest_ns, max(now_ns, event_ns))
-        if dropouts > allowed:
-            outputs.append(
-                Notice(
-                    event_ns,
-                    "violation",
-                    f"MANSD violated: {dropouts} successive dropouts before update "
-                    f"{message.sequence}, at most {allowed} assumed",
-                )
+        if losses > allowed:
+            text = (
+                f"MANSD violated: {losses} successive dropouts before update "
+                f"{message.sequence}, at most {allowed} assumed"
             )
-        elif newest == -1 and dropouts > 0 and not self._known_start:
-            outputs.append(
-                Notice(
-                    event_ns,
-                    "violation",
-                    f"no delivered t_0: {dropouts} updates were lost before the first delivery",
-                )
-            )
-        return outputs
+        elif newest == -1 and losses > 0 and not self._known_start:
+            text = f"no delivered t_0: {losses} updates were lost before the first delivery"
+        else:
+            return ()
+        return (Notice(event_ns, "violation", text),)
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
-        """Advance x_c to the tick and put out u = K x_c, with the model's time."""
+        """Advance x_c to the tick and send the control input, with the model's time."""
         step, t_ns = self._step, self._phase_ns + self._step * self._period_ns
         if self._schedule is not None and self._schedule.next_ns is not None:
             self._change(max(t_ns, self._model_ns))
@@ -164,20 +179,30 @@ class Controller:
             self._model_ns = t_ns
         self._reached_ns = self._model_ns
         self._step += 1
-        u = self._input() if self._knows_state else self._safe_input
+        u: Vector = self._safe_input
+        failed: Sequence[Notice] = ()
+        if self._knows_state:
+            u, failed = self._apply(
+                t_ns, lambda law: law.input(t_ns / NS_PER_S, self.x_c, self._setpoint)
+            )
         number = self._first_number + step
         row = (self._count(), number, t_ns, now_ns, self._model_ns, self.x_c, u)
         carried = np.concatenate([u, self.x_c]) if self._predictive else u
         actuation = Message(Flow.ACTUATION, number, self._model_ns, carried)
-        return (actuation, Record(CONTROLLER_STEP, row))
+        return (actuation, Record(CONTROLLER_STEP, row), *failed)
 
-    def _input(self) -> Vector:
-        """The control law, of the set-point in force."""
-        u: Vector = self._K @ self.x_c
-        if self._setpoint is not None:
-            x_r, u_r = self._setpoint
-            u = self._K @ (self.x_c - x_r) + u_r
-        return u
+    def _apply(
+        self, t_ns: int, method: Callable[[ControlLaw], Vector | None]
+    ) -> tuple[Vector, Sequence[Notice]]:
+        """Call the control law; after its first failure, the input is the safe input."""
+        if self._law is None:
+            return self._safe_input, ()
+        try:
+            u = method(self._law)
+        except ControlFailedError as error:
+            self._law = None
+            return self._safe_input, (Notice(t_ns, FAILED, str(error)),)
+        return (self._safe_input if u is None else u), ()
 
     def _count(self) -> int:
         self._inputs += 1
@@ -185,19 +210,30 @@ class Controller:
 
 
 def _between(newest: int, sequence: int) -> int:
-    """How many updates the sensor has sent between two; before its restart nobody knows."""
-    again = sequence // GENERATION != newest // GENERATION
-    return sequence % GENERATION if again else sequence - newest - 1
+    """The number of updates between two; those before a restart of the sensor are unknown."""
+    restarted = sequence // GENERATION != newest // GENERATION
+    return sequence % GENERATION if restarted else sequence - newest - 1
+
+
+def law_of(resolved: Scenario) -> ControlLaw:
+    """Return the control law of a resolved scenario.
+
+    Raises:
+        CallerError: the user's class does not exist, raises, or lacks what it must offer.
+    """
+    loop, period_s = loop_of(resolved), resolved.timing.controller_period_ns / NS_PER_S
+    return resolved.controller.law(ControlModel(loop.A_model, loop.B_model, loop.K, period_s))
 
 
 def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
-    """Return the controller of a resolved scenario; of the plant it learns x(0) at the most."""
+    """Return the controller of a resolved scenario; of the plant it knows at most x(0)."""
     loop = loop_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input = resolved.controller.safe_input
     return Controller(
         loop.H,
-        loop.K,
+        law_of(resolved),
+        inputs=loop.m,
         period_ns=resolved.timing.controller_period_ns,
         phase_ns=resolved.timing.controller_phase_ns,
         horizon_ns=resolved.timing.horizon_ns,

@@ -1,6 +1,7 @@
 """Files that come with noack, found by name: scenarios and campaigns."""
 
 import difflib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,9 @@ KINDS = ("scenarios", "campaigns")
 
 _SCHEMA = "#:schema"
 """The line that tells an editor where the schema lies, which is not beside a copy."""
+
+_FILE = re.compile(r'^file = "([\w.]+\.py)"$', re.MULTILINE)
+"""A file beside a scenario, which a copy of the scenario names by its absolute path."""
 
 
 class ShippedFile(NamedTuple):
@@ -67,8 +71,10 @@ def text_of(name: str) -> str:
     """
     for folder in KINDS:
         if name in shipped_names(folder):
-            lines = _path_of(name, folder).read_text(encoding="utf-8").splitlines(keepends=True)
-            return "".join(line for line in lines if not line.startswith(_SCHEMA))
+            path = _path_of(name, folder)
+            lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+            text = "".join(line for line in lines if not line.startswith(_SCHEMA))
+            return _FILE.sub(rf'file = "{path.absolute().parent}/\1"', text)
     names = [known for folder in KINDS for known in shipped_names(folder)]
     raise CallerError(f"{name}: nothing of that name is shipped; {_hint(name, names)}")
 

@@ -15,7 +15,7 @@ from noack.core.linear_systems import Matrix, Propagator, Vector, norm
 from noack.protocol.machine_interface import Output, Record
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_ACKNOWLEDGEMENT, SENSOR_MEASUREMENT
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_policy import Policy, Trigger
+from noack.trigger.trigger_policy import Policy, new_trigger
 
 
 class AcknowledgedSensor(FixedMachine):
@@ -45,7 +45,7 @@ class AcknowledgedSensor(FixedMachine):
         first_number: int = 0,
     ) -> None:
         self._propagate = Propagator(H, () if period_ns is None else (period_ns,))
-        self._trigger = Trigger(policy)
+        self._trigger = new_trigger(policy)
         self._weight = policy.weight
         self._timeout_ns = timeout_ns
         self._model_ns = 0

@@ -15,7 +15,7 @@ from noack.core.model_flow import ModelFlow
 from noack.protocol.machine_interface import BEGINNING, Notice, Output, Record, Start
 from noack.protocol.record_tables import NO_SEQUENCE, SENSOR_MEASUREMENT, SENSOR_SETTING
 from noack.protocol.wire_format import Flow, Message
-from noack.trigger.trigger_policy import Policy, Trigger
+from noack.trigger.trigger_policy import Policy, new_trigger
 from sensor_node.acknowledged_sensor import AcknowledgedSensor
 from sensor_node.observing_sensor import ObservingSensor, observer_of
 
@@ -51,7 +51,7 @@ class Sensor:
         self._flow = ModelFlow(H, () if period_ns is None else (period_ns,), setpoint)
         self._schedule = schedule
         self._reached_ns = -1
-        self._trigger = Trigger(policy)
+        self._trigger = new_trigger(policy)
         self._weight = policy.weight
         self._model_ns = 0
         self._inputs = first_number

@@ -18,6 +18,7 @@ from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import DecidedLink, Network, Shuttle, simulate
 from noack.config.resolution import resolve
 from noack.config.scenario_file import load
+from noack.controllers.linear_feedback import LinearFeedback
 from noack.core.linear_systems import Matrix, Vector
 from noack.plants.linear import LinearSystem
 from noack.protocol.machine_interface import Machine, Notice, Record
@@ -113,7 +114,8 @@ class Case(NamedTuple):
             Sensor(self.H, DecayingTrigger(self.beta, 0.5), known, period_ns=PERIOD_NS),
             Controller(
                 self.H,
-                self.K,
+                LinearFeedback(self.K),
+                inputs=len(self.K),
                 period_ns=PERIOD_NS,
                 phase_ns=self.phase_ns,
                 horizon_ns=horizon_ns,
@@ -295,7 +297,8 @@ def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
     sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # never an event
     controller = Controller(
         H,
-        np.array([[k]]),
+        LinearFeedback(np.array([[k]])),
+        inputs=1,
         period_ns=PERIOD_NS,
         phase_ns=0,
         horizon_ns=STEPS * PERIOD_NS,

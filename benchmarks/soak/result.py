@@ -102,7 +102,7 @@ class Result:
         """Everything, for ``--json``."""
         kept = (
             "exit", "events", "deliveries", "drops", "longest_loss_burst", "missing_samples",
-            "lost_outside_netem", "replay", "lateness_us", "reached_s", "horizon_s", "speed",
+            "unintended_losses", "replay", "lateness_us", "reached_s", "horizon_s", "speed",
         )  # fmt: skip
         return {
             "name": self.name,

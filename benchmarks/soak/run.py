@@ -243,8 +243,7 @@ def ended_badly(
         faults.append(f"exit status {status}: {summary['exit']['reason']}")
     for key, right in (
         ("missing_samples", 0),
-        ("lost_outside_netem", 0),
-        ("assumption_violations", []),
+        ("unintended_losses", 0),
         (
             "rejected_datagrams",
             {"controller": {"stale": delivered_out_of_order}} if delivered_out_of_order else {},
@@ -252,6 +251,9 @@ def ended_badly(
     ):
         if summary[key] != right:
             faults.append(f"{key}: {summary[key]}")
+    bursts = [one for one in summary["assumption_violations"] if one["cause"] == "dropouts"]
+    if bursts:
+        faults.append(f"assumption_violations: {bursts}")
     replay = summary["replay"] or {}
     if not (replay.get("bit_exact") and replay.get("complete")):
         faults.append(f"the replay: {replay}")

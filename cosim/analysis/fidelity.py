@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from cosim.analysis.step_schedule import IncomparableError, LiveRun, live_run
+from cosim.analysis.summary_model import FidelityPart, NoFidelityPart
 from cosim.record.run_record import RunRecord
 from cosim.simulation.continuous.continuous_loop import ContinuousLoop, continuous_loop_of
 from cosim.simulation.continuous.continuous_run import (
@@ -31,10 +32,11 @@ from cosim.simulation.continuous.continuous_run import (
 from cosim.simulation.continuous.plant_grid_loop import SampledLoop
 from noack.core.errors import NoackError
 from noack.core.linear_systems import Matrix, Vector
+from noack.core.number_format import percent
 from noack.protocol.record_tables import PLANT_STEP
 
 EXPLAINED = 0.1
-"""The share of the difference that may remain unexplained."""
+"""Largest residual, as a share of the difference, that counts as explained."""
 _ROUNDING = 1e-9
 """Relative to x: a difference below is rounding, and there is nothing to explain."""
 _NUDGE = 1e-13
@@ -44,7 +46,7 @@ _PARTED_PERIODS = 10
 _LARGEST = 1e100
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
 """A longer run is compared only if somebody asks: its end should not take longer than seconds."""
-_STAGES = ("sampling", "delay", "held actuation", "unexplained")
+_STAGES = ("sampling", "delay", "held actuation", "residual")
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class FidelityStage:
     """Events with this effect, and all before it, in place."""
     max_event_difference_s: float | None
     """Largest difference in time to the same event in the stage before."""
-    parted_event: int | None
+    first_different_event: int | None
     """First event more than ten measurements from the stage before's, or that one of them lacks."""
 
 
@@ -92,12 +94,12 @@ class Fidelity:
     """Live run minus the ideal loop."""
     stages: tuple[FidelityStage, ...]
     explained_relative: float
-    """RMS of what remains unexplained over the RMS of the whole difference."""
+    """RMS of the residual over the RMS of the whole difference."""
     events_ideal: int
     events_live: int
     max_event_difference_s: float | None
     """Between the ideal loop and the live run, over the events that both have."""
-    parted_event: int | None
+    first_different_event: int | None
     """First event that is more than ten measurements apart, or that one of the two lacks: from
     there on the same packet fates meet different events."""
     t_s: Vector
@@ -118,13 +120,12 @@ class Fidelity:
     def verdict(self) -> str:
         """One line for people."""
         if self._nothing_to_explain:
-            return "x is that of the ideal loop, to rounding"
+            return "x equals that of the ideal loop, to rounding"
         of_x = 100 * self.total.rms / self.rms_live
         shares = ", ".join(f"{stage.name} {percent(stage.share)}" for stage in self.stages[:-1])
         return (
-            f"x differs from the ideal loop by {of_x:.2g} % (RMS); of this {shares}; "
-            f"{100 * self.explained_relative:.2g} % unexplained"
-            + ("" if self.explained else ", which is too much")
+            f"x differs from the ideal loop by {of_x:.2g} % (RMS). Shares: {shares}. Residual "
+            f"{100 * self.explained_relative:.2g} %" + ("" if self.explained else ", too large")
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -132,37 +133,33 @@ class Fidelity:
         figures = {k: v for k, v in asdict(self).items() if k not in ("t_s", "stage_norms")}
         return {**figures, "explained": self.explained, "verdict": self.verdict}
 
-    def compact(self) -> dict[str, Any]:
-        """The summary's share of it; ``docs/record.md`` documents the keys."""
-        return {
-            "explained": self.explained,
-            "explained_relative": self.explained_relative,
-            "rms_x": self.total.rms,
-            "max_x": self.total.max,
-            "rms_x_live": self.rms_live,
-            "shares": {stage.name.replace(" ", "_"): stage.share for stage in self.stages},
-            "events_ideal": self.events_ideal,
-            "events_live": self.events_live,
-            "max_event_difference_s": self.max_event_difference_s,
-            "parted_event": self.parted_event,
-            "reason": None,
-        }
+    def summary(self) -> FidelityPart:
+        """The part of the run's summary; ``docs/record.md`` explains the keys."""
+        return FidelityPart(
+            reason=None,
+            explained=self.explained,
+            explained_relative=self.explained_relative,
+            rms_x=self.total.rms,
+            max_x=self.total.max,
+            rms_x_live=self.rms_live,
+            shares={stage.name.replace(" ", "_"): stage.share for stage in self.stages},
+            events_ideal=self.events_ideal,
+            events_live=self.events_live,
+            max_event_difference_s=self.max_event_difference_s,
+            first_different_event=self.first_different_event,
+        )
 
 
-def fidelity_for_summary(record: RunRecord) -> dict[str, Any]:
-    """The comparison for a run's summary: all of it null but ``reason`` if there can be none."""
-    nothing: dict[str, Any] = dict.fromkeys(
-        ("explained", "explained_relative", "rms_x", "max_x", "rms_x_live", "shares",
-         "events_ideal", "events_live", "max_event_difference_s", "parted_event")
-    )  # fmt: skip
+def fidelity_for_summary(record: RunRecord) -> FidelityPart | NoFidelityPart:
+    """The comparison for a run's summary, or the reason why there is none."""
     if len(record[PLANT_STEP]) > _STEPS_AT_THE_END:
-        return nothing | {"reason": "the run is long; `noack fidelity` compares it"}
+        return NoFidelityPart(reason="the run is long; `noack fidelity` compares it")
     try:
-        return compute_fidelity(record, _EVENTS_AT_THE_END).compact()
+        return compute_fidelity(record, _EVENTS_AT_THE_END).summary()
     except NoackError as error:
-        return nothing | {"reason": str(error)}
-    except Exception as error:  # whatever it is, the run itself went as it went
-        return nothing | {"reason": repr(error)}
+        return NoFidelityPart(reason=str(error))
+    except Exception as error:  # the run itself did not fail
+        return NoFidelityPart(reason=repr(error))
 
 
 def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelity:
@@ -229,7 +226,7 @@ def compute_fidelity(record: RunRecord, max_events: int = MAX_EVENTS) -> Fidelit
         events_ideal=len(ideal.event_s),
         events_live=len(live.event_s),
         max_event_difference_s=_largest(_apart(ideal.event_s, live.event_s)),
-        parted_event=_parted(ideal.event_s, live.event_s, part_s),
+        first_different_event=_parted(ideal.event_s, live.event_s, part_s),
         t_s=t_s,
         stage_norms=np.array([np.linalg.norm(effect, axis=1) for effect in effects]),
     )
@@ -255,13 +252,8 @@ def _ideal(
     return ideal
 
 
-def percent(share: float) -> str:
-    """A share for people, to a tenth of a per cent; the smallest have no sign."""
-    return f"{round(100 * share, 1) + 0.0:.1f} %"
-
-
 def is_against(share: float) -> bool:
-    """Whether a share, as people see it, takes away from what the others make."""
+    """Whether a share partly cancels the others, at the precision that is shown."""
     return round(100 * share, 1) < 0
 
 

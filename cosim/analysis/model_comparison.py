@@ -21,7 +21,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
 
     ``A``, ``B`` by rows, ``eigenvalues`` of A + BK as pairs of real and imaginary part, ``off_A``
     and ``off_B`` = A − Â and B − B̂, and ``in_box``, whether these are within the half-widths of the
-    scenario's uncertainty box; None without one. All are None of a plant whose x is no state.
+    scenario's uncertainty box; None without one. Only ``A``, as None, if x is not the whole state.
     """
     if resolved.coverage.is_linear:
         return None
@@ -40,7 +40,7 @@ def linearisation(resolved: Scenario) -> Linearisation | None:
     except NoackError:  # of the user's own: it fails, or begins only where it wants
         A, B = np.full((n, n), np.nan), np.full((n, m), np.nan)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
-        return dict.fromkeys(("A", "B", "eigenvalues", "off_A", "off_B", "in_box"))
+        return {"A": None}
     off_A, off_B = A - loop.A_model, B - loop.B_model
     poles = np.linalg.eigvals(A + B @ loop.K)
     in_box: bool | None = None

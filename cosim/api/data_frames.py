@@ -5,7 +5,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from cosim.record.align import join_all
-from cosim.record.packet_outcomes import crossing
+from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.core.clock import NS_PER_S
 from noack.protocol.record_tables import (
@@ -48,7 +48,7 @@ def events(record: RunRecord) -> pa.Table:
     measurements = record[SENSOR_MEASUREMENT]
     sent = measurements[measurements["event"] != NO_SEQUENCE]
     t_s = _seconds(sent["t_ns"])
-    crossed = crossing(record)
+    crossed = packet_outcomes(record)
     fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
     # Delivered, as far as the emulator could know, but not in the end.
     fates[effective(crossed.rows["fate"]) & crossed.lost] = _OVERTAKEN

@@ -1,6 +1,5 @@
-"""What a machine grants, and what that means for a run: measured, judged, and shown.
+"""Check of a machine: real-time settings, timers, ports, disk.
 
-:mod:`cosim.doctor.machine_measures` measures, with processes of their own
-(:mod:`cosim.doctor.probe`); :mod:`cosim.doctor.findings` turns numbers into verdicts, and does
-nothing else.
+:mod:`cosim.doctor.machine_measures` measures, with separate processes (:mod:`cosim.doctor.probe`);
+:mod:`cosim.doctor.findings` judges the measurements; :mod:`cosim.doctor.doctor_table` prints them.
 """

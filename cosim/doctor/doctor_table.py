@@ -1,4 +1,4 @@
-"""The findings, as a person or a program wants to see them."""
+"""The findings of ``noack doctor``, as a table and as JSON."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -16,17 +16,17 @@ _COLOURS = {
     FindingStatus.LIMITED: "yellow",
     FindingStatus.BAD: "bold red",
 }
-_IN_SHORT = {
-    FindingStatus.GOOD: "grants all that there is to ask for",
-    FindingStatus.LIMITED: "is fit for runs, within limits",
-    FindingStatus.BAD: "cannot run it",
+_VERDICTS = {
+    FindingStatus.GOOD: "ready",
+    FindingStatus.LIMITED: "ready, with the limits above",
+    FindingStatus.BAD: "not ready: no run is possible",
 }
 
 
 def document(
     machine: MachineFacts, wanted: RunRequirements, findings: Sequence[MachineFinding]
 ) -> dict[str, Any]:
-    """As one document: ``verdict``, ``findings``, and the numbers behind them."""
+    """Return ``verdict``, ``findings``, and the numbers behind them, for JSON."""
     return {
         "scenario": wanted._asdict() | {"ports": dict(wanted.ports)},
         "verdict": worst(findings),
@@ -41,22 +41,22 @@ def document(
 def print_findings(
     console: Console, wanted: RunRequirements, findings: Sequence[MachineFinding]
 ) -> None:
-    """Print a line for each finding, and below it what it means and what would be better."""
+    """Print each finding, its meaning for a run, and a remedy."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     table.add_column(max_width=26)
     table.add_column(ratio=1)
     for one in findings:
-        said = Text(one.found)
+        text = Text(one.found)
         if one.means:
-            said.append(f"\n{one.means}", "" if one.verdict is not FindingStatus.GOOD else "dim")
+            text.append(f"\n{one.means}", "" if one.verdict is not FindingStatus.GOOD else "dim")
         if one.remedy:
-            said.append(f"\n→ {one.remedy}", "cyan")
-        table.add_row(Text(one.verdict, _COLOURS[one.verdict]), Text(one.what), said)
+            text.append(f"\n→ {one.remedy}", "cyan")
+        table.add_row(Text(one.verdict, _COLOURS[one.verdict]), Text(one.what), text)
     console.print(table)
     verdict = worst(findings)
     console.print(
         Text.assemble(
-            "for ", wanted.name, ": this machine ", (_IN_SHORT[verdict], _COLOURS[verdict])
+            "this machine, for ", wanted.name, ": ", (_VERDICTS[verdict], _COLOURS[verdict])
         )
     )

@@ -1,4 +1,4 @@
-"""What is measured of a machine, and what a scenario wants of it."""
+"""The measurements of a machine, and the requirements of a scenario."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,20 +9,20 @@ from noack.core.clock import NS_PER_S
 
 
 class RunRequirements(NamedTuple):
-    """What a scenario asks of the machine; times are wall time."""
+    """What a scenario requires of the machine; times are wall time."""
 
     name: str
     duration_s: float
     period_ns: int
-    """Of the plant's steps."""
+    """Period of the plant's steps."""
     allowance_ns: int
-    """By how much the certificates let updates and inputs be late."""
+    """Lateness of updates and inputs that the certificates allow."""
     realtime: bool
-    """Whether real-time settings are asked for."""
+    """Whether the scenario asks for real-time settings."""
     fifo_priority: int
     spin_us: float
     ports: Mapping[str, int]
-    """By their keys; those that are 0, any free one, are not among them."""
+    """By key; ports that are 0 (any free port) are left out."""
 
     @property
     def rate_hz(self) -> float:
@@ -31,7 +31,7 @@ class RunRequirements(NamedTuple):
 
 
 def requirements_of(resolved: Scenario) -> RunRequirements:
-    """Return what a resolved scenario asks of the machine that it runs on."""
+    """Return what a resolved scenario requires of the machine."""
     period_ns = round(resolved.timing.plant_period_ns / resolved.speed)
     settings = resolved.realtime
     ports = {name: port for name, port in resolved.ports.model_dump().items() if port}
@@ -48,18 +48,18 @@ def requirements_of(resolved: Scenario) -> RunRequirements:
 
 
 class Lateness(NamedTuple):
-    """How late a loop of the plant's rate woke up that had nothing to do."""
+    """Lateness of an idle loop that wakes up at the plant's rate."""
 
     wakes: int
     p50_us: float
     p99_us: float
     max_us: float
     beyond: int
-    """How many times by more than the certificates allow."""
+    """Number of wake-ups that were later than the certificates allow."""
 
 
 class RoundTrips(NamedTuple):
-    """Datagrams that another process sent back over UDP on the loopback."""
+    """Round trips of datagrams to another process over UDP on the loopback."""
 
     sent: int
     lost: int
@@ -68,59 +68,59 @@ class RoundTrips(NamedTuple):
 
 
 class Buffer(NamedTuple):
-    """A socket's receive buffer, as a process of a run has it."""
+    """The receive buffer of a run's sockets."""
 
     datagrams: int
-    """Datagrams of a run that it held when nobody read."""
+    """Number of a run's datagrams that it holds."""
     granted_bytes: int
     most_bytes: int | None
-    """What the system grants without privileges; None if it does not say."""
+    """Largest size without privileges; None if unknown."""
 
 
 class Disk(NamedTuple):
-    """Where run directories are made."""
+    """The folder of the run directories."""
 
     folder: str
     free_bytes: int
     needed_bytes: int
-    """Of the scenario's rows, until its run has ended."""
+    """Space for the run's rows until the run has ended."""
     write_bytes_per_s: float
 
 
 @dataclass(frozen=True)
 class MachineFacts:
-    """Everything that was measured. What failed is the line that says why."""
+    """All measurements. A measurement that failed is the line that says why."""
 
     cores: int
-    """That this process may use."""
+    """Cores that this process may use."""
     cores_online: int
     load: float | None
-    """Processes that wanted a core, on average over the last minute."""
+    """Load average over the last minute."""
     governor: str | None
-    """How the frequency of the first core is chosen; None if the system does not say."""
+    """Frequency governor of the first core; None if unknown."""
     granted: Mapping[str, str]
-    """Real-time settings, and what became of them (``realtime``)."""
+    """By real-time setting: applied or not permitted, as ``realtime`` reports it."""
     timer_resolution_ns: int
     timer_slack_ns: int | None
     plain: Lateness | str
     """Without real-time settings."""
     realtime: Lateness | str
-    """With those that were granted."""
+    """With the real-time settings that are permitted."""
     round_trips: RoundTrips | str
     buffer: Buffer | str
     ports_taken: Sequence[str]
-    """A line for each of the scenario's ports that cannot be had."""
+    """A line for each port of the scenario that is in use."""
     control: float | str
-    """Seconds that a question took over the control plane (zenoh, TCP on the loopback)."""
+    """Seconds per query over the control plane (zenoh, TCP on the loopback)."""
     disk: Disk | str
     runtime_folder: str | None
     """Why the folder for the user's private files cannot be used; None if it can."""
     cache: bool
-    """Whether compiled code is kept from one run to the next."""
+    """Whether compiled code is cached between runs."""
     display: bool
     viewer: str | None
     """Version of rerun; None if it cannot be imported."""
     extras: Mapping[str, bool]
-    """Which extras of noack are installed."""
+    """Whether each extra of noack is installed."""
     versions: Mapping[str, str | None]
-    """Of Python and of the libraries that a run depends on."""
+    """Versions of Python and of the libraries that a run depends on."""

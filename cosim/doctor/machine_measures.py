@@ -1,4 +1,4 @@
-"""Measures a machine, in some seconds, with what a run itself uses."""
+"""Measures a machine in a few seconds, with the sockets, timers and settings of a run."""
 
 import ctypes
 import json
@@ -63,9 +63,9 @@ def measure(
 
     Args:
         resolved: the resolved scenario.
-        wanted: what it asks of the machine.
-        runs: where its run directory would be made; it need not exist.
-        duration_s: how long wake-ups are watched, without real-time settings and with.
+        wanted: its requirements.
+        runs: folder of the run directories; it need not exist.
+        duration_s: length of each of the two measurements of wake-ups.
     """
     plain, realtime, granted = _wake_ups(wanted, duration_s)
     about = environment("live")
@@ -126,10 +126,10 @@ def _wake_ups(
 
 
 def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
-    """Return what is said of wake-ups that were late by so many nanoseconds."""
+    """Return the statistics of lateness in ns; a line that says why if there is none."""
     late = np.array(list(late_ns), dtype=np.int64)
     if not len(late):
-        return "it never woke up"
+        return "no wake-up was measured"
     p50, p99 = np.quantile(late, [0.5, 0.99]) / 1e3
     beyond = int((late > allowance_ns).sum())
     return Lateness(len(late), float(p50), float(p99), float(late.max()) / 1e3, beyond)
@@ -199,7 +199,7 @@ def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
 
 
 def _control() -> float:
-    """Ask a question over a star as the control plane is; return how long the answer took."""
+    """Return the seconds that a query takes over a star as in the control plane."""
     secret = SessionSecret("doctor", secrets.token_hex(16))
     endpoint, key = f"tcp/{LOOPBACK}:{free_tcp_port()}", "noack/doctor"
     centre = open_session(endpoint, secret, listen=True)
@@ -262,7 +262,7 @@ def _runtime_folder() -> str | None:
 def _cache() -> bool:
     try:
         folder = cache_folder("doctor", [Path(__file__)])
-    except ImportError:  # no numba, nothing to keep
+    except ImportError:  # no numba, nothing to cache
         return False
     if folder is not None:
         with suppress(OSError):
@@ -271,7 +271,7 @@ def _cache() -> bool:
 
 
 def _timer_slack_ns() -> int | None:
-    """Of this thread, which has asked for nothing."""
+    """Return the default timer slack."""
     if sys.platform != "linux":
         return None
     found: int = ctypes.CDLL(None).prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)

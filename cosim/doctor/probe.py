@@ -1,4 +1,4 @@
-"""Processes of their own that measure: ``python -m cosim.doctor.probe wake|echo``."""
+"""Separate processes that measure: ``python -m cosim.doctor.probe wake|echo``."""
 
 import json
 import socket
@@ -13,18 +13,18 @@ from noack.runtime.real_time_settings import realtime
 from noack.runtime.udp_sockets import LOOPBACK
 
 _WARM_UP = 20
-"""Times that the loop wakes up before it counts: the first ones run code that is still cold."""
+"""Wake-ups before the measurement, to warm up the code."""
 _IDLE_S = 10.0
 
 
 def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> dict[str, object]:
-    """Wake up at a rate as a process of a run does, first without real-time settings, then with.
+    """Wake up periodically, as a process of a run does, without and with real-time settings.
 
     Returns:
-        ``plain`` and ``realtime``, nanoseconds late each time, and ``granted``, the settings.
+        ``plain`` and ``realtime``: lateness in ns; ``granted``: the settings.
     """
     found: dict[str, object] = {}
-    # Timer slack and locked memory stay for the life of a process: without them comes first.
+    # Timer slack and locked memory stay for the life of a process: measure without them first.
     for name, enabled in (("plain", False), ("realtime", True)):
         with realtime(enabled, priority, place=0) as granted:
             found |= {name: _lateness(period_ns, duration_s, spin_us), "granted": granted}
@@ -41,7 +41,7 @@ def _lateness(period_ns: int, duration_s: float, spin_us: float) -> Sequence[int
 
 
 class _Metronome:
-    """A machine that only notes how late it is."""
+    """A machine that only records its lateness."""
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -61,7 +61,7 @@ class _Metronome:
 
 
 class _Nothing:
-    """Stands in for a socket and a record."""
+    """A socket and a record that do nothing."""
 
     watched: Sequence[int] = ()
 
@@ -85,7 +85,7 @@ class _Nothing:
 
 
 def echo() -> None:
-    """Send back what comes on a port, which is said first; an empty datagram ends it."""
+    """Print a port and return what arrives there; an empty datagram ends it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind((LOOPBACK, 0))
         endpoint.settimeout(_IDLE_S)

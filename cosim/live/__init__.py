@@ -1,1 +1,1 @@
-"""A live run: launcher, coordinator, recorder, finalisation."""
+"""Live runs: launcher, coordinator, recorder, finalisation."""

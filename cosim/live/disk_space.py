@@ -1,4 +1,4 @@
-"""Room on the disk: what a run will take, said before it begins."""
+"""Disk space that a run needs, checked before its start."""
 
 import shutil
 import sys
@@ -16,11 +16,11 @@ from noack.protocol.record_tables import (
 )
 
 _UNTIL_THE_END = 3
-"""While a run ends, its spool, its record and its view lie side by side, each about as large."""
+"""At the end of a run, spool, record and view exist together, each of about the same size."""
 
 
 def spool_bytes(resolved: Scenario) -> int:
-    """What the rows of a run's grids take, without those of events, of which nobody knows."""
+    """Bytes of the rows on fixed time grids; the number of event rows is not known in advance."""
     steps = resolved.timing.horizon_ns // resolved.timing.plant_period_ns + 1
     ticks = resolved.timing.horizon_ns // resolved.timing.controller_period_ns
     counts = {
@@ -34,7 +34,7 @@ def spool_bytes(resolved: Scenario) -> int:
 
 
 def needed_bytes(resolved: Scenario) -> int:
-    """What a run takes on the disk until it has ended."""
+    """Bytes on the disk until the run has ended."""
     return _UNTIL_THE_END * spool_bytes(resolved)
 
 
@@ -46,20 +46,20 @@ def require_disk_space(resolved: Scenario, runs: Path) -> None:
         runs: where the run directory will be made; it need not exist.
 
     Raises:
-        MachineError: what will be recorded is more than there is room for.
+        MachineError: the record needs more than the free space.
     """
     folder = next((one for one in (runs, *runs.absolute().parents) if one.is_dir()), None)
     if folder is None:
         return
     free, spool = shutil.disk_usage(folder).free, spool_bytes(resolved)
-    if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # which nothing can begin with
+    if free >= _UNTIL_THE_END * spool or free < LEAST_FREE_BYTES:  # then no run can begin at all
         return
     text = (
-        f"{runs}: this run records {_size(spool)} and takes {_size(_UNTIL_THE_END * spool)} until "
-        f"it has ended; {_size(free)} are free on the disk"
+        f"{runs}: this run records {_size(spool)} and needs {_size(_UNTIL_THE_END * spool)} until "
+        f"its end; {_size(free)} are free on the disk"
     )
     if free < spool:
-        raise MachineError(f"{text}; shorten horizon_s, or name another place by --runs")
+        raise MachineError(f"{text}; reduce horizon_s, or choose another disk with --runs")
     print(f"noack: warning: {text}", file=sys.stderr)
 
 

@@ -1,8 +1,9 @@
 """The end of a run: its record completed, its summary and report written."""
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 from cosim.analysis.claims.claim import as_json
 from cosim.analysis.claims.claims_by_part import RunClaims
 from cosim.analysis.fidelity import fidelity_for_summary
+from cosim.analysis.loss_statistics import list_violations
 from cosim.analysis.model_comparison import linearisation
 from cosim.analysis.replay import replay
 from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import Summary, dumps, summarise
-from cosim.analysis.summary_check import can_be_shown
+from cosim.analysis.run_summary import Summary, summarise
+from cosim.analysis.summary_model import ExitPart, RunSummary, can_be_shown
 from cosim.record.run_directory import (
     ENDING_FILE,
     RECORD,
@@ -53,30 +55,29 @@ def finalize(ending: RunEnding, *, report: bool = True) -> Outcome:
         else:
             record = load_record(run_dir)
         summary = summarise(record, int(ending.status), ending.reason, ending.startup_s)
-        summary |= {"replay": None, "fidelity": None, "claims": [], "conditions": None}
-        summary["judged_until_s"] = None
         _write_summary(run_dir, summary)
-        # Written before and after: a failure in the analysis must not cost the summary.
+        # Written again with the results below, so that none of them can cost the summary.
         claims = RunClaims(record)
-        summary |= _analysis(record, claims, summary)
-        summary["exit"] = end = _end(summary)
+        summary = _with_results(record, claims, summary)
         _write_summary(run_dir, summary)
-        if (int(ending.status), ending.reason) != (end["status"], end["reason"]):
-            _correct_ending(run_dir, end, ending.startup_s)
+        status, reason = ExitStatus(summary.exit.status), summary.exit.reason
+        if (ending.status, ending.reason) != (status, reason):
+            _correct_ending(replace(ending, status=status, reason=reason))
+        content = summary.to_json()
         try:
             if report:
-                _report(record, summary, run_dir, claims)
+                _report(record, content, run_dir, claims)
         except Exception as error:  # whatever it is, the run itself is not affected
             (run_dir / REPORT_FILE).unlink(missing_ok=True)
             print(f"noack: warning: no {REPORT_FILE}: {error}", file=sys.stderr)
-    return Outcome(run_dir, ExitStatus(end["status"]), end["reason"], summary)
+    return Outcome(run_dir, status, reason, content)
 
 
-def _correct_ending(run_dir: Path, end: Mapping[str, Any], startup_s: float | None) -> None:
+def _correct_ending(ending: RunEnding) -> None:
     """Let the launcher's file agree with the summary."""
-    if (run_dir / ENDING_FILE).is_file():
-        with suppress(MachineError), EndingFile(run_dir) as file:
-            file.store(ExitStatus(end["status"]), end["reason"], startup_s)
+    if (ending.run_dir / ENDING_FILE).is_file():
+        with suppress(MachineError), EndingFile(ending.run_dir) as file:
+            file.store(ending.status, ending.reason, ending.startup_s)
 
 
 @contextmanager
@@ -90,11 +91,11 @@ def _with_reason(ending: RunEnding) -> Iterator[None]:
         raise MachineError(f"the run failed: {ending.reason}\n{error}") from None
 
 
-def _write_summary(run_dir: Path, summary: Summary) -> None:
+def _write_summary(run_dir: Path, summary: RunSummary) -> None:
     path = run_dir / SUMMARY_FILE
     scratch = path.with_suffix(".partial")
     try:
-        scratch.write_text(dumps(summary), encoding="utf-8")
+        scratch.write_text(summary.model_dump_json(indent=2), encoding="utf-8")
         scratch.replace(path)
     except OSError as error:
         with suppress(OSError):
@@ -104,51 +105,42 @@ def _write_summary(run_dir: Path, summary: Summary) -> None:
         ) from None
 
 
-def _analysis(record: RunRecord, claims: RunClaims, summary: Summary) -> Summary:
-    """Replay, fidelity, linearisation and claims; a failure of one is a line in the summary."""
-    found: Summary = {}
+def _with_results(record: RunRecord, claims: RunClaims, summary: RunSummary) -> RunSummary:
+    """Add the results of replay, fidelity and claims; a failure of one is a line or a warning."""
+    found: dict[str, Any] = {"fidelity": fidelity_for_summary(record)}
     if record.kind == "live":
         try:
             found["replay"] = replay(record).verdict()
-        except Exception as error:  # whatever it is, the run itself is not affected
+        except Exception as error:  # the run itself did not fail
             found["replay"] = {"bit_exact": None, "error": repr(error)}
-    found["fidelity"] = fidelity_for_summary(record)
+        found["exit"] = _exit(summary.exit, found["replay"])
     try:
-        if (near := linearisation(record.scenario)) is not None:
-            found["linearisation"] = near
+        found["linearisation"] = linearisation(record.scenario)
     except Exception as error:  # likewise
         print(f"noack: warning: the plant was not linearised: {error!r}", file=sys.stderr)
     try:
-        found |= {"conditions": claims.conditions, "claims": as_json(claims.judge())}
-        found["judged_until_s"] = claims.judged_until_s
-        found |= _unseen_losses(claims, summary)
+        violations = list_violations(summary.assumption_violations, claims.violations())
+        longest = summary.longest_loss_burst
+        if summary.unintended_losses:
+            longest = max(longest, int(claims.conditions["dropouts"] or 0))
+        found |= {
+            "conditions": claims.conditions,
+            "claims": as_json(claims.judge()),
+            "judged_until_s": claims.judged_until_s,
+            "assumption_violations": violations,
+            "longest_loss_burst": longest,
+        }
     except Exception as error:  # likewise
         print(f"noack: warning: the claims were not judged: {error!r}", file=sys.stderr)
-    return found
+    return summary.with_results(**found)
 
 
-def _end(summary: Summary) -> dict[str, Any]:
-    """How the run ended; a run that cannot be replayed has failed."""
-    end: dict[str, Any] = summary["exit"]
-    verdict = summary["replay"]
-    if end["status"] != ExitStatus.OK or verdict is None or verdict["bit_exact"] is not None:
+def _exit(end: ExitPart, replayed: dict[str, Any]) -> ExitPart:
+    """How the run ended, given its replay: a run that cannot be replayed failed."""
+    if end.status != ExitStatus.OK or replayed["bit_exact"] is not None:
         return end
-    why = verdict.get("error", "the record has no inputs")
-    return {"status": int(ExitStatus.FAILED), "reason": f"the run cannot be replayed: {why}"}
-
-
-def _unseen_losses(claims: RunClaims, summary: Summary) -> Summary:
-    """Loss bursts while a process was away, which emulator and controller did not count."""
-    longest = int(claims.conditions["dropouts"] or 0)
-    if not summary["lost_outside_netem"] or longest <= summary["longest_loss_burst"]:
-        return {}
-    found: Summary = {"longest_loss_burst": longest}
-    if (beyond := claims.mansd_violation) is not None and not summary["assumption_violations"]:
-        at_s, what = beyond
-        found["assumption_violations"] = [
-            {"t_s": at_s, "process": "recorder", "what": f"MANSD violated: {what}"}
-        ]
-    return found
+    why = replayed.get("error", "the record has no inputs")
+    return ExitPart(status=ExitStatus.FAILED, reason=f"the run cannot be replayed: {why}")
 
 
 def reopen(run_dir: Path) -> Outcome:

@@ -15,7 +15,8 @@ from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.live.progress_report import ProgressReport
 from cosim.live.telemetry_store import TelemetryStore
 from cosim.output.viewer.live_viewer import LiveView
-from cosim.output.viewer.recording import RunView, ViewError
+from cosim.output.viewer.recording import RunView
+from cosim.output.viewer.recording_file import ViewError
 from cosim.output.viewer.run_view import open_view, write_view
 from cosim.output.viewer.table_feed import ViewFeed
 from cosim.record.run_directory import active_run

@@ -1,4 +1,4 @@
-"""A simulated run: a run directory like a live run's, made in virtual time."""
+"""A simulated run: a run directory like that of a live run, from virtual time."""
 
 import json
 import secrets
@@ -27,7 +27,7 @@ class Simulator(Protocol):
     """Turns a resolved scenario into the record of a run."""
 
     def __call__(self, resolved: Scenario, *, progress: Progress | None) -> RunRecord:
-        """Simulate the run; tell ``progress`` how far it is."""
+        """Simulate the run; report the simulated time to ``progress``."""
         ...
 
 
@@ -41,13 +41,13 @@ def simulate_run(
 ) -> RunEnding:
     """Simulate a scenario into a new run directory; :func:`cosim.live.finalize.finalize` ends it.
 
-    A run that is broken off leaves nothing behind: it can be repeated.
+    An interrupted simulation leaves no run directory.
 
     Args:
         scenario: as loaded; it is resolved here.
         runs: where run directories are made.
-        simulator: makes the record.
-        progress: is told how far the run is.
+        simulator: produces the record.
+        progress: called with the simulated time.
         view: whether to write the recording for the viewer.
 
     Raises:
@@ -56,7 +56,7 @@ def simulate_run(
     """
     resolved = resolve(scenario)
     run_dir = new_run_dir(runs, resolved.name)
-    run_id = secrets.randbits(64)  # the viewer tells recordings apart by it
+    run_id = secrets.randbits(64)  # identifies the recording in the viewer
     try:
         with active_run(run_dir), EndingFile(run_dir) as ending:
             resolved = write_scenario(resolved, run_dir)

@@ -1,8 +1,7 @@
-"""How long the launcher waits for its processes at the start: longer on a machine with much to do.
+"""Time limit of the start barrier, longer on a loaded machine.
 
-A second of waiting counts as a second while each process that wants to run has a core. When the
-system's load (its average over a minute) is k times the number of cores, a process gets a k-th of
-one, and a second counts as 1/k, but at least as 1/20.
+When the system load (one-minute average) is k > 1 times the number of cores, a process gets 1/k of
+a core, and a second of waiting counts as 1/k s, but at least as 1/20 s.
 """
 
 import os
@@ -11,7 +10,7 @@ from dataclasses import dataclass, field
 DEFAULT_S = 30.0
 _MOST_SLOWED = 20.0
 _OVERLOADED = 1.5
-"""A start that was slowed down by this factor on average has had more to wait for than itself."""
+"""From this slow-down on, the message names the load as the likely cause."""
 
 
 def _cores() -> int:
@@ -20,35 +19,35 @@ def _cores() -> int:
 
 @dataclass
 class StartLimit:
-    """The time that the processes of a run have to come to its start.
+    """The time that the processes of a run have to get ready.
 
     Args:
-        within_s: limit for a machine that has nothing else to do, in seconds.
-        cores: how many of them the launcher may use.
+        within_s: limit on an idle machine, in seconds.
+        cores: cores that the launcher may use.
     """
 
     within_s: float
     cores: int = field(default_factory=_cores)
     waited_s: float = 0.0
-    """Wall time."""
+    """Waited wall time, in seconds."""
     counted_s: float = 0.0
-    """What counts of it."""
+    """The part of it that counts."""
     load: float = 0.0
-    """The newest."""
+    """The newest load."""
 
     def wait(self, wall_s: float, load: float) -> None:
-        """Count some wall time, during which the system had a load."""
+        """Count wall time under a system load."""
         self.load = load
         self.waited_s += wall_s
         self.counted_s += wall_s / min(max(load / self.cores, 1.0), _MOST_SLOWED)
 
     @property
     def is_reached(self) -> bool:
-        """Whether the time is up."""
+        """Whether the limit is reached."""
         return self.counted_s > self.within_s
 
     def explain(self) -> str:
-        """Why the time is up, and what would help."""
+        """Why the limit was reached, and what would help."""
         load = f"a load of {self.load:.1f} on {self.cores} cores"
         waited = f"not ready in time: waited {self.waited_s:.0f} s"
         if self.waited_s > _OVERLOADED * self.counted_s:

@@ -1,4 +1,4 @@
-"""What a person sees of assumptions: the paper's for a scenario, a certificate's."""
+"""Table of assumptions: those of the paper for a scenario, or those of a certificate."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,12 +14,12 @@ _COLOURS: dict[str, str] = {
     AssumptionStatus.VIOLATED: "bold yellow",
     AssumptionStatus.IDEALISED: "dim",
     AssumptionStatus.NOT_NEEDED: "dim",
-    AssumptionStatus.PRESUPPOSED: "cyan",
+    AssumptionStatus.ASSUMED: "cyan",
 }
 
 
 def print_assumptions(console: Console, assumptions: Sequence[Mapping[str, str]]) -> None:
-    """Print assumptions with their verdicts; one that is idealised or not needed is a note."""
+    """Print assumptions with their verdicts."""
     table = Table.grid(padding=(0, 2))
     for one in assumptions:
         text = escape(f"{one['what']} ({one['source']}): {one['why']}")

@@ -1,6 +1,5 @@
-"""The certificates of a scenario, as a person or a program wants to see them."""
+"""The certificates of a scenario, as tables and as JSON."""
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from noack.config.resolution import loop_of, resolve
 from noack.config.scenario import Scenario
 from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix
+from noack.core.number_format import duration, number
 from noack.theory.assumptions import assumptions
 from noack.theory.certificate import NetworkConditions
 from noack.theory.enclosure import NotDecayingError
@@ -31,16 +31,16 @@ from noack.theory.scenario_certificates import (
 from noack.theory.weight import choose_weight
 
 IDEAL = "paper"
-"""Under the paper's conditions: nothing is sampled, delayed or held."""
+"""The paper's conditions: no sampling, no delay, no hold."""
 SCHEDULE = "schedule"
-"""Under the scenario's own schedule and allowance."""
+"""The scenario's rates, plus the lateness that it allows."""
 
 MOST_LATE = 1000
 _MOST_S = 10.0
 
 
 class NetworkLimits(NamedTuple):
-    """How far the schedule could go before a certificate is lost, one thing at a time."""
+    """Largest certified value of each quantity, the others as in the schedule."""
 
     sampling_s: float
     delay_s: float
@@ -49,15 +49,15 @@ class NetworkLimits(NamedTuple):
 
 @dataclass(frozen=True)
 class Study:
-    """Everything that is certified of a scenario.
+    """All certificates of a scenario.
 
     Args:
         resolved: the resolved scenario.
         certificates: under the paper's conditions and under the schedule's.
-        scopes: whose certificates they are.
+        scopes: the plants that they cover.
         scheduled: the schedule's conditions.
         theorem_2: the paper's bounds, with Δ from the ideal certificate.
-        weight: W, if the tool chose it.
+        weight: W, if noack chose it.
     """
 
     resolved: Scenario
@@ -69,7 +69,7 @@ class Study:
 
     @cached_property
     def limits(self) -> dict[str, NetworkLimits]:
-        """By scope; found when first asked for, by a hundred certificates."""
+        """By scope; computed at first use, from about a hundred certificates."""
         return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
 
     def certificate(self, under: str) -> ScenarioCertificate:
@@ -82,7 +82,7 @@ class Study:
         return next(of_box, None)
 
     def to_json(self) -> dict[str, Any]:
-        """As one document."""
+        """Return all of it as one JSON document."""
         theorem = None if self.theorem_2 is None else self.theorem_2._asdict()
         return {
             "scenario": self.resolved.name,
@@ -102,10 +102,10 @@ class Study:
 def with_weight(
     resolved: Scenario, which: str, progress: Callable[[float], None] = lambda share: None
 ) -> tuple[Scenario, Matrix | None]:
-    """The scenario with the weight that was asked for, and W if it had to be chosen.
+    """Return the scenario with the requested weight, and W if noack chose it.
 
     Raises:
-        CallerError: there is no such choice, or none can be made for this scenario.
+        CallerError: there is no such choice, or no weight can be chosen for this scenario.
     """
     weight: Matrix | None = None
     if which == "given":
@@ -132,16 +132,16 @@ def study_scenario(
     late_periods: int | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Study:
-    """Certify a scenario as :func:`study` does, under a norm and an allowance of one's choice.
+    """Certify a scenario as :func:`study` does, with a chosen norm and allowed lateness.
 
     Args:
         scenario: as loaded; it is resolved here.
         weight: given, identity or chosen.
-        late_periods: steps of the plant, 0 to 1000; the scenario's own allowance unless given.
-        progress: is told which share of the choice of a weight is done.
+        late_periods: allowed lateness in steps of the plant, 0 to 1000; by default the scenario's.
+        progress: called with the share of the choice of a weight that is done.
 
     Raises:
-        CallerError: there is no such choice, or no certificates are of this scenario.
+        CallerError: there is no such choice, or no certificate covers this scenario.
     """
     resolved = resolve(scenario)
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
@@ -155,8 +155,8 @@ def study(resolved: Scenario, late_periods: int, weight: Matrix | None = None) -
     """Certify a scenario under the paper's conditions and under its own schedule.
 
     Raises:
-        CallerError: its updates are acknowledged; its plant is not linear, or is disturbed; or its
-            state is not measured as it is.
+        CallerError: its updates are acknowledged, its plant is nonlinear or disturbed, or its
+            state is not measured exactly.
     """
     resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()
@@ -193,8 +193,8 @@ def print_study(console: Console, found: Study) -> None:
     _print_constants(console, found)
     _print_limits(console, found)
     if (outside := outside_box(found.resolved)) is not None:
-        console.print(f"[yellow]the box certificates say nothing of this plant:[/] {outside}")
-    console.print("assumptions of the certificates under the schedule:")
+        console.print(f"[yellow]the box certificates do not cover this plant:[/] {outside}")
+    console.print("assumptions of the certificates for the schedule:")
     certificate = next(c for under, c in found.certificates if under == SCHEDULE)
     print_assumptions(console, [a._asdict() for a in certificate.assumptions])
     console.print("assumptions of the paper's theorems:")
@@ -210,7 +210,7 @@ def print_study(console: Console, found: Study) -> None:
 
 
 def in_words(found: Study) -> Iterator[str]:
-    """What is certified under the scenario's own schedule, in sentences."""
+    """Yield what is certified for the scenario's schedule, in sentences."""
     for under, certificate in found.certificates:
         constants, dropouts = certificate.constants, certificate.conditions.dropouts
         if under != SCHEDULE or constants is None:
@@ -222,10 +222,10 @@ def in_words(found: Study) -> Iterator[str]:
             late = f"; from {certificate.floor_from_s:.4g} s on, ‖x‖ ≤ {floor.state:.4g}"
         apart = ""
         if (spacing_s := certificate.inter_event_s) is not None:
-            apart = f" No two transmissions are closer than {_limit(spacing_s)}."
+            apart = f" The inter-event time is at least {_limit(spacing_s)}."
         yield (
-            f"In words: of {plants}, where what is presupposed above holds, whichever updates are "
-            f"lost, at most {dropouts} in a row: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
+            f"In words: for {plants}, under the assumptions above and for every pattern of at most "
+            f"{dropouts} consecutive losses: ‖x‖ ≤ {constants.state:.4g}{decay}{late}.{apart}"
         )
 
 
@@ -233,7 +233,7 @@ def _print_constants(console: Console, found: Study) -> None:
     trigger = found.resolved.decaying
     norm = "‖W·‖" if trigger.weight is not None else "‖·‖"
     table = Table(
-        title=f"{found.resolved.name}: what is certified, M = {found.resolved.network.mansd + 1}, "
+        title=f"{found.resolved.name}: certified bounds, M − 1 = {found.resolved.network.mansd}, "
         f"β = {trigger.beta:g}, α = {trigger.alpha_per_s:g} /s, errors in {norm}"
     )
     table.add_column("")
@@ -241,13 +241,14 @@ def _print_constants(console: Console, found: Study) -> None:
         table.add_column(f"{under},\n{whose(certificate)}", justify="right")
     printed = found.theorem_2 is not None
     if printed:
-        table.add_column("printed,\nTheorem 2", justify="right")
+        table.add_column("paper's\nTheorem 2", justify="right")
     for label, values, of_theorem in constants(found):
         table.add_row(label, *values, *([of_theorem] if printed else []))
     console.print(table)
     console.print(
-        "[dim]bounds × e^(−rate·t). paper: nothing sampled, delayed or held; "
-        "schedule: as the scenario runs, and late by what it allows[/]"
+        "[dim]All bounds are multiplied by e^(−rate·t). paper: no sampling, no delay, no hold. "
+        "schedule: the scenario's rates, plus the lateness that it allows. plant: the scenario's "
+        "plant. box: every plant of the uncertainty box.[/]"
     )
     for under, certificate in found.certificates:
         if certificate.void:
@@ -257,16 +258,16 @@ def _print_constants(console: Console, found: Study) -> None:
 
 
 def whose(certificate: ScenarioCertificate) -> str:
-    """Of which plants a certificate is, in a word."""
+    """Return "box" or "plant": the plants that a certificate covers."""
     return "box" if certificate.scope == BOX else "plant"
 
 
 def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
-    """Yield what a person is told: label, the value of each certificate, and of Theorem 2."""
+    """Yield rows: label, the value of each certificate, the value of Theorem 2."""
     theorem, all_certificates = found.theorem_2, [c for _, c in found.certificates]
 
     def row(value: Callable[[ScenarioCertificate], float | None]) -> list[str]:
-        return [_number(value(c)) if c.constants else "void" for c in all_certificates]
+        return [number(value(c), 4) if c.constants else "void" for c in all_certificates]
 
     def constant(name: str) -> list[str]:
         return row(lambda c: getattr(c.constants, name))
@@ -274,9 +275,9 @@ def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
     yield (
         "decay rate, 1/s",
         constant("rate_per_s"),
-        _number(found.resolved.decaying.alpha_per_s),
+        number(found.resolved.decaying.alpha_per_s, 4),
     )
-    yield "updates missing", constant("missing_events"), "-"
+    yield "updates outstanding", constant("missing_events"), "-"
     yield (
         "Δ, bound of ‖e_c‖/β",
         constant("delta"),
@@ -287,17 +288,17 @@ def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
     yield (
         "X, bound of ‖x‖",
         constant("state"),
-        (_number(theorem.state_start + theorem.state_forced) if theorem is not None else "-"),
+        (number(theorem.state_start + theorem.state_forced, 4) if theorem is not None else "-"),
     )
     yield (
-        "inter-event, s",
+        "inter-event time, s",
         row(lambda c: c.inter_event_s),
-        (_number(theorem.inter_event_s) if theorem is not None else "-"),
+        (number(theorem.inter_event_s, 4) if theorem is not None else "-"),
     )
-    yield "error gain (< 1)", constant("loop_gain"), "-"
+    yield "loop gain (< 1)", constant("loop_gain"), "-"
     if any(c.floor_constants for c in all_certificates):
-        yield "floor from, s", row(lambda c: c.floor_from_s), "-"
-        for label, name in (("then, of ‖e_c‖/ε", "delta"), ("then, of ‖x‖", "state")):
+        yield "floor reached at, s", row(lambda c: c.floor_from_s), "-"
+        for label, name in (("from then on, ‖e_c‖/ε", "delta"), ("from then on, ‖x‖", "state")):
             yield (
                 label,
                 row(
@@ -308,21 +309,15 @@ def constants(found: Study) -> Iterator[tuple[str, list[str], str]]:
 
 
 def _print_limits(console: Console, found: Study) -> None:
-    table = Table(title="largest certified values of the schedule, one at a time")
-    for heading in ("", "sampling period", "delay of an update", "age of the input"):
+    table = Table(title="schedule: largest value that is certified, one quantity at a time")
+    for heading in ("", "sampling period", "delay of updates", "age of inputs"):
         table.add_column(heading, justify="right" if heading else "left")
     for scope, limits in found.limits.items():
         table.add_row(scope, *map(_limit, limits))
     console.print(table)
 
 
-def _number(value: float | None) -> str:
-    if value is None or math.isnan(value):
-        return "none"
-    return f"{value:.4g}"
-
-
 def _limit(value_s: float) -> str:
     if value_s <= 0:
         return "none"
-    return "any" if value_s >= _MOST_S else f"{1e3 * value_s:.3g} ms"
+    return "any" if value_s >= _MOST_S else duration(value_s)

@@ -1,4 +1,4 @@
-"""What a person sees of a run's fidelity."""
+"""Tables of a run's fidelity: its difference to the ideal loop, effect by effect."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -7,14 +7,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against, percent
+from cosim.analysis.fidelity import Fidelity, SignalDifference, is_against
+from noack.core.number_format import NONE, percent
 
 
 def print_fidelity(console: Console, fidelity: Fidelity) -> None:
-    """Print the chain from the ideal loop to the run, and the verdict."""
+    """Print the effects from the ideal loop to the run, and the verdict."""
     table = Table(title=f"{fidelity.scenario}: difference in x to the ideal loop")
     table.add_column("effect", no_wrap=True)
-    for heading in ("RMS", "max", "share", "events", "Δt, ms", "parted"):
+    for heading in ("RMS", "max", "share", "events", "Δt, ms", "split at"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_row("(ideal loop)", "", "", "", str(fidelity.events_ideal), "", "")
     for stage in fidelity.stages:
@@ -24,23 +25,23 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
             percent(stage.share),
             str(stage.events),
             _milliseconds(stage.max_event_difference_s),
-            _event(stage.parted_event),
+            _event(stage.first_different_event),
         )
     table.add_section()
     table.add_row(
-        "all together",
+        "total",
         *_sizes(fidelity.total),
         "100.0 %",
         str(fidelity.events_live),
         _milliseconds(fidelity.max_event_difference_s),
-        _event(fidelity.parted_event),
+        _event(fidelity.first_different_event),
     )
     console.print(table)
     console.print(_by_state(fidelity))
     console.print(
-        "Each effect is added to those above it. Δt: largest time difference of an event to the "
-        "line above; parted: first event more than ten measurements apart, from which on the same "
-        "packet fates meet other events. A negative share takes away from what the others make.",
+        "Each row adds one effect to the rows above. Δt: largest change of an event's time. split "
+        "at: first event that moves by more than ten measurements; from there on, the recorded "
+        "losses fall on other events. A negative share partly cancels the other effects.",
         highlight=False,
     )
     colour = "green" if fidelity.explained else "bold red"
@@ -48,7 +49,7 @@ def print_fidelity(console: Console, fidelity: Fidelity) -> None:
 
 
 def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
-    """Rows for the table of a run, from its summary."""
+    """Yield the rows of fidelity for the table of a run."""
     if fidelity is None:
         return
     if fidelity["reason"] is not None:
@@ -58,9 +59,9 @@ def summary_rows(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     of_x = f" ({100 * fidelity['rms_x'] / scale:.2g} % of x)" if scale else ""
     yield "difference to the ideal loop, RMS", f"{fidelity['rms_x']:.3g}{of_x}"
     for name, share in fidelity["shares"].items():
-        if name != "unexplained":
+        if name != "residual":
             against = " (partly cancels the other effects)" if is_against(share) else ""
-            yield f"  share of {name.replace('_', ' ')}", percent(share) + against
+            yield f"  {name.replace('_', ' ')}", percent(share) + against
     yield "  residual, RMS", f"{100 * fidelity['explained_relative']:.2g} % of the difference"
 
 
@@ -70,7 +71,7 @@ def _by_state(fidelity: Fidelity) -> Table:
     for name in fidelity.state_names:
         table.add_column(escape(name), justify="right")
     rows = [(stage.name, stage.difference) for stage in fidelity.stages]
-    for name, difference in [*rows, ("all together", fidelity.total)]:
+    for name, difference in [*rows, ("total", fidelity.total)]:
         table.add_row(name, *(f"{value:.2e}" for value in difference.rms_by_state))
     return table
 
@@ -80,8 +81,8 @@ def _sizes(difference: SignalDifference) -> tuple[str, str]:
 
 
 def _milliseconds(value_s: float | None) -> str:
-    return "-" if value_s is None else f"{1e3 * value_s:.1f}"
+    return NONE if value_s is None else f"{1e3 * value_s:.1f}"
 
 
 def _event(number: int | None) -> str:
-    return "-" if number is None else f"{number}"
+    return NONE if number is None else f"{number}"

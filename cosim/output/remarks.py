@@ -1,7 +1,7 @@
-"""What a person should know before trusting the numbers of a run, a sentence each."""
+"""Remarks on a run: what to know before trusting its numbers, a sentence each."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cosim.analysis.run_summary import Summary
 from cosim.output.run_tables import away, changes_in
@@ -16,17 +16,18 @@ class Remark(NamedTuple):
 
     text: str
     severe: bool = False
-    """Whether the run broke what it guarantees."""
+    """Whether a guarantee was broken."""
 
 
 def remarks(summary: Summary) -> Iterator[Remark]:
     """Yield the remarks on a run, the severe ones first; none if all went well."""
     violations = summary["assumption_violations"]
     for one in violations[:_MOST]:
-        where = f"t = {one['t_s']:.3f} s, seen by {one['process']}"
-        yield Remark(f"assumption violated at {where}: {one['what']}", severe=True)
+        where = f"t = {one['t_s']:.3f} s (reported by {one['process']})"
+        severe = one["cause"] in ("dropouts", "change")
+        yield Remark(f"assumption violated at {where}: {one['what']}", severe=severe)
     if len(violations) > _MOST:
-        yield Remark(f"and {len(violations) - _MOST} more such violations", severe=True)
+        yield Remark(f"{len(violations) - _MOST} more violations of this kind", severe=True)
     if (summary.get("replay") or {}).get("bit_exact") is False:
         yield Remark("the replay of the run differs from its record", severe=True)
     yield from map(Remark, _warnings(summary))
@@ -39,21 +40,21 @@ def _warnings(summary: Summary) -> Iterator[str]:
     late = summary["lateness_us"].get("plant")
     if late and late["late_steps"] > _MOST_LATE * late["steps"]:
         share = 100 * late["late_steps"] / late["steps"]
-        yield f"{share:.0f} % of the plant's steps were late: lower speed or plant.rate_hz"
+        yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
     first, last = summary["initial_state_norm"], summary["final_state_norm"]
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
-    if grew and summary.get("diverged_at_s") is None:  # else the run's end says so
+    if grew and summary.get("diverged_at_s") is None:  # else it is the reason of the end
         yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
     if (summary.get("fidelity") or {}).get("explained") is False:
-        yield "the run's difference to the ideal loop is not explained"
+        yield "sampling, delay and hold do not explain the difference to the ideal loop"
     if summary["missing_samples"]:
         where = ", ".join(f"{n} of {t}" for t, n in summary["missing_by_table"].items())
-        yield f"{summary['missing_samples']} samples are missing in the record: {where}"
-    if summary["lost_outside_netem"]:
-        where = ", ".join(f"{n} on {leg}" for leg, n in summary["lost_by_leg"].items())
-        yield f"{summary['lost_outside_netem']} datagrams were lost elsewhere (kernel): {where}"
+        yield f"{summary['missing_samples']} samples are missing from the record: {where}"
+    if summary["unintended_losses"]:
+        where = ", ".join(f"{n} on {leg}" for leg, n in summary["unintended_losses_by_leg"].items())
+        yield f"{summary['unintended_losses']} datagrams were lost elsewhere (kernel): {where}"
     for one in summary.get("restarts") or ():
-        yield f"{one['process']} was restarted, {away(one)}; claims are void from its death on"
+        yield f"{one['process']} was restarted, {away(one)}; claims are void from then on"
     for when, what in changes_in(summary):
         yield f"{when}: {what}"
     for role, reasons in summary["rejected_datagrams"].items():
@@ -61,14 +62,13 @@ def _warnings(summary: Summary) -> Iterator[str]:
         yield f"{role} rejected datagrams: {counts}"
     if _was_late(summary):
         yield (
-            "this machine was late, which voids claims that do not allow for it: a greater "
-            "certificate.late_periods does, where it can be certified; noack simulate is never late"
+            "This machine was late, so some claims were not judged to the end. To allow more "
+            "lateness, raise certificate.late_periods."
         )
 
 
 def _was_late(summary: Summary) -> bool:
-    """Whether claims are void because of what the machine did, and nobody else."""
-    claims: list[dict[str, Any]] = summary.get("claims") or []
+    """Whether claims are void because this machine was late."""
     undisturbed = summary.get("kind", "live") == "live" and not summary.get("restarts")
-    causes = [str(claim.get("why")) for claim in claims]
-    return undisturbed and any("felt after" in cause or " old" in cause for cause in causes)
+    causes = {one["cause"] for one in summary["assumption_violations"]}
+    return undisturbed and bool(causes & {"delay", "hold"})

@@ -1,4 +1,4 @@
-"""The numbers, the timing and the claims of a run as tables."""
+"""Tables of a run: key numbers, timing, claims."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,27 +11,29 @@ from cosim.analysis.model_comparison import said
 from cosim.analysis.run_summary import Summary
 from cosim.output.assumptions_table import print_assumptions
 from cosim.output.fidelity_table import summary_rows
+from noack.core.number_format import NONE, number, ratio, seconds, whole
 
 Numbers = tuple[tuple[str, str], ...]
-"""Quantities and their values, as a person reads them."""
+"""Quantities and their values, as text."""
 _QUANTILES = ("p50", "p99", "p999", "max")
 
 
 def print_details(console: Console, summary: Summary) -> None:
     """Print everything that a summary has: numbers, timing, assumptions, claims."""
     console.print(number_table(summary, key_numbers(summary)))
-    if summary["lateness_us"]:  # in virtual time nothing is late
+    if summary["lateness_us"]:  # none in virtual time
         console.print(_timing_table(summary))
         _print_realtime(console, summary["realtime"])
-    console.print("the paper's assumptions, for this scenario:")
+    console.print("the paper's assumptions for this scenario:")
     print_assumptions(console, summary["assumptions"])
     print_claims(console, summary)
 
 
 def number_table(summary: Summary, rows: Numbers) -> Table:
-    """A run's numbers as a table, headed by what was run."""
-    simulated = ", simulated" if summary.get("kind") == "simulated" else ""
-    title = f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}{simulated}"
+    """Return a run's numbers as a table; its title names scenario, mode and cap."""
+    kind = summary.get("kind", "live")
+    how = "" if kind == "live" else f", {kind}"
+    title = f"{summary['scenario']}, {_mode(summary)}, M − 1 = {summary['mansd']}{how}"
     table = Table(title=escape(title))
     table.add_column("quantity")
     table.add_column("value", justify="right")
@@ -41,12 +43,13 @@ def number_table(summary: Summary, rows: Numbers) -> Table:
 
 
 def short_numbers(summary: Summary) -> Numbers:
-    """The few numbers of a run that matter most, fit for 80 columns."""
+    """Return the most important numbers of a run, for 80 columns."""
+    lost, longest, *intervals = loss_and_interval_rows(summary)
     return (
-        _lost(summary),
-        _longest_burst(summary),
+        lost,
+        longest,
         _forced(summary),
-        *_intervals(summary),
+        *intervals,
         *_norms(summary),
         *_lateness(summary),
         *_replay_rows(summary.get("replay")),
@@ -54,8 +57,13 @@ def short_numbers(summary: Summary) -> Numbers:
     )
 
 
+def loss_and_interval_rows(summary: Summary) -> Numbers:
+    """Return losses, the longest loss burst, and inter-event times."""
+    return _lost(summary), _longest_burst(summary), *_intervals(summary)
+
+
 def key_numbers(summary: Summary) -> Numbers:
-    """What happened in a run: each quantity and its value, as a person reads them."""
+    """Return all numbers of a run."""
     return (
         ("transmissions", str(summary["events"])),
         ("deliveries", str(summary["deliveries"])),
@@ -65,12 +73,13 @@ def key_numbers(summary: Summary) -> Numbers:
         *_causes(summary),
         *_acknowledgements(summary.get("acknowledgements")),
         _longest_burst(summary),
-        ("loss bursts beyond M − 1", str(len(summary["assumption_violations"]))),
+        ("loss bursts beyond M − 1", str(_bursts_beyond_mansd(summary))),
         *_intervals(summary),
         *_norms(summary),
-        ("numerical check of x_c − x_s (I1)", _number(summary["identity_residual_relative"])),
+        ("numerical check of x_c − x_s (I1)", number(summary["identity_residual_relative"])),
+        *_judged_until(summary.get("judged_until_s")),
         ("missing samples", str(summary["missing_samples"])),
-        ("lost elsewhere (kernel)", str(summary["lost_outside_netem"])),
+        ("lost elsewhere (kernel)", str(summary["unintended_losses"])),
         *_restarts(summary.get("restarts")),
         *changes_in(summary),
         *_watchdog(summary.get("watchdog")),
@@ -82,9 +91,13 @@ def key_numbers(summary: Summary) -> Numbers:
     )  # fmt: skip
 
 
+def _bursts_beyond_mansd(summary: Summary) -> int:
+    return sum(one["cause"] == "dropouts" for one in summary["assumption_violations"])
+
+
 def _lost(summary: Summary) -> tuple[str, str]:
     lost = summary["drops"]
-    return "lost in the network", f"{lost} ({_percent(lost, lost + summary['deliveries'])})"
+    return "lost in the network", f"{lost} ({ratio(lost, lost + summary['deliveries'])})"
 
 
 def _longest_burst(summary: Summary) -> tuple[str, str]:
@@ -98,16 +111,16 @@ def _forced(summary: Summary) -> tuple[str, str]:
 
 
 def _intervals(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield "shortest inter-event time", _seconds(summary["inter_event_min_s"])
-    yield "median inter-event time", _seconds(summary["inter_event_median_s"])
-    yield "median time between deliveries", _seconds(summary["inter_delivery_median_s"])
+    yield "shortest inter-event time", seconds(summary["inter_event_min_s"])
+    yield "median inter-event time", seconds(summary["inter_event_median_s"])
+    yield "median time between deliveries", seconds(summary["inter_delivery_median_s"])
 
 
 def _norms(summary: Summary) -> Iterator[tuple[str, str]]:
-    yield "‖x‖ at the start", _number(summary["initial_state_norm"])
-    yield "‖x‖ at the end", _number(summary["final_state_norm"])
+    yield "‖x‖ at the start", number(summary["initial_state_norm"])
+    yield "‖x‖ at the end", number(summary["final_state_norm"])
     errors = (summary["sup_e_s_norm"], summary["sup_e_c_norm"])
-    yield "largest ‖e_s‖, ‖e_c‖", ", ".join(map(_number, errors))
+    yield "maximum ‖e_s‖, ‖e_c‖", ", ".join(map(number, errors))
 
 
 def _ideal_difference(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
@@ -116,17 +129,18 @@ def _ideal_difference(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, st
 
 
 def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
-    """Of a live run: how long an update took, and who missed most deadlines."""
+    """Latency of updates and missed deadlines of a live run."""
     if latency := summary["latency_us"]:
-        quantiles = " / ".join(_whole(latency[key]) for key in ("p50", "p99"))
+        quantiles = " / ".join(whole(latency[key]) for key in ("p50", "p99"))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"
     late = summary["lateness_us"]
     if late:
         worst = max(late, key=lambda role: late[role]["late_steps"])
-        yield (
-            "most deadlines missed",
-            f"{worst}, {late[worst]['late_steps']} of {late[worst]['steps']}",
-        )
+        missed, steps = late[worst]["late_steps"], late[worst]["steps"]
+        if missed:
+            yield "most deadlines missed", f"{worst}, {missed} of {steps}"
+        else:
+            yield "deadlines missed", "none"
 
 
 def _causes(summary: Summary) -> Iterator[tuple[str, str]]:
@@ -139,7 +153,7 @@ def _causes(summary: Summary) -> Iterator[tuple[str, str]]:
 def _acknowledgements(found: dict[str, int] | None) -> Iterator[tuple[str, str]]:
     if found is not None:
         yield "acknowledgements", str(found["sent"])
-        yield "  of these lost", f"{found['lost']} ({_percent(found['lost'], found['sent'])})"
+        yield "  lost", f"{found['lost']} ({ratio(found['lost'], found['sent'])})"
         yield "  longest loss burst", str(found["longest_loss_burst"])
 
 
@@ -149,13 +163,13 @@ def _restarts(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
 
 
 def changes_in(summary: Summary) -> Iterator[tuple[str, str]]:
-    """What was changed while the run went on, and from when on."""
+    """Yield the changes during the run, each with its time."""
     for one in summary.get("changes") or ():
         yield f"changed at {one['t_s']:.3f} s", one["what"]
 
 
 def interval_of(claim: dict[str, Any]) -> str:
-    """Of which time something is claimed, if not of the whole run."""
+    """Return the interval of a claim; empty for the whole run."""
     from_s, until_s = claim.get("from_s") or 0.0, claim.get("until_s")
     if from_s == 0 and until_s is None:
         return ""
@@ -163,31 +177,36 @@ def interval_of(claim: dict[str, Any]) -> str:
 
 
 def away(restart: dict[str, Any]) -> str:
-    """From when to when somebody was away, and why."""
-    since, until = (_seconds(restart[key]) for key in ("last_s", "first_s"))
+    """Return the interval in which a process was down, and the reason."""
+    since, until = (seconds(restart[key]) for key in ("last_s", "first_s"))
     why = (restart["what"] or "").partition(": ")[2]
-    when = f"at {until}" if restart["last_s"] is None else f"away from {since} to {until}"
+    when = f"at {until}" if restart["last_s"] is None else f"down from {since} to {until}"
     return f"{when}: {why}" if why else when
 
 
 def _watchdog(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     if found is not None and found["trips"]:
         times = "once" if found["trips"] == 1 else f"{found['trips']} times"
-        first, total = _seconds(found["first_s"]), _seconds(found["total_s"])
-        yield "actuations too old (watchdog)", f"{times}, first at {first}, {total} in all"
-        yield "  policy then", found["policy"]
+        first, total = seconds(found["first_s"]), seconds(found["total_s"])
+        yield "watchdog: newest actuation too old", f"{times}, first at {first}, {total} in total"
+        yield "  policy applied", found["policy"]
 
 
 def _estimation(found: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
     if found is not None:
-        rms, expected = _number(found["rms_second_half"]), _number(found["expected_rms"])
+        rms, expected = number(found["rms_second_half"]), number(found["expected_rms"])
         what = f"estimated ({found['observer']})" if found["observer"] else "measured with noise"
-        yield f"state {what}: RMS ‖x̂ − x‖, second half", rms
-        yield "  in the steady state, were the plant the model", expected
+        yield f"state {what}: RMS ‖x̂ − x‖ in the second half", rms
+        yield "  predicted for an exact model", expected
         yield (
-            "largest ‖x̂ − x‖, ‖x_c − x‖",
-            f"{_number(found['max'])}, {_number(found['sup_e_c_norm'])}",
+            "maximum ‖x̂ − x‖, ‖x_c − x‖",
+            f"{number(found['max'])}, {number(found['sup_e_c_norm'])}",
         )
+
+
+def _judged_until(until_s: float | None) -> Iterator[tuple[str, str]]:
+    if until_s is not None:
+        yield "claims checked until", seconds(until_s)
 
 
 def _expected(rate: float | None) -> Iterator[tuple[str, str]]:
@@ -197,21 +216,21 @@ def _expected(rate: float | None) -> Iterator[tuple[str, str]]:
 
 def _disturbances(found: list[dict[str, Any]] | None) -> Iterator[tuple[str, str]]:
     for one in found or ():
-        what = f"disturbance at the {one['at']}, RMS, largest"
-        yield what, f"{_number(one['rms'])}, {_number(one['max'])}"
+        what = f"disturbance at the {one['at']}: RMS, maximum"
+        yield what, f"{number(one['rms'])}, {number(one['max'])}"
 
 
 def print_claims(console: Console, summary: Summary) -> None:
-    """Print what was claimed of a run, and what became of it."""
+    """Print the claims about a run and their verdicts."""
     claims = summary.get("claims")
     if not claims:
         return
     table = Table(title="claims checked against this run")
     parts = any(map(interval_of, claims))
-    for heading in ("source", "claim", *(["of the time"] if parts else []), "used", "verdict"):
+    for heading in ("source", "claim", *(["interval"] if parts else []), "used", "verdict"):
         table.add_column(heading, justify="right" if heading == "used" else "left")
     for claim in claims:
-        used = "-" if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %"
+        used = NONE if claim["ratio"] is None else f"{100 * claim['ratio']:.3g} %"
         since = "" if claim["since_s"] is None else f" since {claim['since_s']:.3f} s"
         colour = _CLAIM_COLOURS[claim["verdict"]]
         table.add_row(
@@ -251,25 +270,25 @@ def _replay_rows(verdict: dict[str, Any] | None) -> Iterator[tuple[str, str]]:
         word = f"bit-exact, {verdict['inputs']:,} inputs"
     else:
         found = verdict["first_difference"]
-        word = f"differs: {found['table']} row {found['row']} {found['column']}"
+        word = f"differs: {found['table']}, row {found['row']}, {found['column']}"
     yield "replay", word if verdict.get("complete", True) else f"{word} (record incomplete)"
 
 
 def _timing_table(summary: Summary) -> Table:
-    table = Table(title="timing, wall µs; missed: deadlines missed")
+    table = Table(title="timing in µs of wall time (missed: deadlines missed)")
     for heading in ("", "p50", "p99", "p99.9", "max", "count", "missed"):
         table.add_column(heading, justify="right" if heading else "left")
     for role, late in summary["lateness_us"].items():
         table.add_row(
             f"{role} lateness",
-            *(_whole(late[key]) for key in _QUANTILES),
+            *(whole(late[key]) for key in _QUANTILES),
             str(late["steps"]),
             str(late["late_steps"]),
         )
     latency = summary["latency_us"]
     table.add_row(
         "sensor-to-controller latency",
-        *(_whole(latency[key]) for key in _QUANTILES),
+        *(whole(latency[key]) for key in _QUANTILES),
         str(latency["updates"]),
         "",
     )
@@ -277,7 +296,7 @@ def _timing_table(summary: Summary) -> Table:
 
 
 def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> None:
-    """One line for all processes that were granted the same."""
+    """Print one line for all processes with the same real-time settings."""
     roles_by_settings: dict[str, list[str]] = {}
     for role in sorted(realtime):
         verdicts = realtime[role]
@@ -292,19 +311,3 @@ def _print_realtime(console: Console, realtime: dict[str, dict[str, str]]) -> No
 
 def _mode(summary: Summary) -> str:
     return "model-based" if summary["mode"] == "model" else "zero-order hold"
-
-
-def _percent(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.0f} %" if whole else "-"
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f} s"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
-
-
-def _whole(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0f}"

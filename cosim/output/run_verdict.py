@@ -1,4 +1,4 @@
-"""What a person sees at the end of a run: a verdict of three lines, a table, where the rest is."""
+"""The end of a run on the terminal: a verdict of three lines, a table, where to find more."""
 
 import shutil
 import sys
@@ -21,7 +21,7 @@ from noack.runtime.life_cycle import HORIZON
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
-"""What may become of a claim that did not hold, and how it looks; the worst first."""
+"""Styles of claims that did not hold, the worst first."""
 
 
 class VerdictLine(NamedTuple):
@@ -33,20 +33,19 @@ class VerdictLine(NamedTuple):
 
 
 def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
-    """How far the run came, its transmissions against the ideal loop's, its claims."""
+    """Return three lines: how the run ended, its transmissions, its claims."""
     return _ending(summary), VerdictLine(_transmissions(summary), NEUTRAL), _claims(summary)
 
 
 def _ending(summary: Summary) -> VerdictLine:
     end, reached = summary["exit"], f"{summary['reached_s']:g} s"
     if end["status"] == ExitStatus.OK:
-        return VerdictLine(
-            f"completed {reached}" + ("" if end["reason"] == HORIZON else f": {end['reason']}"),
-            GOOD,
-        )
-    style = BAD if end["status"] == ExitStatus.FAILED else DOUBTFUL
+        why = "" if end["reason"] == HORIZON else f": {end['reason']}"
+        return VerdictLine(f"completed {reached}{why}", GOOD)
+    if end["status"] == ExitStatus.FAILED:
+        return VerdictLine(f"failed after {reached}: {end['reason']}", BAD)
     return VerdictLine(
-        f"not completed: {end['reason']} ({reached} of {summary['horizon_s']:g} s)", style
+        f"stopped after {reached} of {summary['horizon_s']:g} s: {end['reason']}", DOUBTFUL
     )
 
 
@@ -57,7 +56,7 @@ def _transmissions(summary: Summary) -> str:
 
 
 def _claims(summary: Summary) -> VerdictLine:
-    """How many claims held; the others by what became of them, with the first reason."""
+    """Count the claims by verdict, each with its first reason."""
     claims = summary.get("claims") or []
     if not claims:
         return VerdictLine("claims: none", NEUTRAL)
@@ -78,10 +77,10 @@ def _reason(claims: list[dict[str, str]], name: str) -> str:
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) -> None:
-    """Print the verdict, the key numbers, what else a person should know, where the rest is.
+    """Print the verdict, the key numbers, the remarks, and where to find more.
 
     Args:
-        console: where to.
+        console: of the output.
         outcome: of the run.
         verbose: print all tables instead of the key numbers.
     """
@@ -100,7 +99,7 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
-    """Where there is more: the files of a run, or one line with the nearest way to them."""
+    """Yield the files of a run, or one line that says how to see them."""
     run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
     if not verbose:
         page = f"{report} and " if report.is_file() else ""
@@ -113,7 +112,7 @@ def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
 
 
 def _program() -> str:
-    """How the person called us, so that the next command can be typed alike."""
+    """Return the name under which noack was started, for the commands that are shown."""
     program = Path(sys.argv[0])
     if shutil.which(program.name) == str(program):
         return program.name

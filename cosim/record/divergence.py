@@ -61,13 +61,13 @@ def divergence(t_s: Vector, x: Matrix, scenarios: Iterable[Scenario]) -> Diverge
     at_s = float(t_s[np.argmax(norms > GROWTH * scale)])
     return Divergence(
         at_s,
-        f"diverged: ‖x‖ passed {GROWTH * scale:.3g}, {GROWTH:g} times the scale of the run, at "
+        f"diverged: ‖x‖ passed {GROWTH * scale:.3g} ({GROWTH:g} times its expected size) at "
         f"{at_s:g} s, reached {last:.3g}, and was still growing at the end",
     )
 
 
 def _scale(scenario: Scenario) -> float:
-    """What a resolved scenario says of the scale of ‖x‖."""
+    """Return the size of ‖x‖ that a scenario lets expect from its disturbances and set-point."""
     loop = loop_of(scenario)
     carried = 0.0
     for one in scenario.plant.disturbances:

@@ -1,4 +1,4 @@
-"""How far what the sensor knows of the plant's state is from that state: nobody in the loop can."""
+"""The difference between the plant's state and the state that the sensor measures or estimates."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ def true_states(steps: Rows, t_ns: NDArray[np.int64]) -> Reals:
 
 
 def estimation_error(record: RunRecord) -> Reals:
-    """What the sensor takes for x, less x, at each measurement, (k, n); NaN where x is missing."""
+    """x̂ − x at each measurement, (k, n); NaN where x is missing."""
     rows = record[SENSOR_MEASUREMENT]
     return np.asarray(rows["x"] - true_states(record[PLANT_STEP], rows["t_ns"]))
 
@@ -60,12 +60,12 @@ def estimation_summary(record: RunRecord, e_c_sup: float | None) -> dict[str, An
 
 
 def expected_rms(resolved: Scenario) -> float:
-    """‖x̂ − x‖ that noise and random disturbances lead to, if the plant is the model."""
+    """RMS of ‖x̂ − x‖ in the steady state, by noise and random disturbances, for an exact model."""
     return float(np.sqrt(np.trace(steady_state(resolved).covariance)))
 
 
 def disturbance_summary(record: RunRecord) -> list[dict[str, Any]]:
-    """What was added to u and to ẋ, by place, for the summary of a run."""
+    """The disturbances of u and of ẋ, for the summary of a run."""
     steps, found = record[PLANT_STEP], []
     for place, column in (("input", "d"), ("state", "w")):
         if column not in (steps.dtype.names or ()):

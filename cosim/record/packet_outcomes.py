@@ -42,7 +42,7 @@ class PacketOutcome(NamedTuple):
         return longest
 
 
-def crossing(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
+def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
     """Say what became of the updates, or acknowledgements, that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]

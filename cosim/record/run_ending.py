@@ -1,7 +1,7 @@
 """How a run ended, stored in its directory as soon as it is known.
 
-The file is made when the run begins, and blank until the end is known: so its place on the disk is
-taken, and the reason can be stored when the disk is full, or may no longer be written.
+The file is made when the run begins and is blank until the end is known. Its space on the disk is
+thus reserved, and the reason can be stored when the disk is full or no longer writable.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from typing import Self
 from cosim.record.run_directory import ENDING_FILE
 from noack.core.errors import ExitStatus, MachineError, NoackError, why
 
-_ROOM_BYTES = 4096
+_RESERVED_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class RunEnding:
     status: ExitStatus
     reason: str
     startup_s: float | None = None
-    """Wall time from the launch to simulated time 0; None if nobody saw it."""
+    """Wall time from the launch to simulated time 0; None if it is not known."""
 
 
 class EndingFile:
     """The file in which a run's launcher stores how the run ends.
 
-    As a context it also stores the error that leaves it, unless an end is stored.
+    As a context manager it stores the error that leaves the context, unless an end is stored.
 
     Args:
         run_dir: the run's directory.
@@ -45,7 +45,7 @@ class EndingFile:
         self._is_blank = True
         try:
             self._file = (run_dir / ENDING_FILE).open("wb", buffering=0)
-            self._file.write(b" " * _ROOM_BYTES)
+            self._file.write(b" " * _RESERVED_BYTES)
         except OSError as error:
             raise MachineError(f"{run_dir}: the run cannot be written: {why(error)}") from None
 
@@ -63,11 +63,11 @@ class EndingFile:
         self._file.close()
 
     def store(self, status: ExitStatus, reason: str, startup_s: float | None = None) -> None:
-        """Store how the run ended, in the words of its summary."""
-        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        """Store how the run ended, under the keys of its summary."""
         self._is_blank = False
-        text = json.dumps(found).encode().ljust(_ROOM_BYTES)
-        with contextlib.suppress(OSError):  # the terminal shows it all the same
+        found = {"exit": {"status": int(status), "reason": reason}, "startup_s": startup_s}
+        text = json.dumps(found).encode().ljust(_RESERVED_BYTES)
+        with contextlib.suppress(OSError):  # the terminal shows it, too
             self._file.seek(0)
             self._file.write(text)
             self._file.truncate()

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
+from noack.config.controllers import AnyController
 from noack.config.message_sizes import MessageSizes
 from noack.config.observers import AnyObserver
 from noack.config.scenario_changes import check_changes
 from noack.config.scenario_checks import check_sections
-from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.model_section import ModelSection
 from noack.config.sections.network_section import NetworkSection
 from noack.config.sections.plant_section import PlantSection
@@ -28,6 +28,7 @@ from noack.config.sections.run_sections import (
 from noack.config.theory_coverage import TheoryCoverage
 from noack.config.timing import Timing
 from noack.config.triggers import AnyTrigger
+from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.errors import CallerError
 from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
@@ -60,7 +61,7 @@ class Scenario(ScenarioSection):
     """How the sensor estimates the state from what is measured: a table with ``kind``; unless
     given, what is measured is the state."""
     network: NetworkSection
-    controller: ControllerSection = ControllerSection()
+    controller: AnyController = LinearFeedbackSettings()
     certificate: CertificateSection = CertificateSection()
     recovery: RecoverySection = RecoverySection()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from noack.config.controllers import AnyController
 from noack.config.runtime_parameters import LOSS, MANSD, put_settings, require_runtime_parameters
 from noack.config.scenario_checks import check_setpoint, check_trigger
-from noack.config.sections.controller_section import ControllerSection
 from noack.config.sections.network_section import NetworkSection
 from noack.config.triggers import AnyTrigger
 from noack.impairments.link_settings import Mansd, require_scores
@@ -23,7 +23,7 @@ _CHANGEABLE: Mapping[str, TypeAdapter[Any]] = {
     LOSS: TypeAdapter(Loss),
     MANSD: TypeAdapter(Mansd),
     "trigger": TypeAdapter(AnyTrigger),
-    "controller": TypeAdapter(ControllerSection),
+    "controller": TypeAdapter(AnyController),
 }
 """The parts of a scenario that may change during a run."""
 

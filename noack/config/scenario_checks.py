@@ -56,6 +56,8 @@ def check_setpoint(scenario: "Scenario") -> None:
         return
     if scenario.is_acknowledged:
         raise ValueError(f'{key}: not with network.protocol = "ack"')
+    if not scenario.controller.is_linear:
+        raise ValueError(f'{key}: not with controller.kind = "{scenario.controller.kind}"')
     if scenario.message_sizes.is_predictive:
         raise ValueError(
             f"{key}: the plant's watchdog does not have it; "
@@ -106,6 +108,11 @@ def _check_watchdog(scenario: "Scenario") -> None:
         raise ValueError(
             "plant.watchdog.timeout_s: shorter than a period of the controller "
             f"({timing.controller_period_ns / NS_PER_S} s)"
+        )
+    if scenario.message_sizes.is_predictive and not scenario.controller.is_linear:
+        raise ValueError(
+            'plant.watchdog.policy: "model" predicts u = K x_c; '
+            f'not with controller.kind = "{scenario.controller.kind}"'
         )
     if scenario.message_sizes.actuation_entries > MAX_DIMENSION:
         raise ValueError(

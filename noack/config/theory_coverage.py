@@ -45,6 +45,8 @@ class TheoryCoverage:
             return 'network.protocol = "ack": updates are acknowledged'
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
+        if not scenario.controller.is_linear:
+            return f'controller.kind = "{scenario.controller.kind}": u is not K x_c'
         if scenario.plant.disturbances:
             kinds = ", ".join(one.kind for one in scenario.plant.disturbances)
             return f"plant.disturbances ({kinds}): the plant is disturbed"
@@ -95,13 +97,18 @@ class TheoryCoverage:
             )
 
     def require_exact(self) -> None:
-        """Check that the plant is linear and undisturbed, and that the sensor measures its state.
+        """Check that exact simulation covers the plant, controller, measurement and trigger.
 
         Raises:
             CallerError: one of these is not so.
         """
         self.require_linear()
         scenario = self.scenario
+        if not scenario.controller.is_linear:
+            raise CallerError(
+                'controller.kind: needs the controller u = K x_c, "linear"; '
+                f'this scenario has "{scenario.controller.kind}"'
+            )
         if scenario.plant.disturbances:
             kinds = ", ".join(f'"{one.kind}"' for one in scenario.plant.disturbances)
             raise CallerError(
@@ -117,3 +124,5 @@ class TheoryCoverage:
                 "plant.measurement: needs a sensor without noise; "
                 "this scenario has noise_std or noise_bound"
             )
+        if (why := scenario.trigger.beyond_exact) is not None:
+            raise CallerError(why)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from noack.config.sections.rates import period_ns
 from noack.core.clock import NS_PER_S
+from noack.settings.rates import period_ns
 
 if TYPE_CHECKING:
     from noack.config.scenario import Scenario

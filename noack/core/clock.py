@@ -1,42 +1,12 @@
-"""Clocks: integer nanoseconds of simulated time since the run's epoch.
+"""Simulated time: integer nanoseconds since the run's epoch.
 
-The core never reads a clock; shells pass ``now_ns`` in. ``speed`` is simulated time per wall time.
+Machines never read a clock; shells pass ``now_ns`` in. ``speed`` is simulated time per wall time.
 """
 
 import time
 from collections.abc import Callable
-from typing import Protocol
 
 NS_PER_S = 1_000_000_000
-
-
-class Clock(Protocol):
-    """Something that tells simulated time."""
-
-    def now_ns(self) -> int:
-        """Simulated nanoseconds since the run's epoch (negative before it)."""
-        ...
-
-
-class ManualClock:
-    """A clock that stands still until it is set; for simulation, replay and tests."""
-
-    def __init__(self, now_ns: int = 0) -> None:
-        self._now_ns = now_ns
-
-    def now_ns(self) -> int:
-        """Simulated nanoseconds since the run's epoch."""
-        return self._now_ns
-
-    def advance_to(self, now_ns: int) -> None:
-        """Move to ``now_ns``.
-
-        Raises:
-            ValueError: ``now_ns`` lies in the past.
-        """
-        if now_ns < self._now_ns:
-            raise ValueError(f"time cannot go back from {self._now_ns} ns to {now_ns} ns")
-        self._now_ns = now_ns
 
 
 class RunClock:

@@ -11,16 +11,15 @@ class ExitStatus(IntEnum):
     FAILED = 1
     CALLER = 2
     UNINTENDED_LOSSES = 3
-    """An emulator on its own lost datagrams unintentionally: its guarantee does not hold."""
+    """A stand-alone emulator had unintended losses: its guarantee does not hold."""
     INTERRUPTED = 130
     TERMINATED = 143
 
 
 class NoackError(Exception):
-    """An error that is reported to a person as one line, without a traceback.
+    """An error that is reported as one line, without a traceback; one line for each mistake.
 
-    Of several mistakes each has a line. What was wrong is quoted, and may be anything: what cannot
-    be printed is escaped.
+    Quoted input may contain anything: unprintable characters are escaped.
     """
 
     exit_status = ExitStatus.FAILED
@@ -36,7 +35,7 @@ class CallerError(NoackError):
 
 
 class PeerError(NoackError):
-    """Another process failed: it died, never came, or broke the protocol."""
+    """Another process failed: it died, was not ready, or broke the protocol."""
 
 
 class NoAnswerError(PeerError):
@@ -48,7 +47,7 @@ class MachineError(NoackError):
 
 
 class NeverStartedError(NoackError):
-    """A run ended before it had begun; the exit status tells whose fault it was."""
+    """A run ended before its start; the exit status says who erred."""
 
     def __init__(self, message: str, exit_status: ExitStatus) -> None:
         super().__init__(message)
@@ -56,17 +55,17 @@ class NeverStartedError(NoackError):
 
 
 def one_line(error: BaseException) -> str:
-    """Return what an error of somebody else's says, which may be of several lines, as one."""
+    """Return the message of a foreign error as one line."""
     return " ".join(str(error).split())
 
 
 def why(error: OSError) -> str:
-    """Return why the system refused, in its own words, without what some libraries put around."""
+    """Return the system's reason for an error, without additions of libraries."""
     return os.strerror(error.errno) if error.errno else one_line(error)
 
 
 def printable(text: str) -> str:
-    r"""Return a text as one line in which what cannot be printed is escaped (``\x1b``, ``\n``)."""
+    r"""Return a text as one line with unprintable characters escaped (``\x1b``, ``\n``)."""
     if text.isprintable():
         return text
     return "".join(

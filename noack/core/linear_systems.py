@@ -16,12 +16,12 @@ Matrix = NDArray[np.float64]
 
 _CACHED_STEPS = 4096
 _SAFE = 1e-140
-"""Vectors of at least this size, and at most its inverse, have squares that are numbers."""
+"""Squares of vectors between this size and its inverse neither underflow nor overflow."""
 
 
 def transition(generator: Matrix, dt_ns: int) -> Matrix:
     """The transition matrix e^{G dt}, shape (n, n), of ``dz/dt = G z`` over ``dt_ns``."""
-    # The slowest import of all, so that those who propagate nothing should not wait for it.
+    # A slow import, only for programs that propagate states.
     from scipy.linalg import expm
 
     return np.ascontiguousarray(expm(generator * (dt_ns * 1e-9)))
@@ -51,7 +51,7 @@ class Propagator:
 
     Args:
         generator: G, shape (n, n), per second.
-        steps_ns: steps to prepare now, so that a loop need not at its first deadlines.
+        steps_ns: steps to precompute, so that the first deadlines are not delayed.
     """
 
     def __init__(self, generator: Matrix, steps_ns: Iterable[int] = ()) -> None:
@@ -87,16 +87,16 @@ class HeldInputPropagator:
 
 
 def norm(vector: Vector) -> float:
-    """Euclidean norm ‖v‖₂ of a vector of shape (n,); does not overflow before it must."""
+    """Euclidean norm ‖v‖₂ of a vector of shape (n,); avoids overflow of squares."""
     return math.hypot(*vector.tolist())
 
 
 def row_norms(rows: Matrix) -> Vector:
-    """Euclidean norms of k vectors, (k, n) → (k,); like :func:`norm`, they overflow late.
+    """Euclidean norms of k vectors, (k, n) → (k,); avoids overflow of squares.
 
     Where squares are safe, these are numpy's, bit for bit.
     """
-    with np.errstate(over="ignore", under="ignore"):  # these are looked at again
+    with np.errstate(over="ignore", under="ignore"):  # recomputed below
         norms = np.asarray(np.linalg.norm(rows, axis=1))
     doubtful = (norms < _SAFE) | ~(norms < 1 / _SAFE)
     if doubtful.any():

@@ -1,6 +1,6 @@
-"""What sensor and controller integrate between updates: dx/dt = H(x − x_r), exactly.
+"""The model of sensor and controller between updates: dx/dt = H(x − x_r), solved exactly.
 
-The set-point x_r may change at times that both know, so that both models change alike.
+The set-point x_r changes at times known to both, so that both models change alike.
 """
 
 from bisect import bisect_right
@@ -12,12 +12,12 @@ from noack.core.linear_systems import Matrix, Propagator, Vector
 
 
 class ModelFlow:
-    """Takes a model's state from one time to another.
+    """Propagates the model's state from one time to another.
 
     Args:
-        H: what both models integrate, shape (n, n), per second.
-        steps_ns: steps to prepare now.
-        setpoint: x_r at first, shape (n,); None is 0.
+        H: the closed-loop matrix, shape (n, n), per second.
+        steps_ns: steps to precompute.
+        setpoint: initial x_r, shape (n,); None is 0.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class ModelFlow:
         self._moved = setpoint is not None
 
     def change(self, since_ns: int, setpoint: Vector | None) -> None:
-        """Set another set-point from a time on, which is not before those of earlier changes."""
+        """Set another set-point from a time on; times must not decrease."""
         if not _same(self._setpoints[-1], setpoint):
             self._since_ns.append(since_ns)
             self._setpoints.append(setpoint)
@@ -41,11 +41,11 @@ class ModelFlow:
 
     @property
     def moved(self) -> bool:
-        """Whether there ever is a set-point other than 0."""
+        """Whether any set-point differs from 0."""
         return self._moved
 
     def __call__(self, x: Vector, from_ns: int, to_ns: int) -> Vector:
-        """Return the state at ``to_ns`` of a model that is in ``x``, (n,), at ``from_ns``."""
+        """Return the state at ``to_ns`` of a model with state ``x``, (n,), at ``from_ns``."""
         if not self._moved:
             return self.propagate(x, to_ns - from_ns)
         place = bisect_right(self._since_ns, from_ns)

@@ -1,4 +1,4 @@
-"""How a Python child process is started: without importing from the current folder."""
+"""Command of a Python child process that imports nothing from the current folder."""
 
 import sys
 
@@ -6,7 +6,7 @@ import sys
 def python_command(*arguments: object) -> list[str]:
     """Return the command that runs this Python interpreter with the arguments given.
 
-    With ``-P`` the interpreter does not look for modules in the current folder, which anybody may
-    have written to.
+    With ``-P`` the interpreter does not import from the current folder, where others may be able to
+    write.
     """
     return [sys.executable, "-P", *map(str, arguments)]

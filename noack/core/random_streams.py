@@ -24,9 +24,9 @@ def stream(seed: int, *name: str) -> np.random.Generator:
 
 
 def words(seed: int, *name: str, rows: range, width: int) -> NDArray[np.uint64]:
-    """Return rows of a random table; each depends on its number only, not on which are asked for.
+    """Return rows of a random table; each depends on its number only.
 
-    Philox4x64 counts its blocks of four words, so that any row is found at once.
+    Philox4x64 is counter-based: any row is computed directly.
 
     Args:
         seed: non-negative integer.
@@ -55,9 +55,9 @@ def uniforms(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float
 def normals(seed: int, *name: str, rows: range, width: int) -> NDArray[np.float64]:
     """Return rows of a table of standard normal numbers; see :func:`words`.
 
-    By inversion of the distribution function, so that each takes one word, wherever it lies.
+    By inversion of the distribution function, so that each takes exactly one word.
     """
-    # Much to import for those who draw no normals.
+    # A slow import, only for programs that draw normals.
     from scipy.special import ndtri
 
     centred = uniforms(seed, *name, rows=rows, width=width) + 2.0**-54

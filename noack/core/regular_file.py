@@ -1,4 +1,4 @@
-"""Reading files of limited size: a device has no end, and a FIFO waits for a writer."""
+"""Reading regular files of limited size; devices are endless, and a FIFO may block."""
 
 import os
 import stat
@@ -10,13 +10,13 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
 
     Args:
         path: of the file.
-        most_bytes: that it may have.
+        most_bytes: its maximum size.
 
     Raises:
         OSError: it cannot be opened or read.
         ValueError: it is a device, a FIFO or a directory; or it is larger.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # which a FIFO does not hold up
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # so that a FIFO does not block
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise ValueError("not a regular file")

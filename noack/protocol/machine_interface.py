@@ -45,7 +45,7 @@ class Record(NamedTuple):
 RESTART = "restart"
 """Level of the notice of a restarted process."""
 FAILED = "failed"
-"""Level of the notice of a plant that has failed."""
+"""Level of the notice of a plant or controller that cannot continue."""
 
 
 class Notice(NamedTuple):

@@ -1,12 +1,13 @@
-"""The picture: who sends which flow to whom. Nothing else is ever sent in the loop.
+"""Topology of the loop: which process sends which flow to which.
 
-plant ──measurement──▶ sensor ──update──▶ netem ──what survives──▶ controller
-▲                                                                    │
-└────────────────────────────── actuation ───────────────────────────┘
+plant ──measurement──▶ sensor ──update──▶ netem ──delivered updates──▶ controller
+▲                                                                          │
+└───────────────────────────────── actuation ──────────────────────────────┘
 
-The acknowledgement baseline (``network.protocol = "ack"``) has one way more, over the same sockets:
+The acknowledgement baseline (``network.protocol = "ack"``) adds a reverse path, over the same
+sockets:
 
-sensor ◀──what survives── netem ◀──acknowledgement── controller
+sensor ◀──delivered acknowledgements── netem ◀──acknowledgement── controller
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from noack.protocol.wire_format import Flow
 
 
 class MessageRoute(NamedTuple):
-    """What a process receives, and what it sends to whom."""
+    """Received flow, sent flow and receiver of a process."""
 
     receives: Flow
     sends: Flow
@@ -31,18 +32,18 @@ ROUTES: Mapping[str, MessageRoute] = {
 }
 
 SENDER: Mapping[str, str] = {leg.to: role for role, leg in ROUTES.items()}
-"""From whom each process receives."""
+"""The peer from which each process receives."""
 
 ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
-"""To whom each process sends acknowledgements, in the acknowledgement baseline alone."""
+"""Receiver of each process's acknowledgements, in the acknowledgement baseline only."""
 
 ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
-"""From whom each process receives them."""
+"""Sender of the acknowledgements that each process receives."""
 
 LOOP_ROLES = tuple(ROUTES)
 PLANT = "plant"
 CHANGEABLE = ("sensor", "netem", "controller")
-"""Processes whose settings may change during a run."""
+"""Processes with runtime parameters."""
 RECORDER = "recorder"
 COORDINATOR = "coordinator"
 ROLES = (*LOOP_ROLES, RECORDER)

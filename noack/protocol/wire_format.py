@@ -1,6 +1,6 @@
 """The wire format of the loop: one datagram, one message.
 
-Nothing is ever acknowledged, except in the variant ``network.protocol = "ack"``, the baseline.
+Only the acknowledgement baseline (``network.protocol = "ack"``) acknowledges messages.
 
 Layout, version 1, little endian (``docs/wire.md`` has test vectors)::
 
@@ -16,8 +16,8 @@ Layout, version 1, little endian (``docs/wire.md`` has test vectors)::
         32    8n  vector, float64
      32+8n    16  tag: keyed BLAKE2b over all that precedes it, under the run's key
 
-The tag covers flow, run and sequence number, so a datagram of one flow cannot be passed off as one
-of another. Content is read only after the tag has been verified.
+The tag covers flow, run and sequence number, so that no datagram passes for one of another flow.
+Content is read only after the tag was verified.
 """
 
 import hashlib
@@ -37,15 +37,15 @@ MAX_DIMENSION = 64
 KEY_BYTES = 32
 TAG_BYTES = 16
 SEQUENCES, TIMES_NS = 2**63, 2**62
-"""Sequence numbers and times of a run are below: they fit the record's columns, with room to add
-to a time. Nobody counts so far: at 100,000 a second it takes three million years."""
+"""Upper limits of sequence numbers and times: they fit the record's columns, and sums of times do
+too. At 100,000 messages a second, 2⁶³ take three million years."""
 _HEADER = struct.Struct("<2sBBHHQQq")
 HEADER_BYTES = _HEADER.size
 MAX_DATAGRAM_BYTES = HEADER_BYTES + 8 * MAX_DIMENSION + TAG_BYTES
 
 
 class Flow(IntEnum):
-    """What a datagram carries, and thereby between whom."""
+    """What a datagram carries, and so between which processes."""
 
     MEASUREMENT = 1
     """plant → sensor: the plant state x(t_k), shape (n,); with an observer what is measured of it,
@@ -60,7 +60,7 @@ class Flow(IntEnum):
 
 
 NO_VECTOR: Vector = np.zeros(0)
-"""What an acknowledgement carries."""
+"""The vector of an acknowledgement."""
 
 
 class Message(NamedTuple):
@@ -103,7 +103,7 @@ def datagram_bytes(dimension: int) -> int:
 
 
 def read_header(datagram: bytes) -> Header | None:
-    """Read the header of a datagram without verifying it; None if it is not one of ours."""
+    """Read the header of a datagram without verification; None if it is no datagram of noack."""
     if len(datagram) < HEADER_BYTES or datagram[:2] != MAGIC:
         return None
     _, version, flow, dimension, _, run_id, sequence, t_ns = _HEADER.unpack_from(datagram)
@@ -111,7 +111,7 @@ def read_header(datagram: bytes) -> Header | None:
 
 
 def flow_of(datagram: bytes) -> int | None:
-    """The flow that a datagram says it is of, unverified; None if it is too short to say."""
+    """The flow field of a datagram, unverified; None if the datagram is too short."""
     return datagram[3] if len(datagram) >= HEADER_BYTES else None
 
 
@@ -169,7 +169,7 @@ class Encoder:
 
 
 class Decoder:
-    """Turns the datagrams of one flow into messages; everything else is counted and ignored.
+    """Turns the datagrams of one flow into messages; all others are counted and rejected.
 
     Only a datagram that is newer than every one accepted before is accepted.
 
@@ -178,8 +178,8 @@ class Decoder:
         dimension: entries of its vector.
         run_id: the run.
         key: the run's secret key, 32 bytes.
-        not_before_ns: who takes another's place has not seen what it accepted: what is older than
-            this is stale.
+        not_before_ns: older datagrams are stale: the process before a restart may have accepted
+            them.
     """
 
     def __init__(
@@ -207,7 +207,7 @@ class Decoder:
 
         Args:
             datagram: as received.
-            from_peer: whether it came from the address that sends this flow; from elsewhere even an
+            from_peer: whether it came from the peer's address; from any other source even an
                 authentic datagram is a replay.
         """
         verdict = self._examine(datagram, from_peer=from_peer)
@@ -224,7 +224,7 @@ class Decoder:
         return {"accepted": self.accepted, "rejected": rejected}
 
     def _examine(self, datagram: bytes, *, from_peer: bool) -> Message | Rejection:
-        # Cheap tests of the outer form come first: they shed junk and name the commonest mistakes.
+        # Cheap tests first: they reject most invalid input and name common mistakes.
         if len(datagram) < HEADER_BYTES:
             return Rejection.LENGTH
         magic, version, flow, dimension, _, run_id, sequence, t_ns = _HEADER.unpack_from(datagram)

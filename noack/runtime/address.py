@@ -1,4 +1,4 @@
-"""Addresses as people write them: ``host:port``, ``[::1]:9000``, ``:9000``."""
+"""Addresses as text: ``host:port``, ``[::1]:9000``, ``:9000``."""
 
 import re
 import socket
@@ -6,26 +6,26 @@ import socket
 from noack.core.errors import CallerError
 
 Address = tuple[str, int]
-"""Host, as a number, and port."""
+"""Numeric host and port."""
 
 _FORM = re.compile(r"(?:\[(?P<six>[^\[\]]+)\]|(?P<host>[^\[\]:]*)):(?P<port>[0-9]{1,5})")
 
 
 def parse_address(text: str, what: str, like: Address | None = None) -> Address:
-    """Parse an address. A host's name is looked up; no host is the loopback.
+    """Parse an address. A host name is looked up; without a host it is the loopback.
 
     Args:
         text: ``127.0.0.1:9000``, ``[::1]:9000``, ``[fe80::1%eth0]:9000``, ``localhost:9000`` or
             ``:9000``.
         what: the option or key that it stands in, for messages.
-        like: where there is a choice, the address is of the same family; of IPv4 without.
+        like: prefer the family of this address; IPv4 without it.
 
     Raises:
         CallerError: it is not of that form, or there is no such host.
     """
     found = _FORM.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:
-        hint = "; an IPv6 address stands in brackets" if text.count(":") > 1 else ""
+        hint = "; put an IPv6 address in brackets" if text.count(":") > 1 else ""
         raise CallerError(
             f"{what}: expected HOST:PORT, e.g. 127.0.0.1:9000, [::1]:9000 or :9000; "
             f"found {text!r}{hint}"
@@ -36,7 +36,7 @@ def parse_address(text: str, what: str, like: Address | None = None) -> Address:
     try:
         entries = socket.getaddrinfo(host, int(found["port"]), wanted, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "this is no host's name"
+        reason = error.strerror if isinstance(error, OSError) else "not a host name"
         raise CallerError(f"{what}: {host}: no such host ({reason})") from None
     best = min(entries, key=lambda entry: entry[0] != family)
     host, port, *more = best[4]

@@ -1,8 +1,8 @@
-"""The ticket: what a process needs to join a run, handed over by the launcher.
+"""The ticket: what a process needs to join a run.
 
-It holds the run's secret key, so it never travels on a command line or in the environment: the
-launcher writes it to its children's standard input. For processes that a person starts, it lies in
-a file that only its owner can read, in the user's runtime directory.
+It contains the run's secret key, so it is never on a command line or in the environment. The
+launcher writes it to the standard input of launched processes. For processes started by hand it is
+in a file of the user's runtime directory, which only its owner can read.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ class _Fields(ScenarioSection):
 
 
 class Ticket(NamedTuple):
-    """Admission to a run."""
+    """What a process needs to join a run."""
 
     run_id: int
     key: bytes
@@ -47,12 +47,12 @@ class Ticket(NamedTuple):
     """zenoh endpoint of the control plane, e.g. ``tcp/127.0.0.1:7447``."""
     run_dir: str
     launched: bool
-    """Whether a launcher holds the process's standard input as its lifeline."""
+    """Whether a launcher holds the process's standard input open as its lifeline."""
     scenario: Scenario
     """Resolved."""
 
     def fields(self) -> dict[str, Any]:
-        """The ticket as what JSON can hold."""
+        """The ticket's fields as JSON values."""
         scenario = self.scenario.model_dump(mode="json")
         return self._asdict() | {"key": self.key.hex(), "scenario": scenario}
 
@@ -74,7 +74,7 @@ def new_ticket(scenario: Scenario, endpoint: str, run_dir: Path, *, launched: bo
 
 
 def loads(text: str) -> Ticket:
-    """Read a ticket back.
+    """Parse a ticket.
 
     Raises:
         CallerError: the text is not a ticket.
@@ -82,12 +82,12 @@ def loads(text: str) -> Ticket:
     try:
         fields = _Fields.model_validate_json(text)
     except ValidationError as error:
-        raise CallerError(f"not a ticket of this version of noack: {brief(error)}") from None
+        raise CallerError(f"not a valid ticket: {brief(error)}") from None
     return Ticket(**dict(fields) | {"key": bytes.fromhex(fields.key)})
 
 
 def ticket_path(session: str) -> Path:
-    """Where the ticket of a session lies that a person's processes join.
+    """Path of the ticket of a session, for processes started by hand.
 
     Raises:
         CallerError: the name is not fit for a file.
@@ -100,7 +100,7 @@ def ticket_path(session: str) -> Path:
 def published(ticket: Ticket, session: str) -> Iterator[Path]:
     """Keep the ticket in its file, readable by its owner only, while the context lasts.
 
-    The file is locked: of several who publish at once under one name, one succeeds.
+    The file is locked: of several runs of one session name, one succeeds.
 
     Raises:
         CallerError: the folder is not the user's own, or another run is open in the session.
@@ -123,11 +123,11 @@ def wait_for_ticket(
 
     Raises:
         CallerError: the folder or the file is not the user's own.
-        PeerError: none came in time.
+        PeerError: there was none in time.
     """
     path = ticket_path(session)
     deadline_s = time.monotonic() + timeout_s
-    told = False
+    waiting = False
     while True:
         with contextlib.suppress(FileNotFoundError), open_private() as folder:
             return loads(folder.read_text(path.name))
@@ -135,7 +135,7 @@ def wait_for_ticket(
             raise PeerError(
                 f"no run to join in session {session!r}: start `noack record SCENARIO` first"
             )
-        if not told:
+        if not waiting:
             on_wait(path)
-            told = True
+            waiting = True
         time.sleep(0.05)

@@ -1,13 +1,13 @@
-"""The shield: what comes from a process's peers has a queue of its own, in the kernel.
+"""Peer sockets: datagrams of each peer have a receive queue of their own in the kernel.
 
-Beside the process's socket there is one more for each peer, on the same port and connected to the
-peer. The kernel gives each datagram to the socket that fits best, so that what comes from elsewhere
-stays with the first one, in a queue of its own. However much of it there is, it can neither push a
-peer's datagram out nor stand in front of it, and the kernel's counts of what it dropped at one and
-at the other are exact. No more of it is looked at than :class:`FloodWatch` allows.
+Beside the process's socket there is one more per peer, on the same port and connected to the peer.
+The kernel delivers each datagram to the best matching socket, so that datagrams from unknown
+sources stay in the queue of the first socket. They can neither displace nor delay a peer's
+datagram, and the kernel's drop counters are exact for each queue. :class:`FloodWatch` limits how
+many datagrams from unknown sources are read.
 
-A datagram with a peer's forged address passes, as it would anywhere; only an administrator of the
-machine can send one. On other systems than Linux there is no shield.
+A datagram with a peer's forged address passes; only root can send one on the same machine. Systems
+other than Linux have no peer sockets.
 """
 
 import socket
@@ -18,10 +18,10 @@ from contextlib import ExitStack, contextmanager
 from noack.runtime.address import Address
 
 IN_AN_INTERVAL = 256
-"""How many strangers' datagrams are looked at between two turns of housekeeping, 50 ms: some 5,000
-a second, which takes a twentieth of a core."""
+"""Datagrams from unknown sources read between two turns of housekeeping, 50 ms: about 5,000 a
+second, which takes a twentieth of a core."""
 IN_A_FLOOD = 16
-"""How many of a flood are looked at, to know what it is made of and when it ends."""
+"""Datagrams of a flood that are read per interval, to see its sources and its end."""
 _CALM_INTERVALS = 20
 _MOST_CALM_INTERVALS = 1200
 
@@ -30,11 +30,11 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
     """Open a socket for each peer on the address of ``endpoint``, connected to the peer.
 
     Args:
-        endpoint: a bound UDP socket; it goes on hearing everyone else.
-        peers: whose datagrams are to be kept apart.
+        endpoint: a bound UDP socket; it still receives from all other sources.
+        peers: addresses of the peers.
 
     Returns:
-        The sockets, non-blocking, in the order of the peers; none if the system has no such thing.
+        The sockets, non-blocking, in the order of the peers; none if the system cannot do that.
     """
     if sys.platform != "linux":
         return ()
@@ -59,7 +59,7 @@ def open_beside(endpoint: socket.socket, peers: Iterable[Address]) -> tuple[sock
 
 @contextmanager
 def _shared(endpoint: socket.socket) -> Iterator[None]:
-    """Let this user bind the port again for a moment; for ever would let anything of his in."""
+    """Let this user bind the port again for a moment; permanently, any of his programs could."""
     endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
     try:
         yield
@@ -68,16 +68,16 @@ def _shared(endpoint: socket.socket) -> Iterator[None]:
 
 
 class FloodWatch:
-    """How many datagrams of strangers are looked at, and when their number is a flood.
+    """Limits how many datagrams from unknown sources are read, and detects floods.
 
-    A flood begins with an interval in which more came than are looked at in one. It is over after
-    enough intervals in a row in which fewer did; with each flood twice as many, so that floods
-    without end do not make lines without end.
+    A flood begins with an interval in which more arrive than are read. It ends after a number of
+    consecutive calm intervals. This number doubles with each flood, so that repeated floods do not
+    fill the log.
     """
 
     def __init__(self) -> None:
         self.left = IN_AN_INTERVAL
-        """How many may still be looked at in this interval; whoever looks at one takes one off."""
+        """How many may still be read in this interval; the reader decrements it."""
         self.is_flood = False
         self._allowed = IN_AN_INTERVAL
         self._dropped = 0
@@ -86,10 +86,10 @@ class FloodWatch:
         self._needed = _CALM_INTERVALS
 
     def next_interval(self, dropped: int) -> str | None:
-        """Begin the next interval; return what is to be said of the one that ends, if anything.
+        """Begin the next interval; return a log line about the last one, if there is any.
 
         Args:
-            dropped: how many the kernel has dropped so far, as nobody looked at them.
+            dropped: how many the kernel has dropped so far.
         """
         before, self._dropped = self._dropped, dropped
         came = self._allowed - self.left + dropped - before
@@ -108,12 +108,12 @@ class FloodWatch:
         self.is_flood, self._calm = True, 0
         self._begun_with = dropped_before
         return (
-            "flood: more datagrams come from elsewhere than are looked at; "
-            "the kernel drops the others, and keeps the peers' apart"
+            "flood: too many datagrams from unknown sources; "
+            "the kernel drops them and keeps the peers' datagrams"
         )
 
     def _end(self) -> str:
         self.is_flood = False
         self._needed = min(2 * self._needed, _MOST_CALM_INTERVALS)
         shed = self._dropped - self._begun_with
-        return f"the flood is over: the kernel has dropped {shed} datagrams from elsewhere"
+        return f"the flood is over: the kernel dropped {shed} datagrams from unknown sources"

@@ -1,8 +1,8 @@
 """The user's runtime directory: files that only their owner can read.
 
-Without ``XDG_RUNTIME_DIR`` it lies where everybody may write. Whoever uses it therefore opens each
-folder once, checks what has been opened, and reaches files through that descriptor: another user
-who replaces a folder by one of his own, or by a link, replaces nothing that is in use.
+Without ``XDG_RUNTIME_DIR`` it is in a folder where all users may write. So each folder is opened
+once, the open descriptor is checked, and files are reached through it: another user who replaces
+the folder by his own, or by a link, replaces nothing that is in use.
 """
 
 import os
@@ -17,7 +17,7 @@ from noack.core.errors import CallerError
 
 
 def private_folder() -> Path:
-    """Return where the user's private files lie; the folder need not exist yet."""
+    """Return the folder of the user's private files; it need not exist yet."""
     base = os.environ.get("XDG_RUNTIME_DIR")
     return Path(base or tempfile.gettempdir()) / f"noack-{os.getuid()}"
 
@@ -36,7 +36,7 @@ class PrivateFolder:
     """An open folder that belongs to the user and is closed to others.
 
     Args:
-        path: of the folder, for messages and for what runs in this process only.
+        path: of the folder, for messages.
         descriptor: of the folder, to be given to functions of :mod:`os` as ``dir_fd``.
     """
 
@@ -44,7 +44,7 @@ class PrivateFolder:
         self.path, self.descriptor = path, descriptor
 
     def create(self, name: str) -> int:
-        """Create a file for writing, in the place of any of this name; return its descriptor."""
+        """Create a file for writing, replacing any of this name; return its descriptor."""
         with suppress(FileNotFoundError):
             self.remove(name)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -88,7 +88,7 @@ class PrivateFolder:
         os.link(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def replace(self, name: str, other: str) -> None:
-        """Rename a file; one that has the other name is removed."""
+        """Rename a file, replacing any of the other name."""
         os.replace(name, other, src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove(self, name: str) -> None:
@@ -100,7 +100,7 @@ class PrivateFolder:
         os.unlink(name, dir_fd=self.descriptor)
 
     def remove_same(self, name: str, status: os.stat_result) -> None:
-        """Remove a file unless another has taken its place."""
+        """Remove a file unless it was replaced."""
         with suppress(FileNotFoundError):
             now = os.stat(name, dir_fd=self.descriptor, follow_symlinks=False)
             if os.path.samestat(now, status):
@@ -112,13 +112,13 @@ def open_private(*inside: str, create: bool = False) -> Iterator[PrivateFolder]:
     """Open the user's private folder, or one inside it, while the context lasts.
 
     Args:
-        inside: names of the folders on the way to the one wanted.
-        create: make the folders that do not exist.
+        inside: names of nested folders.
+        create: create missing folders.
 
     Raises:
-        CallerError: a folder cannot be made, belongs to another user, is a link, or is open to
+        CallerError: a folder cannot be created, belongs to another user, is a link, or is open to
             others.
-        FileNotFoundError: it does not exist, and is not to be made.
+        FileNotFoundError: it does not exist, and ``create`` is false.
     """
     path = private_folder()
     with ExitStack() as stack:

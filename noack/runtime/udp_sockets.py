@@ -18,22 +18,22 @@ from noack.runtime.unknown_sources import SourceCount
 
 LOOPBACK = "127.0.0.1"
 
-# The default receive buffer holds 256 small datagrams; 4 MiB holds some 10,000. What overflows is
-# lost without a trace, and an unintended loss breaks the MANSD guarantee.
+# The default receive buffer holds 256 small datagrams; 4 MiB hold about 10,000. A datagram lost by
+# overflow is an unintended loss, which breaks the MANSD guarantee.
 _BUFFER_BYTES = 4 * 1024 * 1024
 _SO_RCVBUFFORCE = 33
-_STRANGERS_BYTES = 128 * 1024
-"""For the queue of what comes from elsewhere; the kernel doubles it. It holds some 300 datagrams,
-about as many as are looked at between two turns of housekeeping."""
-_STRANGERS_QUEUED = 4096
-"""How many of that queue are looked at in the end: all, unless the flood goes on."""
+_UNKNOWN_BYTES = 128 * 1024
+"""Receive buffer for datagrams from unknown sources; the kernel doubles it. It holds about 300
+datagrams, as many as are read between two turns of housekeeping."""
+_UNKNOWN_READ_AT_END = 4096
+"""Datagrams of that buffer read at the end: all of them, unless the flood goes on."""
 _SO_MEMINFO = 55
 _MEMINFO_WORDS = 9
 _MEMINFO_DROPS = 8
-_IN_A_ROW = 8
-"""Datagrams that are looked at before deadlines are again: some 50 µs."""
+_READ_AT_ONCE = 8
+"""Datagrams read before the next look at deadlines: about 50 µs."""
 SHED = "shed"
-"""Why a datagram was rejected that the kernel dropped, as too many came from elsewhere."""
+"""Rejection reason of datagrams from unknown sources that the kernel dropped in a flood."""
 MAX_UDP_BYTES = 65_535
 
 T = TypeVar("T")
@@ -68,7 +68,7 @@ def bind(port: int, key: str, host: str = LOOPBACK) -> socket.socket:
 
 
 def enlarge_buffer(endpoint: socket.socket) -> int:
-    """Ask for a 4 MiB receive buffer; return what the kernel granted, in bytes."""
+    """Request a 4 MiB receive buffer; return the size that the kernel set, in bytes."""
     try:
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
     except OSError:
@@ -98,10 +98,10 @@ def require_free_tcp_port(port: int, key: str, host: str = LOOPBACK) -> None:
 
 
 def drops_of(endpoint: socket.socket) -> int | None:
-    """Datagrams that the kernel dropped at a socket; None if it does not say.
+    """Datagrams that the kernel dropped at a socket; None if the system has no such counter.
 
-    The count is exact whenever it is asked for, which the one that comes with datagrams
-    (SO_RXQ_OVFL) is only after one more has come; and it costs nothing per datagram.
+    This counter is always exact and costs nothing per datagram. The one that arrives with
+    datagrams (SO_RXQ_OVFL) is exact only after the next datagram.
     """
     try:
         found = endpoint.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * _MEMINFO_WORDS)
@@ -112,16 +112,16 @@ def drops_of(endpoint: socket.socket) -> int | None:
 
 
 class CountingSocket(ABC, Generic[T]):
-    """A bound socket with one destination that accounts for what passes through it.
+    """A bound socket with one destination, and counters.
 
-    What it sends with stays unconnected: a connected one would fail a send for an earlier one's
-    ICMP error, which in the network emulator is a loss beyond the cap.
+    The sending socket stays unconnected: on a connected one, an ICMP error of an earlier datagram
+    would fail the next send, which in the emulator is an unintended loss.
 
     Args:
         endpoint: from :func:`bind`.
         destination: where it sends.
-        peers: who sends to it; what comes from elsewhere is kept apart
-        (:mod:`noack.runtime.peer_sockets`).
+        peers: addresses that send to it; datagrams from unknown sources have a queue of their own
+            (:mod:`noack.runtime.peer_sockets`).
     """
 
     def __init__(
@@ -131,10 +131,10 @@ class CountingSocket(ABC, Generic[T]):
         self._destination = destination
         self._peers = frozenset(peers)
         self._beside = open_beside(endpoint, peers)
-        self._strange: int | None = None
+        self._unknown_fd: int | None = None
         if self._beside:
-            self._strange = endpoint.fileno()
-            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _STRANGERS_BYTES)
+            self._unknown_fd = endpoint.fileno()
+            endpoint.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UNKNOWN_BYTES)
             for one in self._beside:
                 enlarge_buffer(one)
         self._sockets = {one.fileno(): one for one in (*self._beside, endpoint)}
@@ -144,47 +144,47 @@ class CountingSocket(ABC, Generic[T]):
         self._sources = SourceCount(peers)
         self._sent = 0
         self.send_errors: Counter[str] = Counter()
-        # First what came before there were sockets beside this one: it may be the peers'.
+        # First the datagrams that arrived before the peer sockets: they may be the peers'.
         self.watched: Sequence[int] = self._everyone[::-1]
         """File descriptors to wait on now, the most important first."""
 
     @abstractmethod
     def judge(self, data: bytes, source: Address) -> T | None:
-        """Return the message that a datagram is, None if it is none; counts what is rejected.
+        """Return the message of a datagram; None, counted as rejected, if it has none.
 
         Args:
             data: as received, cut at :attr:`most_bytes`.
-            source: from where.
+            source: sender's address.
         """
 
     most_bytes = MAX_DATAGRAM_BYTES + 1
-    """What is longer than any datagram of the loop is cut, and rejected by its length."""
+    """A longer datagram is cut, and rejected by its length."""
 
     def receive(self, readable: int) -> T | None:
-        """Take the next message, and some datagrams before it that are none.
+        """Return the next message; skip a few rejected datagrams before it.
 
         Args:
-            readable: which of the file descriptors has something.
+            readable: the file descriptor that is readable.
 
         Returns:
             None if there was no message among the next few datagrams.
         """
-        endpoint, strange = self._sockets[readable], readable == self._strange
-        for _ in range(_IN_A_ROW):
+        endpoint, unknown = self._sockets[readable], readable == self._unknown_fd
+        for _ in range(_READ_AT_ONCE):
             try:
                 data, source = endpoint.recvfrom(self.most_bytes)
-            except OSError:  # nothing there any more, or an ICMP error, which is nobody's
+            except OSError:  # empty, or an ICMP error of an earlier send
                 return None
             self._sources.add(source)
             message = self.judge(data, source)
-            if strange and source not in self._peers and self._spend():
+            if unknown and source not in self._peers and self._spend():
                 return message
             if message is not None:
                 return message
         return None
 
     def _spend(self) -> bool:
-        """Note that a stranger's datagram was looked at; whether it was the last for now."""
+        """Count a datagram from an unknown source; whether it was the last of this interval."""
         self._flood.left -= 1
         if self._flood.left > 0:
             return False
@@ -192,7 +192,7 @@ class CountingSocket(ABC, Generic[T]):
         return True
 
     def put(self, data: bytes, destination: Address | None = None) -> None:
-        """Send a datagram; a failure is counted, as nobody would learn of it anyway."""
+        """Send a datagram; a failure is counted."""
         try:
             self._endpoint.sendto(data, destination or self._destination)
             self._sent += 1
@@ -200,8 +200,8 @@ class CountingSocket(ABC, Generic[T]):
             self.send_errors[str(error)] += 1
 
     def tend(self, now_ns: int) -> Sequence[Notice]:
-        """Begin the next interval of housekeeping; return what the log should say of the last."""
-        if self._strange is None:
+        """Begin the next interval of housekeeping; return log lines about the last one."""
+        if self._unknown_fd is None:
             return ()
         line = self._flood.next_interval(self._shed())
         self.watched = self._everyone
@@ -209,7 +209,7 @@ class CountingSocket(ABC, Generic[T]):
 
     def report(self) -> dict[str, object]:
         """Counters, for the run's summary."""
-        self._look_at_the_rest()
+        self._read_the_rest()
         receiving = self._beside or (self._endpoint,)
         drops = [drops_of(one) for one in receiving]
         return {
@@ -218,13 +218,13 @@ class CountingSocket(ABC, Generic[T]):
             "sent": self._sent,
             "send_errors": dict(self.send_errors),
             "received_from": self._sources.report(),
-            "shielded": bool(self._beside),
+            "peer_sockets": bool(self._beside),
             "lost_in_kernel": None if None in drops else sum(n for n in drops if n is not None),
         }
 
     def rejected(self, by_reason: Mapping[str, int]) -> dict[str, int]:
-        """Add to what was rejected what the kernel has shed before anybody looked at it."""
-        shed = {SHED: self._shed()} if self._strange is not None else {}
+        """Add the datagrams from unknown sources that the kernel dropped in a flood."""
+        shed = {SHED: self._shed()} if self._unknown_fd is not None else {}
         return {reason: n for reason, n in (*by_reason.items(), *shed.items()) if n}
 
     def close(self) -> None:
@@ -235,31 +235,31 @@ class CountingSocket(ABC, Generic[T]):
     def _shed(self) -> int:
         return drops_of(self._endpoint) or 0
 
-    def _look_at_the_rest(self) -> None:
-        """Name what was kept waiting, so that every datagram is accounted for."""
-        if self._strange is None:
+    def _read_the_rest(self) -> None:
+        """Count the datagrams that still wait, so that the counters are complete."""
+        if self._unknown_fd is None:
             return
         with suppress(OSError):
-            for _ in range(_STRANGERS_QUEUED):
+            for _ in range(_UNKNOWN_READ_AT_END):
                 data, source = self._endpoint.recvfrom(self.most_bytes)
                 self._sources.add(source)
                 self.judge(data, source)
 
 
 class MessageSocket(CountingSocket[Message]):
-    """A process's one socket in the loop: receives one flow, sends another.
+    """A process's socket in the loop: receives one flow and sends another.
 
-    Where updates are acknowledged, acknowledgements come or go beside them.
+    In the acknowledgement baseline it also receives or sends acknowledgements.
 
     Args:
         endpoint: a bound socket, from :func:`bind`.
-        decoder: takes the flow that the process receives.
-        encoder: makes the datagrams that it sends.
+        decoder: of the received flow.
+        encoder: of the sent flow.
         sends: the flow that it sends.
-        source: who sends to it; what comes from elsewhere is never acted on.
+        source: the peer; datagrams from other sources are rejected.
         destination: where it sends.
-        acknowledgements: takes acknowledgements, and who sends them.
-        acknowledges_to: where it sends them.
+        acknowledgements: decoder of acknowledgements, and their sender.
+        acknowledges_to: where it sends acknowledgements.
     """
 
     def __init__(

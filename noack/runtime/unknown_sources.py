@@ -1,4 +1,4 @@
-"""From where datagrams came: counted by address, in bounded memory."""
+"""Received datagrams by source address, counted in bounded memory."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ class SourceCount:
     """Counts datagrams by source address, cheaply while the source stays the same.
 
     Args:
-        peers: who is always told apart; of others only some of those that sent most.
+        peers: addresses that always have their own count; of others only the most frequent.
     """
 
     def __init__(self, peers: Iterable[Address] = ()) -> None:
@@ -32,7 +32,7 @@ class SourceCount:
         self._last, self._run = source, 1
 
     def report(self) -> dict[str, int]:
-        """How many came from whom; what came from too many to name is under ``others``."""
+        """Datagrams by source; the rare sources together are ``others``."""
         self._fold()
         self._forget(_REPORTED_SOURCES)
         named = [*self._peers.items(), *self._others.most_common()]
@@ -51,7 +51,7 @@ class SourceCount:
         self._last, self._run = None, 0
 
     def _forget(self, most: int) -> None:
-        """Keep the ``most`` busiest; sources may be made up without end, memory may not."""
+        """Keep the ``most`` frequent sources: forged ones must not fill the memory."""
         kept = Counter(dict(self._others.most_common(most)))
         self._more += self._others.total() - kept.total()
         self._others = kept

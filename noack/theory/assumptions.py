@@ -1,7 +1,7 @@
 """Assumptions, the paper's and a certificate's, checked for one scenario before it runs.
 
 A claim is worth its assumptions. Each gets a verdict with its reason; what only the run can show
-(delays, the longest drop run) is checked against the run's record.
+(delays, the longest loss burst) is checked against the run's record.
 """
 
 import math
@@ -27,8 +27,8 @@ class AssumptionStatus(StrEnum):
     """No sampled loop meets it; certificates allow for the difference."""
     NOT_NEEDED = "not needed"
     """It does not hold, or is not checked, and no bound that is computed here rests on it."""
-    PRESUPPOSED = "presupposed"
-    """Only a run can show it; every run is checked for it."""
+    ASSUMED = "assumed"
+    """Depends on the run, and is checked in each run."""
 
 
 class Assumption(NamedTuple):
@@ -47,6 +47,7 @@ def assumptions(resolved: Scenario) -> list[Assumption]:
     return [
         *([_closed_loop(loop)] if resolved.coverage.is_linear else _not_linear(loop, resolved)),
         *_trigger(loop, resolved),
+        *_control_law(resolved),
         *_protocol(resolved),
         *([_unstable_and_distinct(loop.A)] if resolved.coverage.is_linear else []),
         _mansd(resolved),
@@ -78,7 +79,7 @@ def _disturbed(resolved: Scenario) -> list[Assumption]:
     return [
         Assumption(
             "nothing disturbs the plant", "eq:plant", AssumptionStatus.VIOLATED,
-            f"{what}: the theorems and the certificates say nothing of it",
+            f"{what}: not covered by the theorems and the certificates",
         )
     ]  # fmt: skip
 
@@ -97,22 +98,22 @@ def _estimated(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     )
     measured = Assumption(
         "the sensor measures x", "Section II", AssumptionStatus.VIOLATED,
-        f"it knows x {how}: the theorems and the certificates say nothing of that",
+        f"x is known {how}: not covered by the theorems and the certificates",
     )  # fmt: skip
     if resolved.observer is None:
         return [measured, *_above_noise(loop, resolved, found)]
     if not np.isfinite(found.radius):
-        why = "no steady state is found: model and covariances differ by too many magnitudes"
+        why = "no steady state found: model and covariances differ by too many magnitudes"
         decays = Assumption("the observer's error decays", "(I − LC)e^(ÂT)", _verdict(False), why)
         return [measured, decays]
     comes_to = (
-        f"by noise and random disturbances alone, ‖x̂ − x‖ comes to {rms:.3g} (RMS)"
+        f"noise and random disturbances alone give ‖x̂ − x‖ = {rms:.3g} (RMS)"
         if found.radius < 1
         else "‖x̂ − x‖ grows"
     )
     decays = Assumption(
         "the observer's error decays", "(I − LC)e^(ÂT)", _verdict(found.radius < 1),
-        f"its spectral radius is {found.radius:.4g} a measurement in the end; {comes_to}",
+        f"steady-state spectral radius {found.radius:.4g} per measurement; {comes_to}",
     )  # fmt: skip
     above = _above_noise(loop, resolved, found) if found.radius < 1 else []
     return [measured, decays, *above]
@@ -133,8 +134,8 @@ def _above_noise(loop: LoopMatrices, resolved: Scenario, found: SteadyState) -> 
     return [
         Assumption(
             "the threshold stays above the noise", "trigger", _verdict(least >= 3 * size),
-            f"it falls to {least:.3g}; what the sensor errs by makes an ‖e_s‖ of {size:.3g} (RMS) "
-            f"at once: at least {3 * size:.2g} is advised, for the noise not to transmit",
+            f"it falls to {least:.3g}; noise alone gives ‖e_s‖ = {size:.3g} (RMS): set "
+            f"trigger.floor ≥ {3 * size:.2g}; below that, noise alone triggers",
         )
     ]  # fmt: skip
 
@@ -147,7 +148,19 @@ def _trigger(loop: LoopMatrices, resolved: Scenario) -> list[Assumption]:
     return [
         Assumption(
             "the trigger is ‖e_s‖ > βe^(−αt)", "eq:thre", AssumptionStatus.VIOLATED,
-            f'it is "{policy}": the paper\'s theorems and the certificates say nothing of it',
+            f'the policy is "{policy}": not covered by the theorems and the certificates',
+        )
+    ]  # fmt: skip
+
+
+def _control_law(resolved: Scenario) -> list[Assumption]:
+    if resolved.controller.is_linear:
+        return []
+    return [
+        Assumption(
+            "the input is u = K x_c", "eq:ModCont", AssumptionStatus.VIOLATED,
+            f'controller.kind = "{resolved.controller.kind}": the theorems and the certificates '
+            "do not cover it",
         )
     ]  # fmt: skip
 
@@ -159,7 +172,7 @@ def _protocol(resolved: Scenario) -> list[Assumption]:
         Assumption(
             "the sensor resets x_s at every event; nothing is acknowledged", "Section II",
             AssumptionStatus.VIOLATED,
-            'protocol = "ack": the theorems and the certificates say nothing of it',
+            'protocol = "ack": not covered by the theorems and the certificates',
         )
     ]  # fmt: skip
 
@@ -190,12 +203,12 @@ def _other_sign(loop: LoopMatrices) -> str:
 
 def _decay_rate(loop: LoopMatrices, alpha_per_s: float) -> Assumption:
     rate = -spectral_abscissa(loop.A + loop.B @ loop.K)
-    how = f"decays at any rate below {rate:.3g} /s" if rate > 0 else "does not decay"
+    how = f"decay rate {rate:.3g} /s" if rate > 0 else f"grows at {0.0 - rate:.3g} /s"
     return Assumption(
         "0 < α < ᾱ: the threshold decays more slowly than the closed loop",
         "Theorem 2",
         _verdict(alpha_per_s < rate),
-        f"α = {alpha_per_s:g} /s; ‖e^((A+BK)t)‖ {how}",
+        f"α = {alpha_per_s:g} /s; A + BK: {how}",
     )
 
 
@@ -215,7 +228,7 @@ def _unstable_and_distinct(A: Matrix) -> Assumption:
         "A is unstable with distinct eigenvalues",
         "Proposition 1, used by Theorem 1",
         AssumptionStatus.HOLDS if holds else AssumptionStatus.NOT_NEEDED,
-        why if holds else f"{why}; the paper's proof uses it, no bound computed here does",
+        why if holds else f"{why}; used by the paper's proof, but by no bound computed here",
     )
 
 
@@ -226,10 +239,10 @@ def _mansd(resolved: Scenario) -> Assumption:
         "known_state": "sensor and controller know x(0)",
     }[network.initial_sync]
     return Assumption(
-        f"at most M − 1 = {network.mansd} successive dropouts after a delivered t_0",
+        f"at most M − 1 = {network.mansd} consecutive losses after a delivered t_0",
         "Section III",
         _verdict(network.enforce_mansd),
-        ("enforced by the network" if network.enforce_mansd else "enforcement is switched off")
+        ("enforced by the network" if network.enforce_mansd else "not enforced (enforce_mansd)")
         + f"; {start}",
     )
 
@@ -241,8 +254,8 @@ def _continuous_time(resolved: Scenario) -> Assumption:
         "continuous trigger; network and input without delay",
         "Section II",
         AssumptionStatus.IDEALISED,
-        "not met by any sampled loop; certificates allow for the difference. Here: sampled every "
-        f"{period_ms:g} ms, input held for {control_ms:g} ms" + _network_delay(resolved),
+        "never true of a sampled loop; the certificates allow for the difference. Here: sampled "
+        f"every {period_ms:g} ms, input held for {control_ms:g} ms" + _network_delay(resolved),
     )
 
 
@@ -253,7 +266,7 @@ def _network_delay(resolved: Scenario) -> str:
     longest_ms = 1e3 * link.longest_delay_s
     if link.delay_is_bounded:
         return f"; the network delays updates by up to {longest_ms:g} ms"
-    return f"; the network delays updates without a bound, certificates allow for {longest_ms:g} ms"
+    return f"; the network's delay has no bound; the certificates allow for {longest_ms:g} ms"
 
 
 def certificate_assumptions(
@@ -268,7 +281,7 @@ def certificate_assumptions(
 
     Args:
         resolved: the scenario.
-        conditions: what is presupposed of network and schedule.
+        conditions: the assumptions about network and schedule.
         decay: decay rates per second, of "the models" and of "A + BK".
         held: whether the models hold instead of decaying.
         constants: of the certificate; None if there is none.
@@ -277,31 +290,31 @@ def certificate_assumptions(
     alpha, network = resolved.decaying.alpha_per_s, resolved.network
     rate = 0.0 if constants is None else constants.rate_per_s
     if held:
-        why = "a hold does not decay at all: what is certified is bounded, not decaying"
+        why = "a hold does not decay: the certified bounds are constant"
         models = Assumption(
             "α is below the decay rate of the models", "(I1)", AssumptionStatus.VIOLATED, why
         )
     else:
         models = _rate("the models", "(I1)", alpha, decay["the models"], rate)
-    presupposed = [
-        f"at most {conditions.dropouts} successive dropouts after a delivered t_0",
+    assumed = [
+        f"at most {conditions.dropouts} consecutive losses after a delivered t_0",
         f"the trigger is tested every {1e3 * conditions.sampling_s:g} ms"
         if conditions.sampling_s
-        else "the trigger watches continuously",
-        f"the plant feels an update within {1e3 * conditions.delay_s:g} ms of its event",
-        f"the input in force is at most {1e3 * conditions.hold_s:g} ms old",
-        f"the plant feels the controller from {1e3 * conditions.start_s:g} ms on",
+        else "the trigger is tested continuously",
+        f"an update reaches the plant within {1e3 * conditions.delay_s:g} ms of its event",
+        f"the applied input is at most {1e3 * conditions.hold_s:g} ms old",
+        f"the first input arrives within {1e3 * conditions.start_s:g} ms",
     ]
-    enforced = "the network enforces it" if network.enforce_mansd else "enforcement is switched off"
-    checks = [enforced, *["every run is checked for it"] * 4]
-    verdicts = [AssumptionStatus.HOLDS if network.enforce_mansd else AssumptionStatus.PRESUPPOSED]
-    verdicts += [AssumptionStatus.PRESUPPOSED] * 4
+    enforced = "enforced by the network" if network.enforce_mansd else "not enforced"
+    checks = [enforced, *["checked in each run"] * 4]
+    verdicts = [AssumptionStatus.HOLDS if network.enforce_mansd else AssumptionStatus.ASSUMED]
+    verdicts += [AssumptionStatus.ASSUMED] * 4
     gain = (
         Assumption(
-            "the errors reproduce themselves with a gain below 1",
+            "small-gain condition",
             "certificate",
             AssumptionStatus.HOLDS,
-            f"the gain is {constants.loop_gain:.3g}",
+            f"met: the loop gain of the errors is {constants.loop_gain:.3g}, below 1",
         )
         if constants is not None
         else Assumption(
@@ -313,7 +326,7 @@ def certificate_assumptions(
         _rate("A + BK", "Theorem 2", alpha, decay["A + BK"], rate),
         *(
             Assumption(what, "conditions", verdict, why)
-            for what, verdict, why in zip(presupposed, verdicts, checks, strict=True)
+            for what, verdict, why in zip(assumed, verdicts, checks, strict=True)
         ),
         gain,
         Assumption(
@@ -327,13 +340,15 @@ def certificate_assumptions(
 
 def _rate(of: str, source: str, alpha: float, decay: float, rate: float) -> Assumption:
     holds = below(alpha, decay)
-    why = f"α = {alpha:g} /s, decay rate {decay:.3g} /s"
+    why = f"α = {alpha:g} /s, " + (
+        f"decay rate {decay:.3g} /s" if decay >= 0 else f"grows at {-decay:.3g} /s"
+    )
     if not holds:
-        why += f"; bounds that fall at {rate:.3g} /s are certified instead" if rate else ""
+        why += f"; certified instead: bounds with decay rate {rate:.3g} /s" if rate else ""
     verdict = AssumptionStatus.HOLDS if holds else AssumptionStatus.VIOLATED
     return Assumption(f"α is below the decay rate of {of}", source, verdict, why)
 
 
 def below(alpha_per_s: float, decay_per_s: float) -> bool:
-    """Clearly: what is decided by rounding cannot be certified."""
+    """Whether α is clearly below the decay rate: beyond rounding."""
     return alpha_per_s < (1 - 1e-9) * decay_per_s

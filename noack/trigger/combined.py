@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from pydantic import field_validator
+
 from noack.core.linear_systems import Matrix
 from noack.settings.matrices import Rows
 from noack.trigger.policy_settings import Interval, PolicySettings
@@ -20,10 +22,22 @@ class CombinedSettings(PolicySettings):
     interval_s: Interval
     """Time since the last event."""
 
+    @field_validator("rule")
+    @classmethod
+    def _check_rule(cls, rule: PolicySettings) -> PolicySettings:
+        if rule.beyond_exact is not None:
+            raise ValueError(f'"{rule.policy}" cannot be combined; let the class test the interval')
+        return rule
+
     @property
     def weight(self) -> Rows | None:
         """W of the rule."""
         return self.rule.weight
+
+    @property
+    def threshold_decay_per_s(self) -> float:
+        """That of the rule."""
+        return self.rule.threshold_decay_per_s
 
     @property
     def largest_threshold(self) -> float:

@@ -44,6 +44,11 @@ class DecayingSettings(WeightedSettings):
         return f"‖e_s‖ > {decaying_text(self.beta, self.alpha_per_s, self.floor)}"
 
     @property
+    def threshold_decay_per_s(self) -> float:
+        """α."""
+        return self.alpha_per_s
+
+    @property
     def largest_threshold(self) -> float:
         """The larger of β and ε."""
         return max(self.beta, self.floor)

@@ -78,6 +78,11 @@ class PolicySettings(ScenarioSection):
         return None
 
     @property
+    def threshold_decay_per_s(self) -> float:
+        """α of a threshold that decays from the run's start on; 0 if there is none."""
+        return 0.0
+
+    @property
     def largest_threshold(self) -> float:
         """The largest constant that ‖e_s‖_W is compared with; 0 if there is none."""
         return 0.0

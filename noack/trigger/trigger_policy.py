@@ -1,10 +1,12 @@
 """What an event-triggering policy is, and the machine that applies one to measurements."""
 
+from abc import ABC, abstractmethod
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.core.errors import CallerError
 from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.trigger_condition import TriggerCondition
 from noack.trigger.trigger_rule import TriggerRule
@@ -26,6 +28,54 @@ class Policy(Protocol):
     def initial_dynamic_variable(self) -> float:
         """η at the start; 0 for a policy without η."""
         ...
+
+
+class CodedPolicy(ABC):
+    """A policy that decides by code of its own, and so has no trigger rule."""
+
+    initial_dynamic_variable = 0.0
+
+    @property
+    @abstractmethod
+    def weight(self) -> Matrix | None:
+        """W of the norm in which errors are shown, (n, n); None is the identity."""
+
+    @abstractmethod
+    def new_trigger(self) -> "EventTrigger":
+        """Return a trigger that has not started."""
+
+    def trigger_rule(self, n: int) -> TriggerRule:
+        """Not available.
+
+        Raises:
+            CallerError: always.
+        """
+        raise CallerError("trigger.policy: this one is code and has no trigger rule")
+
+
+class EventTrigger(Protocol):
+    """Decides at measurements; the methods are those of :class:`Trigger`."""
+
+    def start(self, t_ns: int, x: Vector) -> None:
+        """Begin, or begin again after an event."""
+        ...
+
+    def restart(self, t_ns: int, x: Vector) -> object:
+        """Begin after a past event, known only now to have reset the model."""
+        ...
+
+    def change(self, policy: Policy) -> None:
+        """Continue with another policy."""
+        ...
+
+    def test(self, t_ns: int, x: Vector, e_s: Vector) -> "TriggerDecision":
+        """Decide whether a measurement is an event."""
+        ...
+
+
+def new_trigger(policy: Policy) -> EventTrigger:
+    """Return a trigger that applies a policy at measurements."""
+    return policy.new_trigger() if isinstance(policy, CodedPolicy) else Trigger(policy)
 
 
 class TriggerDecision(NamedTuple):

@@ -25,7 +25,7 @@ def test_each_benchmark_is_declared_under_its_files_name() -> None:
 
 def summary(**changes: Any) -> dict[str, Any]:
     late = {"p50": 16.0, "p99": 40.0, "max": 150.0, "steps": 10_000, "late_steps": 10}
-    return {"missing_samples": 0, "lost_outside_netem": 0, "lateness_us": {"plant": late}} | changes
+    return {"missing_samples": 0, "unintended_losses": 0, "lateness_us": {"plant": late}} | changes
 
 
 def test_a_complete_and_punctual_demo_reaches_all_goals() -> None:

@@ -76,7 +76,7 @@ def test_the_effects_of_a_flood_are_read_from_the_record(record: RunRecord) -> N
     steps["now_ns"][after] += 3_000_000
     rows[SENSOR_MEASUREMENT] = np.delete(received, [600, 601, 602])
     flooded = RunRecord(record.scenario, rows, [], {})
-    run = FaultedRun(flooded, {"lost_outside_netem": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
+    run = FaultedRun(flooded, {"unintended_losses": 5}, 100.0, Flood(101.0, 102.0, 12_345), None)
     last_late_ns = 2_040_000_000 - PERIOD_NS + 3_050_000
     assert figures_of(run) == pytest.approx({
         "rate_hz": 12_345.0, "missed": 3, "lost": 5, "late_before_us": 50.0,

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from controller_node.controller import Controller, controller_of
 from noack.config.resolution import resolve
 from noack.config.scenario_file import validate
+from noack.controllers.linear_feedback import LinearFeedback
 from noack.protocol.machine_interface import Notice, Output, Record
 from noack.protocol.record_tables import CONTROLLER_DELIVERY, CONTROLLER_STEP, tables
 from noack.protocol.wire_format import Flow, Message
@@ -28,7 +29,15 @@ def new_controller(
     **more: Any,
 ) -> Controller:
     return Controller(
-        H, K, period_ns=2 * MS, phase_ns=phase_ns, horizon_ns=horizon_ns, mansd=mansd, x0=x0, **more
+        H,
+        LinearFeedback(K),
+        inputs=len(K),
+        period_ns=2 * MS,
+        phase_ns=phase_ns,
+        horizon_ns=horizon_ns,
+        mansd=mansd,
+        x0=x0,
+        **more,
     )
 
 

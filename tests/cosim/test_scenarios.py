@@ -48,11 +48,11 @@ def run_of(name: str) -> RunRecord:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_shipped_scenario_keeps_what_it_assumes_and_settles(name: str) -> None:
     record = run_of(name)
-    summary = summarise(record, 0, "horizon")
+    summary = summarise(record, 0, "horizon").to_json()
     assert summary["exit"]["status"] == 0
     assert summary["reached_s"] == pytest.approx(summary["horizon_s"])
     assert summary["missing_samples"] == 0
-    assert summary["lost_outside_netem"] == 0
+    assert summary["unintended_losses"] == 0
     assert summary["assumption_violations"] == []
     assert summary["watchdog"]["trips"] == 0
     assert summary["longest_loss_burst"] <= summary["mansd"]

@@ -48,7 +48,7 @@ def test_a_live_run_acknowledges_and_loses_acknowledgements(
     assert found["lost"] > 3
     assert found["received"] > 3
     assert found["sent"] == found["lost"] + found["received"]
-    assert summary["lost_outside_netem"] == summary["missing_samples"] == 0
+    assert summary["unintended_losses"] == summary["missing_samples"] == 0
     assert summary["rejected_datagrams"] == {}
     assert [claim["verdict"] for claim in summary["claims"]] == ["void"]
     packets = record[NETEM_PACKET]

@@ -75,7 +75,7 @@ def test_a_signal_ends_a_run_cleanly_and_a_summary_does_not_touch_it(start: Star
     assert 0 < until_s <= finished.summary["reached_s"] + 0.1
     assert all((claim["since_s"] or 0.0) <= until_s for claim in finished.summary["claims"])
     assert finished.summary["missing_samples"] == 0
-    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["unintended_losses"] == 0
     assert set(finished.summary["realtime"]) == {"plant", "sensor", "controller", "netem"}
     assert running.left_behind() == []
 

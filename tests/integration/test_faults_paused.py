@@ -79,7 +79,7 @@ def test_a_recorder_that_stands_still_for_long_is_named_and_nothing_is_lost(star
     assert finished.status == 1
     assert finished.summary["exit"]["reason"] == "recorder stopped responding"
     assert finished.summary["missing_samples"] == 0
-    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["unintended_losses"] == 0
     assert finished.summary["replay"]["bit_exact"]
     steps = load_record(finished.run_dir)["plant_step"]
     # All of the time that the plane was patient for, two seconds but for the last sign of life.

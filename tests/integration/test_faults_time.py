@@ -94,7 +94,7 @@ def test_a_run_does_not_notice_a_stepped_wall_clock(
     summary = finished.summary
     assert summary["exit"]["reason"] == "horizon"
     assert summary["missing_samples"] == 0
-    assert summary["lost_outside_netem"] == 0
+    assert summary["unintended_losses"] == 0
     assert summary["replay"]["bit_exact"]
     assert summary["replay"]["complete"]
     assert summary["identity_residual_max"] < 1e-11

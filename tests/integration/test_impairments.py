@@ -71,7 +71,7 @@ def test_the_run_ends_well_and_replays_to_the_bit(finished: Finished) -> None:
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
     assert summary["replay"]["bit_exact"]
     assert summary["replay"]["complete"]
-    assert summary["lost_outside_netem"] == 0
+    assert summary["unintended_losses"] == 0
     assert summary["missing_samples"] == 0
     assert summary["longest_loss_burst"] <= MANSD
     assert "Traceback" not in finished.stderr

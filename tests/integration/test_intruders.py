@@ -167,7 +167,7 @@ def test_a_run_goes_on_untouched(
     assert finished.status == 130, finished.stderr
     assert finished.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     assert finished.summary["missing_samples"] == 0
-    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["unintended_losses"] == 0
     assert finished.summary["replay"]["bit_exact"]
     assert finished.summary["replay"]["complete"]
     assert finished.summary["identity_residual_max"] < 1e-11

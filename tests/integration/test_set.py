@@ -56,7 +56,8 @@ def test_a_run_is_changed_twice_from_another_process(
     assert len(changes) == 2
     assert all("; requested at " in text for text in changes)
     if not any(one.late for one in changes_of(record)):  # else the machine was, and that is said
-        assert summary["assumption_violations"] == []
+        causes = {one["cause"] for one in summary["assumption_violations"]}
+        assert not causes & {"dropouts", "change"}
     assert not (tmp_path / f"noack-{os.getuid()}" / "runs" / f"{run.run_id}.json").exists()
     for path in finished.run_dir.rglob("*"):
         assert not path.is_file() or run.password.encode() not in path.read_bytes()

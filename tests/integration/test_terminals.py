@@ -39,7 +39,7 @@ def test_five_terminals_in_any_order(
     finished = recording.finish()
     assert finished.status == 0, finished.stderr
     assert finished.summary["missing_samples"] == 0
-    assert finished.summary["lost_outside_netem"] == 0
+    assert finished.summary["unintended_losses"] == 0
     for process in early + late:
         stdout, stderr = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 0, stderr

@@ -6,16 +6,15 @@ run, from the same limits and the same
 """
 
 import math
-from collections.abc import Collection
 
 import numpy as np
 
 from cosim.analysis.claims.condition_reader import ConditionReader
 from cosim.analysis.claims.observed_conditions import (
-    CAUSES,
     AssumptionViolation,
     ObservedConditions,
     VoidFrom,
+    causes_of,
     earliest,
 )
 from cosim.record.run_record import Rows
@@ -97,14 +96,3 @@ class AssumptionMonitor:
         counts = seen.losses.consecutive(self._conditions.delay_s, self._lost).value
         self._lost = int(counts[-1]) if len(counts) else self._lost
         return new
-
-
-def causes_of(scenario: Scenario) -> Collection[str]:
-    """The assumptions that claims about a resolved scenario need.
-
-    Certificates need all; (I1) needs the measurements only; nothing is claimed of the
-    acknowledgement baseline.
-    """
-    if scenario.is_acknowledged:
-        return ()
-    return tuple(CAUSES) if scenario.coverage.is_certifiable else ("sampling",)

@@ -19,7 +19,7 @@ import numpy as np
 from cosim.analysis.claims.claim import Claim, Envelope, void_claim
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.claims.common_time import common_end_ns, up_to_common_end
-from cosim.analysis.claims.observed_conditions import VoidFrom, earliest
+from cosim.analysis.claims.observed_conditions import AssumptionViolation
 from cosim.analysis.claims.run_evidence import RunPart
 from cosim.record.recorded_changes import NEVER_NS, RecordedChange, changes_of
 from cosim.record.run_record import Rows, RunRecord
@@ -91,17 +91,14 @@ class RunClaims:
         """Largest observed value of each condition, over the whole run."""
         return ClaimEvaluation(self._judged).conditions
 
-    @property
-    def mansd_violation(self) -> VoidFrom | None:
-        """When more than M − 1 consecutive updates had been lost, for whatever reason."""
-        found: list[VoidFrom | None] = []
+    def violations(self) -> list[AssumptionViolation]:
+        """The assumptions that the run violated: each at the first time, in each of its parts."""
+        found = []
         for one in self.parts:
-            if isinstance(one, Claim) or (void := one.mansd_violation) is None:
-                continue
-            if void.t_s < one.until_s:
+            if not isinstance(one, Claim):
                 from_s = 0.0 if one.part is None else one.part.from_s
-                found.append(void._replace(t_s=void.t_s + from_s))
-        return earliest(found)
+                found += [each._replace(t_s=each.t_s + from_s) for each in one.violations()]
+        return sorted(found, key=lambda one: one.t_s)
 
     def judge(self) -> list[Claim]:
         """Every claim with its verdict, in the run's time."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from noack.config.scenario import Scenario
 from noack.theory.certificate import NetworkConditions
 
 _TOLERANCE_S = 1e-9
@@ -156,3 +157,14 @@ class ObservedConditions(NamedTuple):
 def earliest(found: Iterable[VoidFrom | None]) -> VoidFrom | None:
     """The first of several; None if there is none."""
     return min(filter(None, found), default=None)
+
+
+def causes_of(scenario: Scenario) -> Collection[str]:
+    """The assumptions that claims about a resolved scenario need.
+
+    Certificates need all; (I1) needs the measurements only; nothing is claimed of the
+    acknowledgement baseline.
+    """
+    if scenario.is_acknowledged:
+        return ()
+    return tuple(CAUSES) if scenario.coverage.is_certifiable else ("sampling",)

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from cosim.analysis.claims.claim import Reals
 from cosim.analysis.claims.condition_reader import read_conditions
 from cosim.analysis.claims.observed_conditions import (
+    AssumptionViolation,
     ObservedConditions,
     SampledSeries,
     VoidFrom,
+    causes_of,
     earliest,
 )
 from cosim.record.align import AlignedRun, in_common, join_all
@@ -120,6 +122,15 @@ class RunEvidence:
         """When the plant applied the first input of the controller; infinite if never."""
         return read_conditions(self.record).start_s
 
+    def violations(self) -> list[AssumptionViolation]:
+        """The assumptions that the run violated, M − 1 included, each at the first time."""
+        scenario = self.record.scenario
+        conditions = allowed_conditions(scenario)
+        if self.part is not None and self.part.start_error is not None:
+            conditions = conditions._replace(start_s=0.0)
+        found = self.observed.violations(conditions, {*causes_of(scenario), "dropouts"})
+        return [one for one in found if one.t_s < self.until_s]
+
     @cached_property
     def first_gap(self) -> VoidFrom | None:
         """From when on the record is incomplete, so that no claim can be checked."""
@@ -138,12 +149,6 @@ class RunEvidence:
             why = "the controller's error is not on record, or not finite"
             found.append(VoidFrom(float(self.t_s[first + gaps[0]]), why))
         return earliest(found)
-
-    @cached_property
-    def mansd_violation(self) -> VoidFrom | None:
-        """When more than M − 1 consecutive updates had been lost, for whatever reason."""
-        limit = _ANY._replace(dropouts=self._schedule.dropouts)
-        return self.observed.first_violation(limit, ("dropouts",))
 
     @cached_property
     def paper_violation(self) -> VoidFrom | None:

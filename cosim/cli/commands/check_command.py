@@ -38,9 +38,10 @@ def check(
     from cosim.output.assumptions_table import print_assumptions
     from noack.config.resolution import policy_of, resolve
     from noack.theory.assumptions import assumptions
+    from noack.trigger.trigger_policy import new_trigger
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
-    policy_of(resolved)  # some policies require a stable loop
+    new_trigger(policy_of(resolved))  # some need a stable loop, others a class of the user's
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = Console()
     console.width -= len(_COMMENT)

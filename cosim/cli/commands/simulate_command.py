@@ -71,12 +71,8 @@ def simulate(
 
 def _simulate_continuously(scenario: Scenario, *, json: bool) -> int:
     from cosim.live.progress import PatientConsole
-    from cosim.simulation.continuous.continuous_report import (
-        document,
-        print_run,
-        run_continuous,
-        summary,
-    )
+    from cosim.output.continuous_table import print_run
+    from cosim.simulation.continuous.continuous_report import document, run_continuous, summary
     from noack.config.resolution import resolve
 
     resolved = resolve(scenario)

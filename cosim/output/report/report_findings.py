@@ -1,34 +1,34 @@
-"""What a report says of a run's difference to the ideal loop, and of its replay."""
+"""Sections of a report: the difference to the ideal loop, and the replay."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from cosim.analysis.fidelity import is_against, percent
+from cosim.analysis.fidelity import is_against
 from cosim.analysis.replay.replay_result import ReplayDifference
+from noack.core.number_format import percent
 
 FIDELITY, REPLAY = "Fidelity", "Replay"
 
 _EFFECTS = {
-    "sampling": "the trigger is tested at measurements only",
-    "delay": "updates take time, and act at the controller's next tick",
-    "held_actuation": "the plant holds an input until it has the next one",
-    "unexplained": "what is left: rounding, if all is well",
+    "sampling": "the trigger is tested at the measurements only",
+    "delay": "updates arrive late, and act at the controller's next tick",
+    "held_actuation": "the plant holds each input until the next one arrives",
+    "residual": "the rest, which should be rounding only",
 }
-"""As ``noack fidelity`` adds them to the ideal loop, one after the other."""
+"""The effects that ``noack fidelity`` adds to the ideal loop, in order."""
 
 
 class ReportFinding(NamedTuple):
     """A section of the report."""
 
     heading: str
-    said: list[str]
-    """Paragraphs."""
+    paragraphs: list[str]
     rows: list[tuple[str, str, str]]
-    """Effect, what it is, its share of the difference."""
+    """Effect, its meaning, its share of the difference."""
 
 
 def findings(summary: Mapping[str, Any]) -> Iterator[ReportFinding]:
-    """Return the sections of what there is of the two."""
+    """Yield the sections for which the summary has data."""
     if fidelity := summary.get("fidelity"):
         yield ReportFinding(FIDELITY, list(_fidelity(fidelity)), list(_effects(fidelity)))
     if replay := summary.get("replay"):
@@ -42,34 +42,31 @@ def _fidelity(found: Mapping[str, Any]) -> Iterator[str]:
     scale = found["rms_x_live"]
     of_x = f", {100 * found['rms_x'] / scale:.2g} % of x itself" if scale else ""
     yield (
-        "The ideal loop is the paper's, with the packet fates of this run: it watches "
-        f"continuously, and what it sends acts at once. The run's x differs from its x by "
-        f"{found['rms_x']:.3g} (RMS){of_x}, and by {found['max_x']:.3g} at most."
+        "The ideal loop is the paper's: its trigger is tested continuously and its updates act at "
+        "once. It loses the same packets as this run. The two differ in x by "
+        f"{found['rms_x']:.3g} (RMS){of_x}, and by at most {found['max_x']:.3g}."
     )
-    left = f"{100 * found['explained_relative']:.2g} % of the difference"
+    residual = f"the residual is {100 * found['explained_relative']:.2g} % of the difference"
     yield (
-        f"The effects below explain it: {left} is left."
+        f"The effects below explain the difference: {residual}."
         if found["explained"]
-        else f"The effects below do not explain it: {left} is left, which is too much."
+        else f"The effects below do not explain the difference: {residual}, which is too large."
     )
     yield _events(found)
     if any(map(is_against, found["shares"].values())):
-        yield (
-            "Effects partly cancel: one with a negative share takes away from the difference that "
-            "the others make."
-        )
+        yield ("An effect with a negative share partly cancels the others.")
 
 
 def _events(found: Mapping[str, Any]) -> str:
-    counts = f"{found['events_live']} events, against {found['events_ideal']} of the ideal loop"
-    if (parted := found["parted_event"]) is not None:
+    counts = f"{found['events_live']} events, the ideal loop {found['events_ideal']}"
+    if (parted := found["first_different_event"]) is not None:
         return (
-            f"The run had {counts}. With event {parted} they part: from there on the same fates "
-            "meet other events."
+            f"The run had {counts}. They agree up to event {parted}; from there on, the losses "
+            "fall on other events."
         )
     if (apart_s := found["max_event_difference_s"]) is None:
         return f"The run had {counts}."
-    return f"The run had {counts}; each at most {1e3 * apart_s:.3g} ms from the ideal one."
+    return f"The run had {counts}; the times of an event differ by at most {1e3 * apart_s:.3g} ms."
 
 
 def _effects(found: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -82,13 +79,13 @@ def _replay(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"Nothing could be replayed: {found.get('error', 'the record is empty')}."
     elif found["bit_exact"]:
         yield (
-            f"The machines were fed their {found['inputs']:,} recorded inputs again: all that they "
-            "then did is what is on record, bit for bit."
+            f"The {found['inputs']:,} recorded inputs were replayed: the outputs equal the record, "
+            "bit for bit."
         )
     else:
         yield (
-            "Fed its recorded inputs again, a machine did something else than is on record: "
+            "The recorded inputs were replayed: an output differs from the record: "
             f"{ReplayDifference(**found['first_difference'])}."
         )
     if not found.get("complete", True):
-        yield "The record has gaps; what lies in them could not be compared."
+        yield "The record has gaps, which could not be compared."

@@ -1,4 +1,4 @@
-"""The page of a run: what its summary says and its figures show, as one file of HTML."""
+"""The report of a run: its summary and its figures, as one HTML page."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -13,6 +13,7 @@ from cosim.output.remarks import remarks
 from cosim.output.report.report_findings import findings
 from cosim.output.run_tables import interval_of, key_numbers
 from noack.config.scenario import Scenario
+from noack.core.number_format import whole
 
 _NONE = "–"
 _TONES = {
@@ -20,11 +21,11 @@ _TONES = {
     "violated": "bad",
     "void": "doubt",
 }  # fmt: skip
-_QUANTILES = {"p50": "median", "p99": "99 %", "p999": "99.9 %", "max": "largest"}
+_QUANTILES = {"p50": "p50", "p99": "p99", "p999": "p99.9", "max": "max"}
 
 
 class Embedded(NamedTuple):
-    """A figure as it stands in the page."""
+    """A figure of the page."""
 
     name: str
     markup: Markup
@@ -48,7 +49,7 @@ def page(
         environment: the content of ``environment.json``; empty if there is none.
     """
     claims = _objects(summary.get("claims"))
-    said = list(_remarks(summary, claims))
+    remarks_shown = list(_remarks(summary, claims))
     status = summary["exit"]["status"]
     kind = "simulated run" if summary.get("kind") == "simulated" else "live run"
     hold = "model-based" if scenario.mode == "model" else "zero-order hold"
@@ -59,8 +60,8 @@ def page(
         ),
         description=scenario.description,
         ending=_ending(summary),
-        verdict_tone="bad" if status else "doubt" if said else "good",
-        remarks=said,
+        verdict_tone="bad" if status else "doubt" if remarks_shown else "good",
+        remarks=remarks_shown,
         # These have sections of their own.
         key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
@@ -92,7 +93,7 @@ def templates(folder: Path = Path(__file__).parent) -> Environment:
 def _ending(summary: Mapping[str, Any]) -> str:
     end = summary["exit"]
     if not end["status"]:
-        return f"The run reached its horizon of {_shown(summary['horizon_s'])} s."
+        return f"The run completed its {_shown(summary['horizon_s'])} s."
     return (
         f"The run failed (exit status {end['status']}): {end['reason']}. "
         f"It reached {_shown(summary['reached_s'])} of {_shown(summary['horizon_s'])} s."
@@ -100,12 +101,12 @@ def _ending(summary: Mapping[str, Any]) -> str:
 
 
 def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """What a person should know before trusting the rest."""
+    """Yield what to know before trusting the rest."""
     yield from (remark.text for remark in remarks(dict(summary)))
     for verdict in ("violated", "void"):
         count = sum(claim.get("verdict") == verdict for claim in claims)
         if count:
-            yield f"{count} of {len(claims)} claims {verdict}: see Claims"
+            yield f"{count} of {len(claims)} claims are {verdict}: see Claims"
 
 
 def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
@@ -116,15 +117,15 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     details = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in loss.items())
     yield "between updates", "model Â + B̂K" if scenario.mode == "model" else "zero-order hold"
     yield "trigger", trigger.description
-    yield "norm", "‖v‖₂" if trigger.weight is None else "‖W v‖₂, W in the scenario"
+    yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model
     if scenario.is_acknowledged:
         timeout_ms = 1e-6 * scenario.timing.acknowledgement_timeout_ns
-        back = network.reverse.loss.model_dump()
-        lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in back.items())
+        reverse = network.reverse.loss.model_dump()
+        lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in reverse.items())
         yield "acknowledgements", f"loss: {lost}; timeout {timeout_ms:g} ms"
-    yield "start", network.initial_sync.replace("_", " ")
+    yield "initial synchronisation", network.initial_sync.replace("_", " ")
     yield "plant", f"{scenario.plant.rate_hz:g} steps/s"
     yield "measurements", "every step" if every == 1 else f"every {every} steps"
     yield (
@@ -158,10 +159,10 @@ def _timing(summary: Mapping[str, Any]) -> Iterator[tuple[str, list[str]]]:
         return
     for role, late in (summary.get("lateness_us") or {}).items():
         counts = [str(late["steps"]), str(late["late_steps"])]
-        yield f"{role} lateness", [*(_whole(late[key]) for key in _QUANTILES), *counts]
+        yield f"{role} lateness", [*(whole(late[key]) for key in _QUANTILES), *counts]
     latency = summary.get("latency_us")
     if latency:
-        quantiles = [_whole(latency[key]) for key in _QUANTILES]
+        quantiles = [whole(latency[key]) for key in _QUANTILES]
         yield "sensor-to-controller latency", [*quantiles, str(latency["updates"]), ""]
 
 
@@ -178,16 +179,12 @@ def _words(key: str) -> str:
     return str(key).replace("_", " ")
 
 
-def _whole(value: float | None) -> str:
-    return _NONE if value is None else f"{value:.0f}"
-
-
 def _line(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else _shown(value)
 
 
 def _shown(value: Any) -> str:
-    """A value of JSON as a person reads it."""
+    """Write a value of a JSON document as text."""
     if value is None:
         return _NONE
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""The figures of one run, drawn from its record."""
+"""The figures of a run, drawn from its record."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
@@ -7,13 +7,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from cosim.analysis.run_summary import latency_us, lateness_us
+from cosim.analysis.timing_statistics import latency_us, lateness_us
 from cosim.output.report import signal_figures
 from cosim.output.report.axes import Bound, BoundKind
 from cosim.output.report.decimate import Reals
 from cosim.record.align import AlignedRun, join_all
 from cosim.record.estimation_error import true_states
-from cosim.record.packet_outcomes import crossing
+from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import RunRecord
 from noack.config.scenario import Scenario
 from noack.core.clock import NS_PER_S
@@ -32,13 +32,13 @@ Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKin
 
 
 class RunFigure(NamedTuple):
-    """A figure and what is said about it."""
+    """A figure with its caption."""
 
     name: str
     figure: Figure
     caption: str
     description: str
-    """What it shows, for those who cannot see it."""
+    """Text alternative of the figure."""
 
 
 BOUNDED = ("errors", "state-norm", "inter-event")
@@ -60,7 +60,7 @@ def pictures(
     Args:
         record: the run's record, of any length, none included.
         envelopes: certified bounds to be drawn beside what they bound.
-        timed: whether the processes' lateness means anything; in virtual time it does not.
+        timed: whether to show lateness; there is none in virtual time.
     """
 
     @cache
@@ -89,7 +89,7 @@ def _bounding(envelopes: Sequence[Envelope], quantity: str) -> list[Bound]:
 
 
 def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
-    crossed = crossing(record)
+    crossed = packet_outcomes(record)
     measurements, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
     events = measurements[measurements["event"] != NO_SEQUENCE]
     dropped = np.isin(events["event"], crossed.sequence[crossed.lost])
@@ -115,33 +115,32 @@ def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
     return RunFigure(
         "states",
         figure,
-        "States, and the time between broadcasts and between receptions. "
+        "States, and the times between transmissions and between deliveries. "
         + (
-            f"x_c jumps to {known} when a packet survives, x_s when its acknowledgement does, too. "
+            f"x_c jumps to {known} when an update arrives, x_s when its acknowledgement arrives. "
             if scenario.is_acknowledged
-            else f"At every event x_s jumps to {known}; x_c does so only when the packet survives. "
+            else f"At every event x_s jumps to {known}; x_c does so only when the update arrives. "
         )
         + _known(scenario)
-        + "A cross is a packet that was lost, a "
-        "diamond one that only the bound on successive drops let through.",
+        + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
-        f"{len(events)} broadcasts, of which {int(dropped.sum())} were dropped, and for "
-        f"{len(deliveries)} receptions, of which {int(forced.sum())} were forced.",
+        f"{len(events)} transmissions, of which {int(dropped.sum())} were lost, and for "
+        f"{len(deliveries)} deliveries, of which {int(forced.sum())} were forced.",
     )
 
 
 def _known(scenario: Scenario) -> str:
-    """What the sensor knows of x, where it does not measure x itself."""
+    """Explain x̂, where the sensor does not measure x exactly."""
     if scenario.coverage.knows_state:
         return ""
     if scenario.observer is None:
-        return "x̂ is what is measured, x with noise. "
+        return "x̂ is the measurement, x with noise. "
     outputs = (
-        "1 measured output"
+        "1 output"
         if scenario.message_sizes.outputs == 1
         else f"{scenario.message_sizes.outputs} outputs"
     )
-    return f"x̂ is the estimate of the sensor's observer, from {outputs}. "
+    return f"x̂ is the estimate of the observer, from {outputs}. "
 
 
 def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFigure:
@@ -152,17 +151,17 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFi
             t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
         ),
         (
-            "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; while none comes, "
-            "the sensor transmits again and again. The controller's error is ‖e_c‖ = ‖x_c − x‖."
+            "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; without one, the "
+            "sensor transmits repeatedly. The controller's error is ‖e_c‖ = ‖x_c − x‖."
             if record.scenario.is_acknowledged
-            else "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset whenever it passes the threshold. "
-            "The controller's error ‖e_c‖ = ‖x_c − x‖, which nobody in the loop can measure, "
-            "leaves it while packets are lost."
+            else "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset when it exceeds the threshold. The "
+            "controller's error ‖e_c‖ = ‖x_c − x‖ may exceed the threshold while packets are lost; "
+            "no process of the loop can measure it."
         )
         + (
             ""
             if record.scenario.coverage.knows_state
-            else " Both are against x̂, what the sensor knows."
+            else " Both are relative to x̂, the sensor's estimate of x."
         )
         + _dashed(bounds),
         "Error norms over time on a logarithmic axis: "
@@ -188,8 +187,8 @@ def _input(record: RunRecord) -> RunFigure:
     return RunFigure(
         "input",
         signal_figures.input_figure(_seconds(steps["t_ns"]), steps["u"], names),
-        "Control input u = K x_c, held from one tick of the controller to the next. Inputs that "
-        "coincide are drawn inside each other.",
+        "Control input u = K x_c, held between the controller's ticks. Equal inputs are drawn one "
+        "inside the other.",
         f"Control inputs {', '.join(names)} over time.",
     )
 
@@ -200,8 +199,7 @@ def _inter_event(record: RunRecord, lower_bounds: list[Bound]) -> RunFigure:
     return RunFigure(
         "inter-event",
         signal_figures.inter_event_figure(event_s, lower_bounds, record.scenario.horizon_s),
-        "Time between successive transmissions, over time and as a histogram."
-        + _dashed(lower_bounds),
+        "Inter-event times, over time and as a histogram." + _dashed(lower_bounds),
         "Inter-event times on a logarithmic axis"
         + (f", the shortest {np.diff(event_s).min():.3g} s." if len(event_s) > 1 else "."),
     )
@@ -215,10 +213,10 @@ def _lateness(record: RunRecord) -> RunFigure:
     return RunFigure(
         "lateness",
         signal_figures.lateness_figure(late_us, period_us),
-        "Share of its steps in which a process acted at least so late. Plant and controller count "
-        "from their own deadlines, the sensor from the measurement's grid time, the network from "
-        "the event's.",
-        f"Complementary distribution of lateness on logarithmic axes; the latest: {longest}.",
+        "Share of a process's steps with at least this lateness. Lateness is measured from the "
+        "deadline (plant, controller), the time of the measurement (sensor), or the event "
+        "(network).",
+        f"Complementary distribution of lateness on logarithmic axes; maximum: {longest}.",
     )
 
 
@@ -227,13 +225,13 @@ def _latency(record: RunRecord) -> RunFigure:
     return RunFigure(
         "latency",
         signal_figures.latency_figure(_seconds(event_ns), taken_us, record.scenario.horizon_s),
-        "Wall time from the sensor's event to the controller's update, one way.",
+        "Sensor-to-controller latency: wall time from the event to the controller's update.",
         f"Latencies of {len(taken_us)} updates, the longest {_largest(taken_us)} µs.",
     )
 
 
 def _dashed(curves: Sequence[Bound]) -> str:
-    return " Dashed: the bounds that are claimed." if curves else ""
+    return " Dashed: claimed bounds." if curves else ""
 
 
 def _largest(values: Reals) -> str:

@@ -75,7 +75,7 @@ def paper_figure(
     title: str = "",
     x_hat: Reals | None = None,
 ) -> Figure:
-    """States above, broadcasting and receiving intervals below: the paper's Fig. 2 and 3.
+    """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
     Args:
         mode: model is the paper's MB-ET (Fig. 2), zoh its ZOH-ET (Fig. 3).
@@ -87,9 +87,9 @@ def paper_figure(
         broadcast_s: (e,) times t_i of all transmissions.
         dropped: (e,) which of them the network lost.
         received_s: (d,) times t_i* of those that the controller received.
-        forced: (d,) which of them only the bound on successive dropouts let through.
+        forced: (d,) which of them were forced by the guarantee.
         title: what the run was, shown after "MB-ET" or "ZOH-ET".
-        x_hat: (k, n) what the sensor takes for x; None where that is x itself.
+        x_hat: (k, n) the sensor's estimate of x; None where it measures x exactly.
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
@@ -132,7 +132,7 @@ def paper_figure(
 def _state(
     axes: Axes, t_s: Reals, x: Reals, x_s: Reals, x_c: Reals, x_hat: Reals | None
 ) -> list[Shown]:
-    """Draw one state; what comes later is thinner, so that curves that coincide stay visible."""
+    """Draw one state; later curves are thinner, so that equal curves stay visible."""
     plant = line(axes, t_s, finite(x), "$x$ plant", color=_PLANT, linewidth=4.2)
     controller = line(axes, t_s, finite(x_c), "$x_c$ controller", color=_CONTROLLER, linewidth=2.4)
     sensor = line(axes, t_s, finite(x_s), "$x_s$ sensor", color=_SENSOR, linewidth=1.3)
@@ -144,7 +144,7 @@ def _state(
 
 
 def _heading(figure: Figure, mode: str, title: str, note: str, shown: Sequence[Shown]) -> None:
-    """Write title and legend above all states, which may be too narrow to bear them."""
+    """Write title and legend above all states."""
     head = "MB-ET" if mode == "model" else "ZOH-ET"
     text = ": ".join(filter(None, (head, plain(title, _LONGEST_TITLE)))) + (
         f" ({note})" if note else ""
@@ -180,7 +180,7 @@ def _receptions(axes: Axes, t_s: Reals, forced: Flags, dropped_s: Reals) -> None
 
 
 def _intervals(t_s: Reals) -> Reals:
-    """Time since the one before, NaN for the first: (k,)."""
+    """Return the times since the previous event, NaN for the first, (k,)."""
     return np.diff(t_s, prepend=np.nan)
 
 
@@ -192,12 +192,12 @@ def error_figure(
     e_c_norm: Reals,
     envelopes: Sequence[Bound] = (),
 ) -> Figure:
-    """‖e_s‖ with its threshold, and ‖e_c‖ with what bounds it, on a logarithmic axis.
+    """‖e_s‖ with its threshold, and ‖e_c‖ with its bounds, on a logarithmic axis.
 
     Args:
         t_s: (k,) times of the samples.
         e_s_norm: (k,) ‖x_s − x‖ before a reset, as the trigger tested it.
-        threshold: (k,) what it was tested against.
+        threshold: (k,) of the trigger.
         e_c_norm: (k,) ‖x_c − x‖; NaN where unknown.
         envelopes: certified bounds on ‖e_c‖.
     """
@@ -221,7 +221,7 @@ def error_figure(
 
 @styled
 def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()) -> Figure:
-    """‖x‖ with what bounds it, on a logarithmic axis.
+    """‖x‖ with its bounds, on a logarithmic axis.
 
     Args:
         t_s: (k,) times of the samples.
@@ -239,7 +239,7 @@ def state_norm_figure(t_s: Reals, x_norm: Reals, envelopes: Sequence[Bound] = ()
 def _norms(
     figure: Figure, axes: Axes, t_s: Reals, measured: Reals, title: str, shown: list[Any]
 ) -> Figure:
-    """Label a figure of norms; its axis stays near the largest: a reset goes down to rounding."""
+    """Label a figure of norms, and limit its axis: resets fall to rounding errors."""
     legend(axes, shown)
     axes.set(title=title, xlabel=TIME, ylabel="norm")
     finish(axes, t_s)
@@ -277,7 +277,7 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
 
 @styled
 def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = None) -> Figure:
-    """Share of steps that were later than so much, per process.
+    """Share of steps with at least a given lateness, per process.
 
     Args:
         lateness_us: by process, (k,) lateness of each of its steps in wall µs.
@@ -304,7 +304,7 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
 
 
 def _later_than(values: Reals) -> tuple[Reals, Reals]:
-    """Values, ascending, and the share of all that reach each of them."""
+    """Return values, ascending, and the share of all values that are at least as large."""
     values = finite(values)
     values = np.maximum(np.sort(values[np.isfinite(values)]), _SHORTEST_US)
     k = len(values)
@@ -318,15 +318,15 @@ def _later_than(values: Reals) -> tuple[Reals, Reals]:
 
 @styled
 def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) -> Figure:
-    """Time from the sensor's event to the controller's update, one way.
+    """Sensor-to-controller latency over time, with a histogram.
 
     Args:
         t_s: (d,) event times of the updates that arrived.
-        latency_us: (d,) wall µs until the controller had taken them.
-        until_s: the run's length, if the axis is to show all of it.
+        latency_us: (d,) wall µs from the event to the controller's update.
+        until_s: end of the time axis; by default the last event.
     """
     figure, axes = _over_time(t_s, latency_us, _CONTROLLER, [], until_s)
-    axes.set(title="Latency, event to update", ylabel="latency [wall µs]")
+    axes.set(title="Sensor-to-controller latency", ylabel="latency [wall µs]")
     return figure
 
 
@@ -348,12 +348,12 @@ def fidelity_figure(found: Fidelity) -> Figure:
 def inter_event_figure(
     broadcast_s: Reals, lower_bounds: Sequence[Bound] = (), until_s: float | None = None
 ) -> Figure:
-    """Inter-event times t_i − t_{i−1} over time, and how often each occurs.
+    """Inter-event times t_i − t_{i−1} over time, with a histogram.
 
     Args:
         broadcast_s: (e,) times t_i of all transmissions.
         lower_bounds: certified or printed bounds on the inter-event time.
-        until_s: the run's length, if the axis is to show all of it.
+        until_s: end of the time axis; by default the last event.
     """
     intervals_s = np.diff(broadcast_s)
     figure, axes = _over_time(broadcast_s[1:], intervals_s, _SENSOR, lower_bounds, until_s)
@@ -368,7 +368,7 @@ def _over_time(
     lower_bounds: Sequence[Bound],
     until_s: float | None,
 ) -> tuple[Figure, Axes]:
-    """Draw values over time, and beside it their histogram on the same logarithmic axis."""
+    """Draw values over time, and their histogram on the same logarithmic axis."""
     values = finite(values, positive=True)
     figure, (axes, beside) = single(2.1, [label for label, *_ in lower_bounds], beside_in=2.0)
     logarithmic(axes, "y")

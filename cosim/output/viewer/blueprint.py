@@ -1,4 +1,4 @@
-"""The layout of a run's recording: which panels a person sees, in which order and colours.
+"""The layout of a run's recording: panels, their order, colours.
 
 Entities of the recording, all on the timeline ``t`` (simulated time since the run's epoch):
 
@@ -9,18 +9,18 @@ Entities of the recording, all on the timeline ``t`` (simulated time since the r
 ``error/log10``           decimal logarithms of these and of the certified bound (5 scalars)
 ``size/log10``            ‖x‖ and its certified bound as decimal logarithms (2 scalars)
 ``input``                 u = K x_c (m scalars)
-``event/interval``        t_i − t_{i−1} in seconds, at every broadcast
+``event/interval``        t_i − t_{i−1} in seconds, at every transmission
 ``event/stem``            its stem: 0, interval, NaN
-``event/certified``       the certified least interval, at the start and the end of the run
-``reception/interval``    the same between deliveries the loss model let through
-``reception/forced``      the same for deliveries forced by the bound on successive dropouts
+``event/certified``       the certified minimum inter-event time, at the start and the end
+``reception/interval``    the same between deliveries that were not forced
+``reception/forced``      the same for deliveries forced by the guarantee
 ``reception/stem``        the stems of both
-``drop``                  0 at every dropped update
+``drop``                  0 at every lost update
 ``lateness/<process>``    lateness in microseconds
 ``log``                   text
-``picture/…``             the plant, as a picture that moves (``cosim/output/viewer/pictures/``)
-``network/…``             the loop's processes, and packets under way
-``key/…``                 which colour is what
+``picture/…``             the plant, animated (``cosim/output/viewer/pictures/``)
+``network/…``             the loop's processes, and packets in flight
+``key/…``                 the colours and their meaning
 ========================  =================================================================
 """
 
@@ -61,9 +61,9 @@ LOG = "log"
 
 _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
 _BEFORE, _AFTER = 0.02, 0.06
-"""Room beside the run on a time axis, as shares of its length."""
+"""Margins of the time axis, as shares of the run's length."""
 _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
-"""Id of rerun's own view that holds what linked views share."""
+"""Id of rerun's view that stores what linked views share."""
 
 
 def state_path(name: str) -> str:
@@ -85,7 +85,7 @@ def styles(
         colors=[PLANT, SENSOR, CONTROLLER],
         widths=[4.5, 1.5, 1.5],
     )
-    # What comes later is drawn above: ‖e_c‖ is often equal to its bound, and stays visible on it.
+    # Later series are drawn on top: ‖e_c‖ often equals its bound, and stays visible on it.
     errors = ["bound (I1)", "‖e_s‖ sensor", "threshold", "‖e_c‖ controller", "certified"]
     colours = [IDENTITY, SENSOR, THRESHOLD, CONTROLLER, CERTIFIED]
     widths = [3.5, 1.5, 2.0, 1.5, 2.0]
@@ -97,18 +97,16 @@ def styles(
     found[SIZE_LOG10] = rr.SeriesLines(
         names=["‖x‖ plant", "certified"], colors=[PLANT, CERTIFIED], widths=[2.5, 2.0]
     )
-    found[EVENT_CERTIFIED] = rr.SeriesLines(
-        names="certified least interval", colors=CERTIFIED, widths=1.5
-    )
+    found[EVENT_CERTIFIED] = rr.SeriesLines(names="certified minimum", colors=CERTIFIED, widths=1.5)
     m = len(input_names)
     found[INPUT] = rr.SeriesLines(
         names=list(input_names),
         colors=[input_colour(i) for i in range(m)],
-        # Inputs often coincide: the first ones, wider, stay visible beneath the last.
+        # Inputs are often equal: the first ones are wider and stay visible.
         widths=[2.0 + 2.5 * (m - 1 - i) / m for i in range(m)],
     )
-    found[EVENT_STEM] = _stem("broadcast", SENSOR)
-    found[EVENT] = _mark("broadcast", SENSOR, "circle", 4.0)
+    found[EVENT_STEM] = _stem("sent", SENSOR)
+    found[EVENT] = _mark("sent", SENSOR, "circle", 4.0)
     found[RECEPTION_STEM] = _stem("received", CONTROLLER)
     found[RECEPTION] = _mark("received", CONTROLLER, "circle", 4.0)
     found[FORCED] = _mark("received (forced)", FORCED_COLOUR, "diamond", 6.0)
@@ -145,57 +143,26 @@ def layout(
     picture: Picture | None = None,
     diagram: NetworkDiagram | None = None,
 ) -> rrb.Blueprint:
-    """Lay out the panels: picture and packets on the left, above words; curves on the right.
+    """Lay out the panels: picture, packets and texts on the left, curves on the right.
 
-    Without a picture or diagram, the curves have the place to themselves. Plots have no legend of
-    their own, which would cover them: the colours are named in a panel beside them.
+    Plots have no legends, which would cover data: a panel names the colours.
     """
-    intervals = rrb.Horizontal(
-        _plot("Broadcasting intervals [s]", "event", [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]),
-        _plot(
-            "Receiving intervals [s]",
-            "reception",
-            [RECEPTION_STEM, RECEPTION, FORCED, DROP],
-        ),
-    )
-    norms = rrb.Tabs(
-        _plot("log10 ‖e‖", ERROR_LOG10),
-        _plot("‖e‖", ERROR),
-        _plot("log10 ‖x‖", SIZE_LOG10),
-    )
-    inputs = _plot("Control input u = K x_c", INPUT)
-    words = rrb.Tabs(
-        ColourKey(input_names).panel(),
-        rrb.TextDocumentView(origin=ABOUT, name="About this run"),
-        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if processes else []),
-        rrb.TextLogView(
-            origin=LOG,
-            name="Log",
-            # The column of times is as narrow as its title, "t": the text says the time.
-            columns=rrb.TextLogColumns(
-                timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
-                text_log_columns=["loglevel", "body"],
-            ),
-            format_options=rrb.TextLogFormat(monospace_body=True),
-        ),
-    )
-    states = _states(state_names)
-    drawings = [
-        *([] if picture is None else [panel(picture)]),
-        *([] if diagram is None else [diagram.panel()]),
-    ]
+    texts = _texts(input_names, lateness=bool(processes))
+    drawings = [] if picture is None else [panel(picture)]
+    drawings += [] if diagram is None else [diagram.panel()]
     if drawings:
-        shares = [4, 3, 3][: len(drawings)]
+        left = rrb.Vertical(*drawings, texts, row_shares=[*[4, 3][: len(drawings)], 3.6])
         curves = rrb.Vertical(
-            states, rrb.Horizontal(norms, inputs), intervals, row_shares=[2, 1, 1]
+            _states(state_names),
+            rrb.Horizontal(_norms(), _inputs()),
+            _intervals(),
+            row_shares=[2, 1, 1],
         )
-        whole = rrb.Horizontal(
-            rrb.Vertical(*drawings, words, row_shares=[*shares, 3.6]), curves, column_shares=[1, 1]
-        )
+        whole = rrb.Horizontal(left, curves, column_shares=[1, 1])
     else:
         whole = rrb.Horizontal(
-            rrb.Vertical(states, intervals, row_shares=[2, 1]),
-            rrb.Vertical(norms, inputs, words),
+            rrb.Vertical(_states(state_names), _intervals(), row_shares=[2, 1]),
+            rrb.Vertical(_norms(), _inputs(), texts),
             column_shares=[2, 1],
         )
     return rrb.Blueprint(
@@ -205,8 +172,46 @@ def layout(
     )
 
 
+def _intervals() -> rrb.Container:
+    sent = [EVENT_STEM, EVENT, DROP, EVENT_CERTIFIED]
+    received = [RECEPTION_STEM, RECEPTION, FORCED, DROP]
+    return rrb.Horizontal(
+        _plot("Broadcasting intervals [s]", "event", sent),
+        _plot("Receiving intervals [s]", "reception", received),
+    )
+
+
+def _norms() -> rrb.Container:
+    return rrb.Tabs(
+        _plot("log10 ‖e‖", ERROR_LOG10), _plot("‖e‖", ERROR), _plot("log10 ‖x‖", SIZE_LOG10)
+    )
+
+
+def _inputs() -> rrb.View:
+    return _plot("Control input u = K x_c", INPUT)
+
+
+def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
+    """Tabs: the colour key, the text about the run, lateness, the log."""
+    return rrb.Tabs(
+        ColourKey(input_names).panel(),
+        rrb.TextDocumentView(origin=ABOUT, name="About this run"),
+        *([_plot("Lateness [µs]", "lateness", ["$origin/**"])] if lateness else []),
+        rrb.TextLogView(
+            origin=LOG,
+            name="Log",
+            # The column of times would be too narrow: the text contains the time.
+            columns=rrb.TextLogColumns(
+                timeline_columns=rrb.encodings.TimelineColumn(TIMELINE, visible=False),
+                text_log_columns=["loglevel", "body"],
+            ),
+            format_options=rrb.TextLogFormat(monospace_body=True),
+        ),
+    )
+
+
 def _states(names: Sequence[str]) -> rrb.Container:
-    """One panel for each coordinate: all at once up to four, in tabs of equal size beyond."""
+    """One panel for each coordinate: together up to four, else in tabs of equal size."""
     most = _PAGE_OF_FEW if len(names) <= _MANY else _PAGE_OF_MANY
     size = math.ceil(len(names) / math.ceil(len(names) / most))
     pages = [names[i : i + size] for i in range(0, len(names), size)]
@@ -223,9 +228,9 @@ def _page(names: Sequence[str]) -> rrb.Container:
 
 
 def _common_time_axis(horizon_s: float) -> rrb.View:
-    """Give what all plots show at first: the whole run, with room for marks and tick labels.
+    """Set the initial time range of all plots: the whole run, with a margin.
 
-    The viewer keeps the common range with a view of its own, which is known by its id.
+    The viewer stores the common range in a hidden view of its own, identified by its id.
     """
     start, end = (
         rr.TimeRangeBoundary.absolute(seconds=share * horizon_s) for share in (-_BEFORE, 1 + _AFTER)
@@ -237,7 +242,7 @@ def _common_time_axis(horizon_s: float) -> rrb.View:
 
 
 def _plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
-    """One time series; all share the time axis, so that zooming one zooms all."""
+    """One time series; all share the time axis and zoom together."""
     return rrb.TimeSeriesView(
         origin=origin,
         contents=[path if path.startswith("$") else f"/{path}" for path in contents],

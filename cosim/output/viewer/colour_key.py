@@ -1,4 +1,4 @@
-"""The key to the colours: one panel beside the plots, instead of a legend that covers each."""
+"""The colour key: one panel instead of a legend in each plot."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,7 +20,7 @@ from cosim.output.palette import (
 from cosim.output.viewer.pictures.picture import Shape, label, lines
 
 COLOUR_KEY = "key"
-"""What all entities of the key are below."""
+"""Parent of all entities of the key."""
 
 _WIDE, _HIGH = 18.0, 1.2
 _MOST_IN_A_ROW = 6
@@ -43,7 +43,7 @@ _ROWS: tuple[tuple[_Entry, ...], ...] = (
     ),
     (
         ("lost", LOST, _CROSS),
-        ("received, forced", FORCED, _DIAMOND),
+        ("delivery forced", FORCED, _DIAMOND),
         ("network", NETWORK, _STROKE),
     ),
 )
@@ -55,7 +55,7 @@ def input_colour(i: int) -> Colour:
 
 
 class ColourKey:
-    """Samples of lines and marks in rows, each above its name.
+    """Samples of lines and marks, with their names.
 
     Args:
         input_names: of the control inputs; a single one needs no entry.

@@ -1,4 +1,4 @@
-"""The view of a run: opened as it begins, or written anew from its finished record."""
+"""The recording of a run for the viewer: written during the run, or from its record."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from noack.config.scenario import Scenario
 from noack.protocol.topology import LOOP_ROLES
 
 _INDEXED_S = 120.0
-"""Wall time of a run whose view has an index; that of a longer one would take too much memory."""
+"""Longest wall time of a run whose recording gets an index, which takes memory."""
 
 
 def open_view(
@@ -27,7 +27,7 @@ def open_view(
     *,
     at_once: bool = False,
 ) -> RunView:
-    """Create the recording of a run, to be written at once or while the run goes on."""
+    """Create the recording of a run, written at once or during the run."""
     loop = loop_of(scenario)
     return RunView(
         run_dir / RECORDING_FILE,
@@ -57,11 +57,11 @@ def write_view(record: RunRecord, run_dir: Path, run_id: int) -> None:
 
 
 def about(scenario: Scenario, kind: Kind = "live") -> str:
-    """Markdown that says what the view shows."""
+    """Return the viewer's text about a run, in Markdown."""
     network = scenario.network
     late = {
-        "live": "* **Lateness**: wall time by which each process acted after its input was due.",
-        "simulated": "* The run was **simulated**, in virtual time: nothing was ever late.",
+        "live": "* **Lateness**: wall time between a deadline and the process's action.",
+        "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
     }[kind]
     protocol, x_s_is_reset = "Nothing is acknowledged.", "at every event"
     if scenario.is_acknowledged:
@@ -73,19 +73,19 @@ def about(scenario: Scenario, kind: Kind = "live") -> str:
 
 Sensor and controller run **{hold}** between updates. The sensor transmits when
 {scenario.trigger.description}.
-The network ({network.loss.model.replace("_", "-")} loss) drops at most
-M − 1 = {network.mansd} packets in a row. {protocol}
+The network ({network.loss.model.replace("_", "-")} loss) loses at most
+M − 1 = {network.mansd} consecutive packets. {protocol}
 
-* A finished run opens where ‖e_c‖ is largest. **Colours** names what each colour stands for.
-* **The picture**: the plant, solid, and in outline where the sensor's model (whole line) and the
-  controller's (dashes) believe it is. Play the run to see it move.
-* **Packets**: each update on its way; what is lost falls, what was forced through is a diamond.
-  A flight takes microseconds; it is drawn as {LEG_S:g} s a leg: x_c jumps before the dot arrives.
+* A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
+* **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed
+  outline). Play the run to animate it.
+* **Packets**: each update in flight. A lost one falls; a forced delivery is a diamond. A flight
+  takes microseconds but is animated as {LEG_S:g} s per hop, so x_c jumps before the dot arrives.
 * **States**: the plant's x, the sensor's model x_s (reset {x_s_is_reset}), the controller's model
-  x_c (reset only by what survives). Where x_c leaves the other two, packets were lost.
-* **Intervals**: time since the last broadcast, and since the last reception.
-* **Errors**: e_s = x_s − x against its threshold, and e_c = x_c − x, which nobody in the loop can
-  measure, below what is known of it: the bound from identity (I1), and the certified one, which
-  holds as long as nothing is later than the certificate allows (the summary's claims say so).
+  x_c (reset by each delivery). Where x_c differs from the other two, packets were lost.
+* **Intervals**: time since the previous transmission, and since the previous delivery.
+* **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
+  (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds
+  while no process is later than the certificate allows (see the claims of the summary).
 {late}
 """

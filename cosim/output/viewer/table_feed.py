@@ -1,4 +1,4 @@
-"""Feeds the view of a run from the tables of its record, as they grow or all at once."""
+"""Feeds the recording of a run from its tables, as they grow or all at once."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -40,9 +40,9 @@ from noack.theory.run_conditions import allowed_conditions
 from noack.theory.scenario_certificates import ScenarioCertificate, certify
 
 _LAG_S = 0.2
-"""Wall time by which the joined view trails, so that all processes' batches are in."""
+"""Wall time by which the view lags, so that the batches of all processes have arrived."""
 _PATIENCE_S = 1.0
-"""Wall time that it waits for a controller that is silent."""
+"""Wall time that it waits for a silent controller."""
 
 _SHOWN = (
     CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
@@ -54,18 +54,18 @@ Reals = NDArray[np.float64]
 
 
 class ViewFeed:
-    """Joins growing tables and passes what is complete to the view.
+    """Aligns growing tables and passes complete batches to the view.
 
     Args:
         scenario: the resolved scenario.
-        view: takes the joined batches.
+        view: receives the aligned batches.
     """
 
     def __init__(self, scenario: Scenario, view: RunView) -> None:
         self._scenario = scenario
         self._loop = loop_of(scenario)
         self._view = view
-        # What is not shown is not kept.
+        # Other tables are not shown.
         self._pending: dict[str, list[Rows]] = {table: [] for table in _SHOWN}
         self._types = tables_of(scenario)
         self._track: ControllerTrack = initial_track(scenario)
@@ -77,7 +77,7 @@ class ViewFeed:
         self._told = np.zeros(0, self._types[CONTROLLER_SETTING])
         self._flow = model_flow(scenario, self._told)
         self._claimed_until_s = np.inf
-        # Where the sensor does not know x, the plant's own is shown.
+        # If the sensor does not measure x exactly, the plant's own x is shown.
         self._plant: Rows | None = None
         if not scenario.coverage.knows_state:
             self._plant = np.zeros(0, self._types[PLANT_STEP])
@@ -97,7 +97,7 @@ class ViewFeed:
 
     @np.errstate(all="ignore")  # a run may diverge
     def advance(self, *, final: bool = False) -> None:
-        """Pass on what is complete; at the end, everything."""
+        """Pass on the complete batches; at the end, everything."""
         if len(told := self._take(CONTROLLER_SETTING, None)):
             self._told = np.concatenate([self._told, told])
             self._flow = model_flow(self._scenario, self._told)
@@ -140,13 +140,13 @@ class ViewFeed:
         return rows[:ready]
 
     def _systems(self, steps: Rows) -> None:
-        """Keep the system's own states until the measurements at their times are shown."""
+        """Keep the system's internal states until the measurements at their times are shown."""
         if self._own is not None and len(steps):
             t_ns, z = self._own
             self._own = np.concatenate([t_ns, steps["t_ns"]]), np.vstack([z, steps["z"]])
 
     def _own_at(self, times_ns: Times) -> Reals | None:
-        """The system's own state at ascending times (k,), NaN where it is not in; (k, N)."""
+        """Return the system's internal state at ascending times (k,), NaN if unknown; (k, N)."""
         if self._own is None:
             return None
         t_ns, z = self._own
@@ -174,17 +174,7 @@ class ViewFeed:
         )
         if not self._scenario.is_acknowledged:
             bounds[~in_common(self._scenario, joined)] = np.nan
-        self._view.samples(
-            joined.t_ns,
-            joined.x,
-            joined.x_s,
-            joined.x_c,
-            joined.e_s_norm,
-            joined.threshold,
-            joined.e_c_norm,
-            bounds,
-            self._certified(t_s, "state"),
-        )
+        self._view.samples(joined, bounds, self._certified(t_s, "state"))
         z = self._own_at(joined.t_ns)
         self._view.move(joined.t_ns, Frames(t_s, joined.x, joined.x_s, joined.x_c, z))
         event_ns = rows["t_ns"][rows["event"] != NO_SEQUENCE]
@@ -197,12 +187,9 @@ class ViewFeed:
 
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:
-        """The certificate of the run, made when the run is under way: it takes its time.
-
-        None of what is beyond the theory.
-        """
+        """The certificate of the run, None if there is none; computed at first use: it is slow."""
         if not self._scenario.coverage.is_certifiable or self._loop.setpoint is not None:
-            return None  # at a set-point it would be of the deviations
+            return None  # at a set-point it bounds the deviations
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
             self._view.certified_interval(
@@ -219,7 +206,7 @@ class ViewFeed:
         return np.asarray(np.where(t_s < self._claimed_until_s, bound, np.nan))
 
     def _bounds(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
-        """The bound of ‖e_c‖ that (I1) gives, (k,); none where updates are acknowledged."""
+        """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
         if self._scenario.is_acknowledged:
             return np.full(len(rows), np.nan)
         samples = zip(
@@ -229,7 +216,7 @@ class ViewFeed:
         return np.array([self._monitor.sample(*sample).identity for sample in samples])
 
     def _deliveries(self, until_ns: int | None) -> None:
-        """Draw deliveries once the network's word on them, from another process, must be in."""
+        """Draw deliveries once the rows of the network process about them must have arrived."""
         waiting = np.concatenate(self._undrawn)
         ready = np.full(len(waiting), True) if until_ns is None else waiting["t_ns"] <= until_ns
         self._undrawn = [waiting[~ready]]
@@ -247,8 +234,10 @@ class ViewFeed:
         if not len(rows):
             return
         if self._scenario.is_acknowledged:
-            back = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
-            self._view.packets(back["t_ns"], back["release_ns"], back["fate"], back=True)
+            reverse = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
+            self._view.packets(
+                reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True
+            )
         rows, sequence, event_ns = updates_in(rows)
         self._view.packets(event_ns, rows["release_ns"], rows["fate"])
         self._forced.update(sequence[rows["fate"] == Fate.FORCED].tolist())
@@ -272,6 +261,6 @@ class ViewFeed:
 
 
 def _intervals_s(t_ns: Times, before_ns: int | None) -> NDArray[np.float64]:
-    """Time since the one before, NaN for the first of all."""
+    """Return the times since the previous one, NaN for the first."""
     first = np.nan if before_ns is None else (t_ns[0] - before_ns) * 1e-9
     return np.concatenate([[first], np.diff(t_ns) * 1e-9])

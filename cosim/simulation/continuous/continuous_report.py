@@ -1,11 +1,8 @@
-"""What ``noack simulate --trigger continuous`` says of a run."""
+"""The run of ``noack simulate --trigger continuous``: its summary and its JSON document."""
 
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from cosim.record.divergence import Divergence, divergence
 from cosim.simulation.continuous.continuous_loop import Samples, continuous_loop_of
@@ -17,8 +14,7 @@ from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 
 POINTS = 501
-"""States are told at so many times, evenly over the run."""
-_EVENTS_SHOWN = 40
+"""Number of times, evenly over the run, at which the document gives the states."""
 
 
 def run_continuous(resolved: Scenario) -> ContinuousRun:
@@ -37,7 +33,7 @@ def run_continuous(resolved: Scenario) -> ContinuousRun:
 
 @np.errstate(all="ignore")  # a run may diverge
 def document(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
-    """The run as JSON: its summary, every event, and the states at 501 times."""
+    """Return the run as JSON: its summary, every event, and the states at 501 times."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     before = run.before
     return {
@@ -72,7 +68,7 @@ def _thresholds(run: ContinuousRun, samples: Samples) -> list[float] | None:
 
 
 def summary(run: ContinuousRun, resolved: Scenario) -> dict[str, Any]:
-    """The run's figures, under the names that they have in a run's ``summary.json``."""
+    """Return the run's numbers, with the keys of ``summary.json``."""
     samples = run.at(np.linspace(0.0, run.reached_s, POINTS))
     diverged = _divergence(run, samples, resolved)
     arrived = np.flatnonzero(run.delivered)
@@ -107,57 +103,5 @@ def _divergence(run: ContinuousRun, samples: Samples, resolved: Scenario) -> Div
     return divergence(samples.t_s, samples.x, [resolved])
 
 
-@np.errstate(all="ignore")
-def print_run(console: Console, run: ContinuousRun, resolved: Scenario) -> None:
-    """Print the run's figures, and its events."""
-    figures = summary(run, resolved)
-    mode = "model-based" if resolved.mode == "model" else "zero-order hold"
-    table = Table(title=f"{resolved.name}, {mode}, M − 1 = {resolved.network.mansd}, continuous")
-    table.add_column("quantity")
-    table.add_column("value", justify="right")
-    for what, value in (
-        ("transmissions", str(figures["events"])),
-        ("deliveries", str(figures["deliveries"])),
-        ("dropped by the network", str(figures["drops"])),
-        (
-            f"longest loss burst (cap M − 1 = {figures['mansd']})",
-            str(figures["longest_loss_burst"]),
-        ),
-        ("shortest inter-event time", _seconds(figures["inter_event_min_s"])),
-        ("median inter-event time", _seconds(figures["inter_event_median_s"])),
-        ("median time between deliveries", _seconds(figures["inter_delivery_median_s"])),
-        ("‖x‖ at the start", f"{figures['initial_state_norm']:.3g}"),
-        ("‖x‖ at the end", f"{figures['final_state_norm']:.3g}"),
-    ):
-        table.add_row(what, value)
-    console.print(table)
-    console.print(_event_table(run))
-    if len(run.before) > _EVENTS_SHOWN:
-        console.print(f"and {len(run.before) - _EVENTS_SHOWN} more events: --json has them all")
-    if figures["exit"]["status"]:
-        console.print(f"[bold red]the run failed:[/] {escape(figures['exit']['reason'])}")
-
-
-def _event_table(run: ContinuousRun) -> Table:
-    table = Table(title="events")
-    for heading in ("event", "t, s", "since the last, s", "fate", "‖x‖", "‖e_c‖ before"):
-        table.add_column(heading, justify="right")
-    since_s = np.diff(run.event_s, prepend=0.0)
-    for i, state in enumerate(run.before[:_EVENTS_SHOWN]):
-        table.add_row(
-            str(i),
-            f"{state.t_s:.9f}",
-            f"{since_s[i]:.9f}" if i else "",
-            "delivered" if run.delivered[i] else "[red]lost[/]",
-            f"{np.linalg.norm(state.x):.4g}",
-            f"{run.system.norms(state.e_c[None])[0]:.4g}",
-        )
-    return table
-
-
 def _or_none(statistic: Any, values: Vector) -> float | None:
     return float(statistic(values)) if len(values) else None
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.6f} s"

@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 import tomli_w
 from markupsafe import Markup
 
-from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
 from cosim.output.report.report_page import templates
 from cosim.studies.campaign.campaign_figures import Drawn
 from cosim.studies.campaign.campaign_summary import CampaignSummary, ComparedResult, GridPointResult
 from cosim.studies.campaign.draw_statistics import Estimate
 from cosim.studies.campaign.metrics import METRICS, Metric
+from noack.core.number_format import plus_minus
 
 NONE = "–"
 

@@ -21,7 +21,6 @@ from cosim.simulation.batch.batch_interface import ROW
 from cosim.simulation.batch.batch_status import DIVERGED, OK, TOO_MANY_EVENTS
 from cosim.simulation.virtual_time import simulate
 from cosim.studies.campaign.random_draws import Box, box_of, drawn_scenario
-from noack.config.resolution import policy_of
 from noack.config.scenario import Scenario
 from noack.config.sections.run_sections import PortsSection, RealtimeSection, SeedsSection
 from noack.core.clock import NS_PER_S
@@ -95,8 +94,8 @@ class SampledWork:
         row["final_norm"] = norms[-1]
         row["cost"] = self._cost(record)
         joined = join_all(record)
-        fading_per_s = policy_of(record.scenario).trigger_rule(record.loop.n).fading_per_s
-        scaled = joined.e_c_norm * np.exp(fading_per_s * joined.t_ns / NS_PER_S)
+        decay_per_s = record.scenario.trigger.threshold_decay_per_s
+        scaled = joined.e_c_norm * np.exp(decay_per_s * joined.t_ns / NS_PER_S)
         row["sup_e_c_scaled"] = scaled[in_common(record.scenario, joined)].max(initial=0.0)
 
     def _cost(self, record: RunRecord) -> float:

@@ -7,12 +7,12 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from cosim.output.number_format import plus_minus
 from cosim.output.report.figure_files import inline
 from cosim.output.report.report_page import templates
 from cosim.studies.design.design_figure import trade_off
 from cosim.studies.design.design_result import WORDS, DesignResult, certified, seconds
 from noack.config.scenario_file import dumps
+from noack.core.number_format import plus_minus
 
 _CAPTION = (
     "Mean number of transmissions and quantile of the settling times of each candidate, all on the "

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from cosim.output.number_format import plus_minus
 from cosim.studies.design.candidate_measures import Bounded, Bounds, CandidateMeasures, DesignLimits
 from cosim.studies.design.design_search import Trial
 from cosim.studies.design.design_space import DesignSpace
 from noack.config.scenario import Scenario
+from noack.core.number_format import plus_minus
 
 _DESIGNED = "_designed"
 WORDS: dict[Bounded, str] = {"state": "sup‖x‖", "error": "sup‖e_c‖"}

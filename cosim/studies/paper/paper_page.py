@@ -1,5 +1,7 @@
 """The page ``paper.md``: the template's words, the results' numbers."""
 
+import re
+import textwrap
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -16,6 +18,9 @@ from cosim.studies.paper.paper_numbers import HORIZON_S, number, percent, spread
 from cosim.studies.paper.paper_results import Results
 from noack.core.linear_systems import Vector
 
+_COLUMNS, _GLUE = 100, "\N{NO-BREAK SPACE}"
+_ITEM = re.compile(r"\* |\d+\. ")
+"""The mark of a list item in Markdown."""
 _LOST = "lost"
 _MEASURES = (
     ("transmissions", "events"),
@@ -57,7 +62,7 @@ class _Varied(NamedTuple):
 
 def render(results: Results) -> str:
     """Return the page in Markdown."""
-    return (
+    return _wrapped(
         _templates()
         .get_template("paper.md.jinja")
         .render(
@@ -78,6 +83,41 @@ def render(results: Results) -> str:
             **results.evidence,
         )
     )
+
+
+def _wrapped(text: str) -> str:
+    """Wrap the paragraphs of a Markdown page at 100 columns; tables and code stay as they are."""
+    lines: list[str] = []
+    paragraph, code = "", False
+    for line in text.splitlines():
+        start = line.lstrip()
+        fence = start.startswith("```")
+        kept = code or fence or not start or start[0] in "|#!<"
+        code ^= fence
+        if paragraph and (kept or _ITEM.match(start)):
+            lines += _filled(paragraph)
+            paragraph = ""
+        if kept:
+            lines.append(line)
+        else:
+            paragraph = f"{paragraph} {start}" if paragraph else line
+    return "\n".join([*lines, *_filled(paragraph), ""])
+
+
+def _filled(paragraph: str) -> list[str]:
+    start = paragraph.lstrip()
+    item = _ITEM.match(start)
+    begin = len(paragraph) - len(start) + (item.end() if item else 0)
+    # No line may begin with an operator, which is a mark of Markdown.
+    glued = paragraph[:begin] + re.sub(r" (?=[-+>=*] )", _GLUE, paragraph[begin:])
+    lines = textwrap.wrap(
+        glued,
+        _COLUMNS,
+        subsequent_indent=" " * begin,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [line.replace(_GLUE, " ") for line in lines]
 
 
 def _shares(results: Results) -> dict[str, Any]:

@@ -8,10 +8,10 @@ from noack.config.disturbances import AnyDisturbance, variance_at
 from noack.config.plants import AnyPlant
 from noack.config.sections.matrix_file_section import require_read
 from noack.config.sections.measurement_section import MeasurementSection
-from noack.config.sections.rates import RateHz, require_whole_period
 from noack.observers.estimation_model import NoiseVariances
 from noack.plants.linear import LinearSettings
 from noack.settings.matrices import Row, Rows, require_non_negative
+from noack.settings.rates import RateHz, require_whole_period
 from noack.settings.section import ScenarioSection
 
 

@@ -16,7 +16,7 @@ ROLES = {"plant", "sensor", "netem", "controller", "recorder", "launcher"}
 GOOD: dict[str, Any] = {
     "exit": {"status": 0, "reason": "horizon"},
     "missing_samples": 0,
-    "lost_outside_netem": 0,
+    "unintended_losses": 0,
     "rejected_datagrams": {},
     "assumption_violations": [],
     "replay": {"bit_exact": True, "complete": True, "inputs": 7},
@@ -78,9 +78,9 @@ def test_what_was_overtaken_is_rejected_and_nothing_else() -> None:
     [
         ("exit", {"status": 1, "reason": "plant: too slow"}, "too slow"),
         ("missing_samples", 3, "missing_samples: 3"),
-        ("lost_outside_netem", 1, "lost_outside_netem: 1"),
+        ("unintended_losses", 1, "unintended_losses: 1"),
         ("rejected_datagrams", {"plant": {"tag": 1}}, "rejected_datagrams"),
-        ("assumption_violations", [{"what": "MANSD violated"}], "MANSD"),
+        ("assumption_violations", [{"cause": "dropouts", "what": "MANSD violated"}], "MANSD"),
         ("replay", {"bit_exact": False, "complete": True, "inputs": 7}, "the replay"),
         ("replay", None, "the replay"),
         ("replay", {"bit_exact": True, "complete": True, "inputs": 6}, "7 on the way"),

@@ -1,5 +1,6 @@
 """Numbers that age badly: every one has defined behaviour, and nobody is accused wrongly."""
 
+import json
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from cosim.analysis.claims.claim import ClaimVerdict
 from cosim.analysis.claims.claim_evaluation import ClaimEvaluation
 from cosim.analysis.replay import replay
-from cosim.analysis.run_summary import dumps, summarise
+from cosim.analysis.run_summary import summarise
 from cosim.record.run_record import RunRecord
 from cosim.simulation.virtual_time import simulate
 from noack.config.resolution import resolve
@@ -44,8 +45,8 @@ def plant(A: Any, B: Any, gain: Any, factor: float = 1.02) -> dict[str, Any]:
 
 def require_sound(record: RunRecord, status: ExitStatus = ExitStatus.OK) -> dict[str, Any]:
     """Replay, summary and claims of a run: bit-exact, JSON, and no false accusation."""
-    found = summarise(record, 0, "horizon")
-    dumps(found)
+    found = summarise(record, 0, "horizon").to_json()
+    json.dumps(found, allow_nan=False)
     assert found["exit"]["status"] == status, found["exit"]
     assert replay(record).bit_exact is True
     with np.errstate(all="ignore"):
@@ -143,7 +144,7 @@ def test_as_many_inputs_as_states_are_replayed(content: dict[str, Any]) -> None:
     record = simulate(scenario(content, horizon_s=0.2, **settings))
     assert record["plant_step"]["u"].shape == (21, 64)
     assert replay(record).bit_exact is True
-    dumps(summarise(record, 0, "horizon"))
+    summarise(record, 0, "horizon").model_dump_json()
 
 
 @pytest.mark.parametrize("x", [[-0.0, 0.0], [5e-324, -5e-324], [-0.0, -1e-310]])
@@ -175,7 +176,7 @@ def test_an_input_beyond_all_numbers_is_not_applied(content: dict[str, Any]) -> 
     # The plant rejects what is not finite, and goes on holding what it has: here, nothing.
     assert np.isfinite(record["plant_step"]["u"]).all()
     assert np.isfinite(record["plant_step"]["x"]).all()
-    found = summarise(record, 0, "horizon")
+    found = summarise(record, 0, "horizon").to_json()
     assert found["rejected_datagrams"]["plant"]["not_finite"] == sent.sum()
 
 
@@ -212,6 +213,6 @@ def test_a_damaged_number_in_a_record_is_named(
     found = replay(damaged).first_difference
     assert found is not None
     assert (found.table, found.column.rstrip("0123456789[]_")) == (table, column.rstrip("_"))
-    dumps(summarise(damaged, 0, "horizon"))
+    summarise(damaged, 0, "horizon").model_dump_json()
     with np.errstate(all="ignore"):
         assert ClaimEvaluation(damaged).judge()

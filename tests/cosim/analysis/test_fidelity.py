@@ -62,7 +62,7 @@ def test_all_is_explained(fidelity: Fidelity) -> None:
     assert sum(stage.share for stage in fidelity.stages) == pytest.approx(1.0, rel=1e-9)
     assert fidelity.stages[2].events == fidelity.stages[3].events == fidelity.events_live
     assert fidelity.stages[3].max_event_difference_s == pytest.approx(0.0, abs=1e-9)
-    assert fidelity.stages[3].parted_event is None
+    assert fidelity.stages[3].first_different_event is None
 
 
 def test_the_figures_fit_together(fidelity: Fidelity) -> None:
@@ -113,12 +113,12 @@ def test_a_rule_without_a_run_in_continuous_time_is_told_in_a_line() -> None:
 
 
 def test_a_share_that_counts_against_the_others_is_called_so() -> None:
-    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "unexplained": 0.0}
+    shares = {"sampling": 1.42, "delay": -0.42, "held_actuation": -1e-9, "residual": 0.0}
     numbers = {"rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.0, "shares": shares}
     told = dict(summary_rows(numbers | {"reason": None}))
-    assert told["  share of sampling"] == "142.0 %"
-    assert told["  share of delay"] == "-42.0 % (partly cancels the other effects)"
-    assert told["  share of held actuation"] == "0.0 %"
+    assert told["  sampling"] == "142.0 %"
+    assert told["  delay"] == "-42.0 % (partly cancels the other effects)"
+    assert told["  held actuation"] == "0.0 %"
 
 
 def test_a_loop_that_amplifies_rounding_is_told_and_not_blamed_on_the_run() -> None:
@@ -157,7 +157,7 @@ def test_a_record_of_another_plant_is_not_explained(record: RunRecord) -> None:
     fidelity = compute_fidelity(RunRecord(other, rows, record.notices, record.reports))
     assert fidelity.explained_relative > 0.1
     assert not fidelity.explained
-    assert "too much" in fidelity.verdict
+    assert "too large" in fidelity.verdict
 
 
 def test_a_plant_that_missed_its_input_once_is_not_explained(record: RunRecord) -> None:
@@ -192,7 +192,7 @@ def test_a_paper_loop_with_more_events_than_the_run_is_compared() -> None:
     """A sampled sensor that looks four times a second has fewer events than the paper's."""
     fidelity = compute_fidelity(lane(None, "plant.measure_every=25", 'mode="zoh"'))
     assert fidelity.events_ideal > fidelity.events_live
-    assert fidelity.parted_event is not None
+    assert fidelity.first_different_event is not None
     assert fidelity.explained_relative < 1e-9
 
 
@@ -277,7 +277,7 @@ def test_the_last_run_is_compared(simulated: Path) -> None:
     document = json.loads(noack("fidelity", simulated / "latest", "--json").stdout)
     assert document["explained"] is True
     assert [stage["name"] for stage in document["stages"]] == [
-        "sampling", "delay", "held actuation", "unexplained"
+        "sampling", "delay", "held actuation", "residual"
     ]  # fmt: skip
 
 
@@ -290,7 +290,7 @@ def test_a_difference_that_nothing_explains_fails(simulated: Path, tmp_path: Pat
     pq.write_table(table.set_column(table.schema.get_field_index("x_4"), "x_4", column), path)
     done = noack("fidelity", run)
     assert done.exit_code == 1
-    assert "too much" in done.stdout
+    assert "too large" in done.stdout
     assert noack("fidelity", run, "--json").exit_code == 1
 
 

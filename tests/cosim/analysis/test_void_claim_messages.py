@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from cosim.analysis.claims.claims_by_part import RunClaims
+from cosim.analysis.loss_statistics import list_violations
+from cosim.analysis.run_summary import summarise
 from cosim.live.progress import progress_line
 from cosim.live.recorder import Recorder
 from cosim.record.run_directory import SCENARIO_FILE
@@ -72,6 +75,16 @@ def test_the_recorder_says_it_once_and_it_stays_on_record(run: RunRecord, tmp_pa
     notices = recorder.finish().notices
     assert notices == [{"t_ns": 506_000_000, "level": "void", "text": line, "process": "recorder"}]
     assert load_record(tmp_path).notices == notices
+
+
+def test_the_summary_lists_every_violated_assumption(run: RunRecord) -> None:
+    reported = summarise(run, 0, "horizon").assumption_violations
+    assert reported == []  # no process sees that an input is old
+    found = {one.cause: one for one in list_violations(reported, RunClaims(run).violations())}
+    assert found.keys() == {"hold"}
+    assert found["hold"].t_s == pytest.approx(0.506)
+    assert found["hold"].what == "an input was 0.203 s old, 0.007 s allowed"
+    assert found["hold"].process == "recorder"
 
 
 def test_what_is_found_out_at_the_end_is_said_too(run: RunRecord, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 import noack
 from cosim.analysis.replay.replay_result import rows_differ
 from cosim.record.align import join_all
-from cosim.record.packet_outcomes import crossing
+from cosim.record.packet_outcomes import packet_outcomes
 from cosim.record.run_record import load_record
 
 
@@ -55,7 +55,7 @@ def test_what_overtakes_and_what_is_under_way_is_said(scenario: noack.Scenario) 
     """Delays of up to half a second: some updates arrive out of order, some after the end."""
     jitter = {"kind": "delay", "delay_s": 0.3, "jitter_s": 0.25}
     run = noack.simulate(noack.with_settings(scenario, {"network.impairments": [jitter]}))
-    crossed = crossing(load_record(run.directory))
+    crossed = packet_outcomes(load_record(run.directory))
     fates = Counter(run.events()["fate"].to_pylist())
     assert (
         fates["delivered_out_of_order"]

@@ -41,7 +41,7 @@ def about(what: str, wanted: RunRequirements = WANTED, **changed: Any) -> Machin
     return next((one for one in found if one.verdict is not FindingStatus.GOOD), found[0])
 
 
-def test_a_machine_that_grants_everything_is_good() -> None:
+def test_a_machine_without_limits_is_good() -> None:
     findings = judge(IDEAL, WANTED)
     assert worst(findings) is FindingStatus.GOOD
     assert not [one for one in findings if one.remedy]
@@ -70,7 +70,7 @@ def test_a_machine_that_grants_everything_is_good() -> None:
     ("extra: fmi", {"extras": {"fmi": False}}, FindingStatus.LIMITED),
     ("versions", {"versions": {"python": "3.12.1", "noack": None}}, FindingStatus.LIMITED),
 ])  # fmt: skip
-def test_each_thing_is_judged_and_what_is_not_good_says_what_would_be(
+def test_each_finding_has_a_verdict_and_a_remedy(
     what: str, changed: dict[str, Any], verdict: FindingStatus
 ) -> None:
     found = about(what, **changed)
@@ -87,17 +87,17 @@ def test_the_remedy_of_a_missing_extra_installs_it() -> None:
     )
 
 
-def test_lateness_is_judged_against_what_the_certificates_allow() -> None:
+def test_lateness_is_compared_with_the_allowance_of_the_certificates() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
-    found = about("wake-ups with what was granted", realtime=late)
+    found = about("wake-ups with the real-time settings applied", realtime=late)
     assert found.verdict is FindingStatus.LIMITED
     # 4 of 1000 at 500 Hz: one every 250 steps of 2 ms
     assert "4 of them (0.4 %) beyond the 4 ms that loop's certificates allow" in found.means
-    assert "every 0.5 s, of its 20 s" in found.means
+    assert "one every 0.5 s of a run of 20 s" in found.means
     assert "certificate.late_periods" in found.remedy
 
 
-def test_what_is_not_in_force_limits_nothing() -> None:
+def test_settings_that_a_run_does_not_use_limit_nothing() -> None:
     late = Lateness(1000, 50.0, 3000.0, 9000.0, 4)
     assert about("wake-ups", plain=late).verdict is FindingStatus.GOOD
     without = WANTED._replace(realtime=False)
@@ -107,10 +107,10 @@ def test_what_is_not_in_force_limits_nothing() -> None:
     assert about("real-time", without, granted=refused).verdict is FindingStatus.GOOD
 
 
-def test_wake_ups_that_nobody_could_watch_are_not_called_good() -> None:
-    assert about("wake-ups with what was granted", realtime="it timed out").verdict is (
-        FindingStatus.LIMITED
-    )
+def test_wake_ups_that_could_not_be_measured_are_not_good() -> None:
+    assert about(
+        "wake-ups with the real-time settings applied", realtime="it timed out"
+    ).verdict is (FindingStatus.LIMITED)
 
 
 def test_every_finding_is_documented() -> None:
@@ -122,7 +122,7 @@ def test_every_finding_is_documented() -> None:
     assert all(any(what.startswith(name) for what in found) for name in named)
 
 
-def test_quantiles_of_lateness_are_of_the_sample() -> None:
+def test_lateness_statistics_are_those_of_the_sample() -> None:
     found = lateness(range(0, 101_000, 1000), 98_500)  # 0 to 100 µs
     assert found == Lateness(101, 50.0, 99.0, 100.0, 2)
     assert isinstance(lateness([], 1), str)

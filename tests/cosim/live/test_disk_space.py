@@ -33,7 +33,7 @@ def test_the_size_is_that_of_the_rows_but_for_events(content: dict[str, Any]) ->
     assert spool_bytes(resolved) == pytest.approx(sum(rows), rel=0.002)
 
 
-def test_a_run_that_cannot_fit_does_not_begin(
+def test_a_run_that_cannot_fit_is_refused(
     content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = scenario_of(content, 1e7)

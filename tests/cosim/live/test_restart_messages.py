@@ -23,7 +23,7 @@ def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any
         for k in (1, 2)
     ]
     tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    restarts = summarise(RunRecord(record.scenario, tables, said, {}), 0, "")["restarts"]
+    restarts = summarise(RunRecord(record.scenario, tables, said, {}), 0, "").to_json()["restarts"]
     last_s = rows["now_ns"][49] * 1e-9
     found = {one["generation"]: (one["last_s"], one["first_s"], one["what"]) for one in restarts}
     assert found == {
@@ -43,7 +43,7 @@ def test_rows_are_missing_of_one_whose_first_ones_are(content: dict[str, Any], n
         rows["input"][80:] -= 37
     said = [{"process": "sensor", "level": RESTART, "t_ns": 0, "text": "newest"}]
     tables = {table: record[table] for table in record.tables} | {SENSOR_MEASUREMENT: rows}
-    summary = summarise(RunRecord(record.scenario, tables, said, {}), 0, "")
+    summary = summarise(RunRecord(record.scenario, tables, said, {}), 0, "").to_json()
     assert summary["missing_by_table"]["sensor"] == 7
     if newest == 2:
         assert [one["what"] for one in summary["restarts"]] == [None, "newest"]

@@ -157,15 +157,15 @@ def test_what_is_certified_is_said_in_words_with_its_conditions() -> None:
     said = " ".join(result.stdout.split())
     sentences = said.split("In words: ")[1:]
     assert [one.partition(",")[0] for one in sentences] == [
-        "of the scenario's plant", "of every plant of the box"
+        "for the scenario's plant", "for every plant of the box"
     ]  # fmt: skip
     document = json.loads(
         CliRunner().invoke(app, ["certify", "unstable_pendulum", "--json"]).stdout
     )
     scheduled = [one for one in document["certificates"] if one["under"] == "schedule"]
     for sentence, one in zip(sentences, scheduled, strict=True):
-        assert "where what is presupposed above holds" in sentence
-        assert "at most 3 in a row" in sentence
+        assert "under the assumptions above" in sentence
+        assert "at most 3 consecutive losses" in sentence
         assert f"‖x‖ ≤ {one['constants']['state']:.4g} e^(−0.3t); from" in sentence
         assert f"on, ‖x‖ ≤ {one['floor_constants']['state']:.4g}." in sentence
 

@@ -42,7 +42,7 @@ def claim(verdict: str, why: str = "") -> dict[str, Any]:
             "verdict": verdict}  # fmt: skip
 
 
-def test_a_run_that_went_well_is_a_verdict_a_table_and_a_way_to_the_rest(outcome: Outcome) -> None:
+def test_a_completed_run_prints_a_verdict_a_table_and_where_to_find_more(outcome: Outcome) -> None:
     summary = outcome.summary
     lines = [line.text for line in verdict(summary)]
     claims = len(summary["claims"])
@@ -62,7 +62,7 @@ def test_a_run_that_went_well_is_a_verdict_a_table_and_a_way_to_the_rest(outcome
     assert list(remarks(summary)) == []
 
 
-def test_all_tables_are_there_on_request_and_do_not_alarm(outcome: Outcome) -> None:
+def test_verbose_prints_all_tables_without_warnings(outcome: Outcome) -> None:
     text = printed(outcome, verbose=True)
     for what in ("numerical check of x_c − x_s (I1)", "the paper's assumptions", "idealised",
                  "claims checked against this run", "certificate"):  # fmt: skip
@@ -75,8 +75,8 @@ def test_all_tables_are_there_on_request_and_do_not_alarm(outcome: Outcome) -> N
     ("status", "reason", "said"),
     [
         (0, "horizon", "completed 20 s"),
-        (1, "sensor died", "not completed: sensor died (20 s of 20 s)"),
-        (130, "stopped by SIGINT", "not completed: stopped by SIGINT (20 s of 20 s)"),
+        (1, "sensor died", "failed after 20 s: sensor died"),
+        (130, "SIGINT", "stopped after 20 s of 20 s: SIGINT"),
         (0, "horizon; rows are missing", "completed 20 s: horizon; rows are missing"),
     ],
 )  # fmt: skip
@@ -99,10 +99,15 @@ def test_claims_that_did_not_hold_are_counted_with_a_reason(outcome: Outcome) ->
 
 
 def test_what_breaks_the_guarantee_is_unmistakable(outcome: Outcome) -> None:
-    broken = {"t_s": 2.5, "process": "controller", "what": "MANSD violated: 6 lost"}
+    broken = {
+        "t_s": 2.5,
+        "process": "controller",
+        "cause": "dropouts",
+        "what": "MANSD violated: 6 lost",
+    }
     text = printed(outcome, assumption_violations=[broken] * 7)
-    assert text.count("assumption violated at t = 2.500 s, seen by controller: MANSD") == 5
-    assert "and 2 more such violations" in text
+    assert text.count("assumption violated at t = 2.500 s (reported by controller): MANSD") == 5
+    assert "2 more violations of this kind" in text
     assert RED in text
 
 
@@ -133,12 +138,14 @@ def test_summary_prints_the_same_short_form_and_all_of_it_on_request(outcome: Ou
     assert json.loads(noack_summary("--json")) == outcome.summary
 
 
-def test_the_live_rows_are_there_where_a_run_was_live(outcome: Outcome) -> None:
+def test_a_live_run_has_latency_and_deadlines_in_its_table(outcome: Outcome) -> None:
     late = {"p50": 1.0, "p99": 2.0, "p999": 3.0, "max": 4.0, "steps": 100, "late_steps": 0}
     lateness = {"plant": late, "sensor": late | {"late_steps": 7}}
     latency = {"p50": 600.4, "p99": 900.0, "p999": 1.0, "max": 1.0, "updates": 3}
     rows = dict(short_numbers(outcome.summary | {"lateness_us": lateness, "latency_us": latency}))
     assert rows["most deadlines missed"] == "sensor, 7 of 100"
+    punctual = outcome.summary | {"lateness_us": {"plant": late}}
+    assert dict(short_numbers(punctual))["deadlines missed"] == "none"
     assert rows["sensor-to-controller latency p50 / p99"] == "600 / 900 µs"
 
 

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cosim.analysis.run_summary import dumps, summarise
+from cosim.analysis.run_summary import summarise
 from cosim.record.run_directory import RECORD, REPORTS_FILE
 from cosim.record.run_record import finish_record, load_record
 from noack.core.errors import CallerError
@@ -72,7 +72,7 @@ def test_what_is_no_report_counts_as_none(run_dir: Path, report: object) -> None
     path.write_text(json.dumps(json.loads(path.read_text()) | {"plant": report}))
     record = load_record(run_dir)
     assert record.reports.keys() == {"sensor", "netem", "controller"}
-    assert json.loads(dumps(summarise(record, 0, "")))["missing_samples"] == 0
+    assert json.loads(summarise(record, 0, "").model_dump_json())["missing_samples"] == 0
 
 
 def test_of_a_damaged_spool_the_rest_is_kept(run_dir: Path) -> None:
@@ -90,5 +90,5 @@ def test_of_a_damaged_spool_the_rest_is_kept(run_dir: Path) -> None:
     kept = [*rows["input"][:2].tolist(), *rows["input"][4:].tolist()]
     assert finished[PLANT_STEP]["input"].tolist() == kept
     assert [notice["text"] for notice in finished.notices] == ["MANSD violated", "last"]
-    assert summarise(finished, 0, "")["missing_by_table"] == {PLANT_STEP: 2}
+    assert summarise(finished, 0, "").to_json()["missing_by_table"] == {PLANT_STEP: 2}
     assert steps == len(finished[PLANT_STEP]) + 2

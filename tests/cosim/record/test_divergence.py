@@ -90,19 +90,19 @@ def unstable(content: dict[str, Any], horizon_s: float) -> Scenario:
 
 def test_a_simulated_run_that_diverges_fails(content: dict[str, Any]) -> None:
     resolved = unstable(content, 8.0)
-    sampled = summarise(simulate(resolved), 0, "horizon")
+    sampled = summarise(simulate(resolved), 0, "horizon").to_json()
     continuous = summary(run_continuous(resolved), resolved)
     for found in (sampled, continuous):
         assert found["exit"]["status"] == 1
         assert found["exit"]["reason"].startswith("diverged: ‖x‖ passed ")
         assert 1e6 < found["final_state_norm"] < np.inf
     assert sampled["diverged_at_s"] == pytest.approx(continuous["diverged_at_s"], abs=0.1)
-    stopped = summarise(simulate(resolved), 130, "stopped by the user (SIGINT)")
+    stopped = summarise(simulate(resolved), 130, "stopped by the user (SIGINT)").to_json()
     assert stopped["exit"] == {"status": 130, "reason": "stopped by the user (SIGINT)"}
     assert stopped["diverged_at_s"] == sampled["diverged_at_s"]
 
 
 def test_a_run_too_short_to_tell_does_not_fail(content: dict[str, Any]) -> None:
-    found = summarise(simulate(unstable(content, 0.5)), 0, "horizon")
+    found = summarise(simulate(unstable(content, 0.5)), 0, "horizon").to_json()
     assert found["final_state_norm"] < GROWTH * found["initial_state_norm"]
     assert (found["exit"]["status"], found["diverged_at_s"]) == (0, None)

@@ -106,7 +106,7 @@ def test_whatever_changes_the_run_is_replayed_and_the_identity_holds(
             if since_ns <= row["now_ns"] and end_ns > began_ns
         ]
         assert row["consecutive_losses"] <= max(allowed)
-    assert summarise(record, 0, "horizon")["assumption_violations"] == []
+    assert summarise(record, 0, "horizon").to_json()["assumption_violations"] == []
 
 
 def test_each_machine_applies_a_change_at_its_own_first_time_not_before_it() -> None:
@@ -217,7 +217,7 @@ def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> N
     (made,) = changes_of(record)
     assert list(made.late) == ["controller"]
     assert made.everywhere_ns == made.late["controller"] > 990 * MS
-    (violation,) = summarise(record, 0, "horizon")["assumption_violations"]
+    (violation,) = summarise(record, 0, "horizon").to_json()["assumption_violations"]
     assert "heard of a change too late" in violation["what"]
     assert violation["process"] == "controller"
     claims = [one for one in RunClaims(record).judge() if one.source == "(I1)"]

@@ -206,18 +206,18 @@ def test_the_cap_of_the_way_back_holds() -> None:
 
 def test_the_summary_counts_acknowledgements() -> None:
     for record in (MESS, simulate(acknowledged())):
-        summary = summarise(record, 0, "horizon")
+        summary = summarise(record, 0, "horizon").to_json()
         found = summary["acknowledgements"]
         assert found["sent"] == summary["deliveries"] == len(record[CONTROLLER_DELIVERY])
         assert found["received"] == len(record[SENSOR_ACKNOWLEDGEMENT])
         assert found["lost"] > 0
         assert 0 <= found["sent"] - found["lost"] - found["received"] <= 2  # under way at the end
-        assert summary["lost_outside_netem"] == summary["missing_samples"] == 0
+        assert summary["unintended_losses"] == summary["missing_samples"] == 0
         assert summary["identity_residual_max"] is None
-    assert summarise(MESS, 0, "horizon")["rejected_datagrams"]["sensor"].keys() <= {
+    assert summarise(MESS, 0, "horizon").to_json()["rejected_datagrams"]["sensor"].keys() <= {
         "length", "version", "run", "flow", "tag", "stale",
     }  # fmt: skip
-    assert "acknowledgements" not in summarise(simulate(plain()), 0, "horizon")
+    assert "acknowledgements" not in summarise(simulate(plain()), 0, "horizon").to_json()
 
 
 def test_a_run_is_replayed_bit_for_bit() -> None:

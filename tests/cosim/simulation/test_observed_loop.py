@@ -193,7 +193,7 @@ def test_with_noise_but_no_observer_what_is_measured_is_taken_for_x(
     sizes = error.std(axis=0)
     assert 0.01 < sizes[0] < 0.03 < sizes[1] < 0.08
     assert [claim.source for claim in ClaimEvaluation(record).judge()] == ["(I1)", "(I1)"]
-    assert summarise(record, 0, "horizon")["estimation"]["observer"] is None
+    assert summarise(record, 0, "horizon").to_json()["estimation"]["observer"] is None
 
 
 def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line(
@@ -205,7 +205,7 @@ def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line
     assert record.scenario.coverage.knows_state
     sources = [claim.source for claim in ClaimEvaluation(record).judge()]
     assert sources == ["(I1)", "(I1)", "eq:LossEv3"]
-    summary = summarise(record, 0, "horizon")
+    summary = summarise(record, 0, "horizon").to_json()
     assert summary["estimation"] is None
     (pushed,) = summary["disturbances"]
     assert (pushed["at"], pushed["kinds"]) == ("input", ["gaussian"])
@@ -214,7 +214,7 @@ def test_a_disturbed_plant_that_is_measured_keeps_the_paper_s_bound_line_by_line
 
 def test_the_summary_says_how_good_the_estimate_was(observed: dict[str, Any]) -> None:
     record = run(observed, disturbance=1, noise=2)
-    found = summarise(record, 0, "horizon")["estimation"]
+    found = summarise(record, 0, "horizon").to_json()["estimation"]
     norms = np.linalg.norm(estimation_error(record), axis=1)
     assert found["max"] == pytest.approx(norms.max())
     assert found["rms"] == pytest.approx(np.sqrt((norms**2).mean()))

@@ -56,7 +56,7 @@ def test_it_is_replayed_bit_for_bit(run: RunRecord) -> None:
 def test_its_end_and_its_beginning_are_told(run: RunRecord) -> None:
     told = [(one["t_ns"], one["process"]) for one in run.notices if one["level"] == "watchdog"]
     assert told == [(1_100_000_000, "plant"), (1_402_000_000, "plant")]
-    summary = summarise(run, 0, "horizon")
+    summary = summarise(run, 0, "horizon").to_json()
     assert summary["watchdog"] == {
         "policy": run.scenario.plant.watchdog.policy, "timeout_s": pytest.approx(0.1), "trips": 1,
         "first_s": pytest.approx(1.1), "total_s": pytest.approx(0.302),

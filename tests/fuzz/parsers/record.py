@@ -15,7 +15,6 @@ from rich.console import Console
 
 from cosim.analysis.replay import replay
 from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import dumps as summary_text
 from cosim.analysis.run_summary import summarise
 from cosim.live.finalize import reopen
 from cosim.output.run_verdict import print_outcome
@@ -50,10 +49,12 @@ NOTICE = {"t_ns": 10_000_000, "level": "violation", "text": "MANSD violated", "p
 CLAIM = {
     "what": "the error is bounded", "source": "Theorem 1", "bound": "‖e‖ ≤ 1", "certified": 1.0,
     "observed": 0.5, "ratio": 0.5, "verdict": "void", "since_s": 0.01, "why": "late",
+    "from_s": 0.0, "until_s": None,
 }  # fmt: skip
 FIDELITY = {
-    "reason": None, "rms_x": 0.1, "rms_x_live": 1.0, "explained_relative": 0.01,
-    "shares": {"sampling": 1.0, "unexplained": 0.0},
+    "reason": None, "explained": True, "explained_relative": 0.01, "rms_x": 0.1, "max_x": 0.2,
+    "rms_x_live": 1.0, "shares": {"sampling": 1.0, "residual": 0.0}, "events_ideal": 1,
+    "events_live": 1, "max_event_difference_s": None, "first_different_event": None,
 }  # fmt: skip
 KNOWN = Vocabulary(
     ("rows", "ended", "channel", "rejected", "acknowledgements", "realtime", "pid", "plant",
@@ -81,9 +82,9 @@ def files(acknowledged: bool, live: bool) -> Mapping[str, bytes]:
     }
     (folder / REPORTS_FILE).write_text(json.dumps(reports))
     kind = "live" if live else "simulated"
-    summary = summarise(record, 0, "finished")
+    summary = summarise(record, 0, "finished").to_json()
     summary |= {"replay": replay(record).verdict(), "claims": [CLAIM], "fidelity": FIDELITY}
-    (folder / SUMMARY_FILE).write_text(summary_text(summary))
+    (folder / SUMMARY_FILE).write_text(json.dumps(summary))
     (folder / ENVIRONMENT_FILE).write_text(json.dumps(environment(kind) | {"command": []}))
     write_record(record, folder)
     writer = SpoolWriter(folder / SPOOL, "recorder")
@@ -177,7 +178,7 @@ def _read(run_dir: Path) -> None:
     """What the commands on runs do with a run directory."""
     cut_short = (run_dir / SPOOL).is_dir() or not (run_dir / RECORD).is_dir()
     record = finish_record(run_dir) if cut_short else load_record(run_dir)
-    json.loads(summary_text(summarise(record, 0, "finished")))
+    json.loads(summarise(record, 0, "finished").model_dump_json())
     found = replay(record)
     json.dumps(found.verdict())
     json.dumps(found.document())

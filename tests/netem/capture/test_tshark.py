@@ -5,10 +5,7 @@ import random
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from netem.capture.pcapng import PcapngSection
-from tests.netem.capture.batches import INTERFACES, T_NS, batch, file_of
+from tests.netem.capture.batches import INTERFACES, T_NS, file_of
 from tests.netem.capture.conftest import Tshark
 
 GOOD = "1"
@@ -94,13 +91,3 @@ def test_tshark_filters_by_fate_flow_and_datagram(tshark: Tshark, tmp_path: Path
         INTERFACES[0].description,
     ]
     assert rows[3][1] == "delivered, after 1.5 ms; forward, flow 3, packet 1"
-
-
-def test_tshark_shows_how_many_events_are_missing(tshark: Tshark, tmp_path: Path) -> None:
-    section = PcapngSection(INTERFACES)
-    section.miss(np.array([7, 0]))
-    path = tmp_path / "capture.pcapng"
-    path.write_bytes(
-        section.header() + bytes(section.packets(*batch({}, {}))) + section.statistics()
-    )
-    assert fields(tshark, path, "frame.drop_count") == [["7"], [""]]

@@ -2,21 +2,20 @@
 
 import json
 import signal
-import subprocess
-import sys
-import time
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from netem.cli import relay_run
 from netem.control import emulator_commands
 from netem.control.emulator_session import running
+from netem.fates.fate_recorder import FateRecorder
+from netem.words.words_to_settings import settings_of
 from noack.core.errors import ExitStatus
-from tests.netem.control.processes import emulator, read_until, send_through, udp_socket
+from tests.netem.control.processes import emulator, send_through, udp_socket
+from tests.netem.fates.links import spec_of
 
 
 def shown(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
@@ -86,47 +85,6 @@ def test_a_killed_emulator_is_not_found(capsys: pytest.CaptureFixture[str]) -> N
     assert "no emulator 'lab' accepts commands" in capsys.readouterr().err
 
 
-def test_statistics_are_lines_of_json(tmp_path: Path) -> None:
-    file = tmp_path / "statistics.jsonl"
-    options = ("--engine", "plain", "--stats", "0.05", "--stats-file", str(file), "loss", "100%")
-    with (
-        udp_socket() as server,
-        emulator(server.getsockname(), *options) as (address, _),
-    ):
-        send_through(address, [b"x"] * 50)
-        while file.read_text().count("\n") < 5:
-            time.sleep(0.01)
-    documents = [json.loads(line) for line in file.read_text().splitlines()]
-    arrived = [document["links"][0]["forward"]["arrived"] for document in documents]
-    assert arrived == sorted(arrived)
-    assert arrived[-1] == 50
-    elapsed = [document["elapsed_s"] for document in documents]
-    assert elapsed == sorted(elapsed)
-    assert documents[0]["links"][0]["forward"]["recent"] is None
-    assert all(document["links"][0]["forward"]["recent"] for document in documents[1:])
-
-
-def test_a_reader_that_leaves_does_not_stop_the_relay() -> None:
-    with (
-        udp_socket() as server,
-        emulator(server.getsockname(), "--engine", "plain", "--stats", "0.02") as (
-            address,
-            process,
-        ),
-    ):
-        assert process.stdout is not None
-        assert process.stderr is not None
-        assert json.loads(process.stdout.readline())["links"][0]["name"] == "relay"
-        process.stdout.close()
-        error = read_until(process.stderr.fileno(), lambda text: text.endswith("continues\n"))
-        assert error.splitlines()[-1] == (
-            "noack netem: statistics cannot be written to standard output "
-            "(Broken pipe); the relay continues"
-        )
-        send_through(address, [b"still here"])
-        assert server.recv(100) == b"still here"
-
-
 PAYLOADS = [number.to_bytes(2) * 20 for number in range(150)]
 
 
@@ -148,55 +106,23 @@ def run_through(
 WORDS = ("loss", "gemodel", "10%", "30%", "duplicate", "20%", "corrupt", "20%")
 
 
-@pytest.mark.parametrize("engine", ["auto", "plain"])
 def test_a_recorded_run_is_repeated_exactly(
-    tmp_path: Path, engine: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = str(tmp_path / "fates.parquet")
-    before = run_through(capsys, "--engine", engine, "--record-fates", trace, *WORDS, "mansd", "2")
-    again = run_through(
-        capsys, "--engine", engine, "--replay-fates", trace, "--seed", "99", *WORDS, "mansd", "2"
-    )
+    before = run_through(capsys, "--record-fates", trace, *WORDS, "mansd", "2")
+    again = run_through(capsys, "--replay-fates", trace, "--seed", "99", *WORDS)
     assert again == before
     assert len({*before} - {*PAYLOADS}) > 15
-    other = run_through(capsys, "--engine", engine, "--seed", "99", *WORDS, "mansd", "2")
-    assert other != before
 
 
-def test_a_recorded_run_with_delays_is_repeated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("words", "cap"), [("loss 100%", 2), ("loss 100% mansd 4", 4)])
+def test_a_replay_has_the_cap_of_its_trace_unless_it_has_its_own(
+    tmp_path: Path, words: str, cap: int
 ) -> None:
-    """In the order in which delays that overlap by chance let it."""
-    trace = str(tmp_path / "fates.parquet")
-    before = run_through(capsys, "--record-fates", trace, *WORDS, "delay", "3ms", "2ms")
-    again = run_through(capsys, "--replay-fates", trace, "loss", "100%")
-    assert Counter(again) == Counter(before)
-
-
-def test_a_replay_keeps_the_cap_of_its_record_unless_told_another(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    trace = str(tmp_path / "fates.parquet")
-    first = run_through(capsys, "--record-fates", trace, "loss", "60%", "mansd", "2")
-    for words, period in (("loss 100%", 3), ("loss 100% mansd 4", 5)):
-        again = run_through(
-            capsys, "--replay-fates", trace, *words.split(), payloads=[*PAYLOADS, *PAYLOADS]
-        )
-        beyond = [PAYLOADS.index(payload) for payload in again[len(first) :]]
-        assert again[: len(first)] == first
-        assert set(np.diff(beyond)) == {period}
-
-
-def test_a_trace_of_other_links_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "links.toml"
-    file.write_text('[[link]]\nname = "up"\nlisten = ":0"\nto = "127.0.0.1:9"\n')
-    trace = str(tmp_path / "fates.parquet")
-    run_through(capsys, "--engine", "plain", "--record-fates", trace)
-    done = subprocess.run(
-        [sys.executable, "-m", "netem", "--links", str(file), "--replay-fates", trace],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == ExitStatus.CALLER
-    assert done.stderr == (f"noack netem: {trace}: has no link 'up'; its links: relay\n")
+    path = tmp_path / "fates.parquet"
+    with FateRecorder(path, [spec_of(settings_of("loss 60% mansd 2"), "relay")]):
+        pass
+    (spec,) = relay_run._replaying([spec_of(settings_of(words), "relay")], path)
+    assert (spec.forward.mansd, spec.reverse.mansd) == (cap, None)
+    assert spec.decisions == {"forward": [], "reverse": []}

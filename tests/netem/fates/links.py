@@ -1,4 +1,4 @@
-"""Links that do everything, and datagrams for them: for traces of what really happens."""
+"""Datagrams for links with any impairments, and traces of their fates."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -13,62 +13,14 @@ from netem.engine.relay_interface import LinkSpec
 from netem.fates.fate_recorder import FateRecorder
 from netem.link_machine import Datagram, Link
 from netem.relay_events import EVENT
-from noack.impairments.kinds import AnyImpairment
-from noack.impairments.kinds.blackout import Blackout
-from noack.impairments.kinds.corrupt import Corrupt
-from noack.impairments.kinds.delay import Delay
-from noack.impairments.kinds.duplicate import Duplicate
-from noack.impairments.kinds.loss import LossOf
-from noack.impairments.kinds.rate import Rate
-from noack.impairments.kinds.reorder import Reorder
 from noack.impairments.link_records import PacketDecision
 from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.impairments.loss_models.periodic_loss import PeriodicLoss
-from noack.impairments.loss_models.scripted import ScriptedLoss
-from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
-US = 1e-6
-shares = st.floats(0, 1)
-times_s = st.floats(0, 50 * US)
-losses = st.one_of(
-    st.builds(BernoulliLoss, probability=shares, correlation=st.sampled_from([0.0, 0.5])),
-    st.builds(GilbertElliottLoss, good_to_bad=shares, bad_to_good=shares),
-    st.builds(PeriodicLoss, period=st.just(4), burst=st.integers(0, 4)),
-    st.builds(ScriptedLoss, lost=st.sets(st.integers(0, 30)).map(sorted).map(tuple)),
-    st.just(WorstCaseLoss()),
-)
-impairments: st.SearchStrategy[AnyImpairment] = st.one_of(
-    st.builds(LossOf, loss=losses),
-    st.builds(Duplicate, probability=shares),
-    st.builds(Corrupt, probability=shares),
-    st.builds(
-        Delay,
-        delay_s=times_s,
-        jitter_s=times_s,
-        distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
-        correlation=st.sampled_from([0.0, 0.9]),
-    ),
-    st.builds(Reorder, probability=shares, gap=st.integers(1, 3)),
-    st.builds(Rate, rate_bps=st.integers(10**6, 10**9), queue=st.integers(1, 5)),
-    st.builds(
-        Blackout,
-        intervals_s=st.just(((10 * US, 20 * US),)),
-        every_s=st.sampled_from([None, 25 * US]),
-    ),
-)
-settings = st.builds(
-    LinkSettings,
-    impairments=st.lists(impairments, max_size=5).map(tuple),
-    mansd=st.none() | st.integers(0, 4),
-    first_delivered=st.booleans(),
-    limit=st.sampled_from([1, 3, 1000]),
-)
+MAX_GAP_NS = 3_000_000
 
 
 class Arrival(NamedTuple):
-    """A datagram that comes in."""
+    """A received datagram."""
 
     gap_ns: int
     """After the one before."""
@@ -83,7 +35,8 @@ def _numbered(came: list[Arrival]) -> list[Arrival]:
 
 
 arrivals = st.lists(
-    st.builds(Arrival, st.integers(0, 30_000), st.integers(0, 2), st.integers(0, 40)), max_size=40
+    st.builds(Arrival, st.integers(0, MAX_GAP_NS), st.integers(0, 2), st.integers(0, 40)),
+    max_size=40,
 ).map(_numbered)
 
 
@@ -93,7 +46,7 @@ def payload(flow: int, packet: int, size_bytes: int) -> bytes:
 
 @dataclass
 class Run:
-    """What a link did."""
+    """The decisions and departures of a link."""
 
     verdicts: list[PacketDecision] = field(default_factory=list)
     arrivals: list[tuple[int, int, int]] = field(default_factory=list)
@@ -103,7 +56,7 @@ class Run:
 
     @property
     def events(self) -> NDArray[Any]:
-        """What a relay would have told a tap of the arrivals."""
+        """The events of the arrivals, as a relay hands them to a tap."""
         events = np.zeros(len(self.verdicts), EVENT)
         for event, verdict, came in zip(events, self.verdicts, self.arrivals, strict=True):
             now_ns, event["flow"], event["size_bytes"] = came
@@ -117,7 +70,7 @@ class Run:
 
 
 def drive(link: Link, came: Sequence[Arrival]) -> Run:
-    """Send datagrams through a link, and let everything out at the end."""
+    """Send datagrams through a link, and wait for all departures."""
     run, now_ns, counts = Run(), 0, dict.fromkeys(range(10), 0)
 
     def release(until_ns: float) -> None:
@@ -147,7 +100,7 @@ def spec_of(link_settings: LinkSettings, name: str = "a") -> LinkSpec:
 
 
 def record(path: Path, link_settings: LinkSettings, came: Sequence[Arrival]) -> Run:
-    """Send datagrams through a link, and record what becomes of them."""
+    """Send datagrams through a link, and record their fates."""
     run = drive(Link(link_settings, 7, "a", "forward"), came)
     with FateRecorder(path, [spec_of(link_settings)]) as recorder:
         events = run.events

@@ -55,10 +55,34 @@ def test_a_document_is_the_programs(document: object, tmp_path: Path) -> None:
     assert "not a fate trace of this program" in refused(write(tmp_path / "a", TABLE, document))
 
 
-@pytest.mark.parametrize("column", ["delay_ns", "copy_delay_ns"])
-def test_a_delay_can_be_added_to_a_time(column: str, tmp_path: Path) -> None:
-    table = with_values(column, lambda values: [2**62 + 1, *values[1:]])
-    assert "impossible decision" in refused(write(tmp_path / "a", table))
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("fate", 9), ("delay_ns", -5), ("delay_ns", 2**62 + 1), ("copy_delay_ns", 2**62 + 1),
+     ("bit", -2), ("flow", -1), ("flow", 10**12), ("copy_bit", -3)],
+)  # fmt: skip
+def test_an_impossible_decision_is_refused(column: str, value: int, tmp_path: Path) -> None:
+    table = with_values(column, lambda values: [value, *values[1:]])
+    line = refused(write(tmp_path / "a", table))
+    assert "impossible decision: " in line
+    assert f"{column} {value}" in line
+
+
+@pytest.mark.parametrize(
+    ("packets", "message"),
+    [([0, 3], "expected packet 1, found 2"), ([0, 0], "expected packet 1, found 0")],
+)
+def test_a_missing_or_repeated_packet_is_refused(
+    packets: list[int], message: str, tmp_path: Path
+) -> None:
+    table = TABLE.take(packets)
+    assert f"up forward: flow 0: {message}; an incomplete trace" in refused(
+        write(tmp_path / "a", table)
+    )
+
+
+def test_another_format_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a", TABLE, {"format": 9, "version": "9.9"})
+    assert "has the format of noack 9.9; record it again" in refused(path)
 
 
 @pytest.mark.parametrize("column", TABLE.column_names)

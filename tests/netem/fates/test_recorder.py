@@ -1,8 +1,6 @@
 import json
-import os
 import resource
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from noack.core.errors import CallerError
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.link_settings import LinkSettings
 from noack.protocol.record_tables import Fate
-from tests.netem.fates.links import Arrival, record, spec_of
+from tests.netem.fates.links import record, spec_of
 
 NOTHING = np.zeros(0, np.uint8)
 LINK = LinkSettings(impairments=(Corrupt(probability=0.5),), mansd=2)
@@ -159,44 +157,6 @@ def test_a_file_that_cannot_be_made_is_said_at_once(tmp_path: Path) -> None:
         FateRecorder(Path("/dev/full"), [spec_of(LINK)])
 
 
-def rewritten(path: Path, change: Callable[[pa.Table], pa.Table]) -> None:
-    """Write a trace anew, with other rows."""
-    file = pq.ParquetFile(path)
-    table, metadata = change(file.read()), file.metadata.metadata
-    with pq.ParquetWriter(path, table.schema) as writer:
-        writer.write_table(table)
-        writer.add_key_value_metadata({METADATA: metadata[METADATA.encode()].decode()})
-
-
-def test_a_hole_is_found(path: Path) -> None:
-    record(path, LINK, [Arrival(10, 0, 4), Arrival(10, 1, 4)] * 5)
-    rewritten(path, lambda table: pa.concat_tables([table.slice(0, 5), table.slice(6)]))
-    with pytest.raises(CallerError, match="a forward: flow 1: expected packet 2, found 3"):
-        read_fates(path)
-
-
-def test_a_datagram_twice_is_found(path: Path) -> None:
-    record(path, LINK, [Arrival(10, 0, 4)] * 3)
-    rewritten(path, lambda table: pa.concat_tables([table, table.slice(2)]))
-    with pytest.raises(CallerError, match="flow 0: expected packet 3, found 2"):
-        read_fates(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("fate", 9), ("delay_ns", -1), ("delay_ns", -5), ("copy_delay_ns", 0), ("bit", -2),
-     ("flow", -1), ("flow", 10**12), ("copy_bit", -3)],
-)  # fmt: skip
-def test_what_no_emulator_does_is_refused(path: Path, name: str, value: int) -> None:
-    events = arrivals(3)
-    events["delay_ns"] = 100
-    events[name][1] = value
-    with FateRecorder(path, [spec_of(LINK)]) as recorder:
-        recorder.take(events, NOTHING)
-    with pytest.raises(CallerError, match=f"a forward: impossible decision: .*{name} {value}"):
-        read_fates(path)
-
-
 def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"cannot be read \(.*No such file"):
         read_fates(path)
@@ -210,23 +170,7 @@ def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
         read_fates(path)
 
 
-def test_a_trace_whose_emulator_was_killed_is_not_finished(path: Path) -> None:
-    record(path, LINK, [Arrival(10, 0, 4)] * 3)
-    os.truncate(path, path.stat().st_size - 8)
-    with pytest.raises(CallerError, match="incomplete because the emulator was killed"):
-        read_fates(path)
-
-
 def test_a_link_that_the_trace_does_not_know_is_named(path: Path) -> None:
     record(path, LINK, [])
     with pytest.raises(CallerError, match="has no link 'b'; its links: a"):
         read_fates(path, ["b"])
-
-
-def test_a_trace_of_another_format_is_refused(path: Path) -> None:
-    record(path, LINK, [])
-    file = pq.ParquetFile(path)
-    with pq.ParquetWriter(path, file.schema_arrow) as writer:
-        writer.add_key_value_metadata({METADATA: json.dumps({"format": 3, "version": "9.9"})})
-    with pytest.raises(CallerError, match=r"has the format of noack 9\.9"):
-        read_fates(path)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from noack.core.clock import ManualClock, RunClock
+from noack.core.clock import RunClock
 
 EPOCH_NS = 123_456_789_012_345
 speeds = st.sampled_from([0.01, 0.5, 1.0, 2.0, 3.0, 10.0, 1000.0])
@@ -18,17 +18,6 @@ class Wall:
 
     def __call__(self) -> int:
         return self.now_ns
-
-
-def test_a_manual_clock_stands_until_it_is_set() -> None:
-    clock = ManualClock(5)
-    assert [clock.now_ns(), clock.now_ns()] == [5, 5]
-    clock.advance_to(5)
-    clock.advance_to(10**12)
-    assert clock.now_ns() == 10**12
-    with pytest.raises(ValueError, match="cannot go back from 1000000000000 ns to 999999999999 ns"):
-        clock.advance_to(10**12 - 1)
-    assert clock.now_ns() == 10**12
 
 
 @given(st.integers(-(10**12), 10**15))
@@ -70,12 +59,6 @@ def test_whoever_waits_as_told_wakes_at_the_deadline(speed: float, wall_ns: int,
     wall.now_ns += round(wait_s * 1e9)
     # To half a nanosecond of wall time, and to the rounding of times of up to 10¹⁵ ns.
     assert abs(clock.now_ns() - t_ns) <= 2 + speed
-
-
-def test_a_fast_run_waits_less() -> None:
-    wall = Wall()
-    waits = [RunClock(EPOCH_NS, speed, wall).wall_s_until(10**9) for speed in (1.0, 2.0, 0.5)]
-    assert waits == [1.0, 0.5, 2.0]
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])

@@ -50,7 +50,7 @@ def test_an_address_of_a_link_keeps_its_interface() -> None:
         ("host:", "expected HOST:PORT"),
         ("host:65536", "expected HOST:PORT"),
         ("host:x", "expected HOST:PORT"),
-        ("::1:9000", "found '::1:9000'; an IPv6 address stands in brackets"),
+        ("::1:9000", "found '::1:9000'; put an IPv6 address in brackets"),
         ("[]:9000", "expected HOST:PORT"),
         ("[127.0.0.1]:9000", "here: 127.0.0.1: no such host ("),
         ("a b:9000", "here: a b: no such host ("),

@@ -46,7 +46,7 @@ def test_what_is_no_ticket_gets_a_line_without_the_key(
     with pytest.raises(CallerError) as caught:
         loads(json.dumps(fields | {key: value}))
     line = str(caught.value)
-    assert line.startswith(f"not a ticket of this version of noack: {key}")
+    assert line.startswith(f"not a valid ticket: {key}")
     assert "\n" not in line
     assert KEY[:8] not in line
 

@@ -48,7 +48,7 @@ def test_a_flood_is_said_once_and_its_end_with_what_was_dropped() -> None:
     calm = 0
     while (line := watch.next_interval(dropped)) is None:
         calm += 1
-    assert line == f"{OVER} the kernel has dropped {dropped} datagrams from elsewhere"
+    assert line == f"{OVER} the kernel dropped {dropped} datagrams from unknown sources"
     assert 10 <= calm <= 40  # between half a second and two
     assert watch.left == IN_AN_INTERVAL
 
@@ -134,7 +134,7 @@ def test_a_flood_displaces_nothing_and_every_datagram_is_accounted_for(stack: Ex
     assert sum(rejected.values()) == stranger_sent
     assert report["accepted"] == 10
     assert report["lost_in_kernel"] == 0
-    assert report["shielded"] is True
+    assert report["peer_sockets"] is True
     assert [line.text.split(":")[0] for line in ear.lines] == ["flood"]
 
 
@@ -187,7 +187,7 @@ def test_without_a_shield_the_loop_hears_as_well(
     ear.tend()
     report = ear.channel.report()
     assert report["rejected"] == {"source": 100}
-    assert report["shielded"] is False
+    assert report["peer_sockets"] is False
     assert report["lost_in_kernel"] == 0
     assert ear.lines == []
 

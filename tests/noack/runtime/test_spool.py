@@ -66,12 +66,6 @@ def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
     assert list(read_chunks(tmp_path / "nowhere", "step")) == []
 
 
-def test_a_reopened_file_is_continued(tmp_path: Path) -> None:
-    for first in (0, 1):
-        spool(tmp_path, "recorder", "step", (first, b"a"))
-    assert [first for first, _ in read_chunks(tmp_path, "step")] == [0, 1]
-
-
 @given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
 def test_what_was_spooled_twice_is_merged(
     tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
@@ -123,17 +117,6 @@ def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
     tail.close()
 
 
-def test_half_a_batch_waits_for_its_other_half(tmp_path: Path) -> None:
-    chunk = struct.pack("<QQ", 0, 3) + b"abc"
-    tail, path = SpoolTail(tmp_path), tmp_path / "plant_step.recorder"
-    for size in range(len(chunk)):
-        path.write_bytes(chunk[:size])
-        assert list(tail.read()) == []
-    path.write_bytes(chunk)
-    assert list(tail.read()) == [("plant_step", 0, b"abc")]
-    tail.close()
-
-
 def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> None:
     path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
     tail = SpoolTail(tmp_path)
@@ -143,12 +126,6 @@ def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> No
     path.unlink()
     assert list(tail.read()) == [("plant_step", 3, b"de")]
     tail.close()
-
-
-def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path) -> None:
-    (tmp_path / "spool").write_text("")
-    with pytest.raises(MachineError, match=r"spool: the record cannot be written: File exists$"):
-        SpoolWriter(tmp_path / "spool", "recorder")
 
 
 @pytest.mark.parametrize("what", ["deleted", "moved", "replaced", "folder"])

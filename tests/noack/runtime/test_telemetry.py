@@ -71,7 +71,7 @@ def test_batches_number_every_row_in_order(actions: list[bool | None]) -> None:
     ]
 
 
-def test_a_full_batch_takes_the_other_tables_along() -> None:
+def test_a_full_batch_publishes_all_tables() -> None:
     """So that a reader that merges tables never waits for one of them."""
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire)
@@ -98,7 +98,7 @@ def test_a_row_is_copied_when_it_is_appended() -> None:
 
 
 @given(st.integers(1, 6 * BATCH), st.data())
-def test_what_the_recorder_misses_is_sent_again(count: int, data: st.DataObject) -> None:
+def test_missing_batches_are_sent_again(count: int, data: st.DataObject) -> None:
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire)
     flushed = data.draw(st.sets(st.integers(0, count - 1), max_size=5))
@@ -142,7 +142,7 @@ def test_what_was_received_is_known_in_as_few_ranges_as_can_be(
     assert missing == set(range(total)) - numbers
 
 
-def test_what_is_on_disk_is_kept_no_longer() -> None:
+def test_batches_on_disk_are_dropped() -> None:
     confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
     buffer = TelemetryBuffer(TABLES, Wire(), 0, lambda: confirmed[-1])
     for number in range(30):
@@ -157,7 +157,7 @@ def test_what_is_on_disk_is_kept_no_longer() -> None:
     assert again.batches[0][1:3] == (10, 10)
 
 
-def test_what_was_lost_under_way_is_sent_again_while_the_run_goes_on() -> None:
+def test_lost_batches_are_sent_again_during_the_run() -> None:
     confirmed: list[dict[str, list[tuple[int, int]]]] = [{}]
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire, 0, lambda: confirmed.pop() if confirmed else {})
@@ -181,36 +181,7 @@ def test_what_was_lost_under_way_is_sent_again_while_the_run_goes_on() -> None:
     assert [first for _, first, _, _ in wire.batches[sent:]] == list(range(50, 250, 10))
 
 
-def test_of_a_long_run_nothing_is_kept_that_was_confirmed() -> None:
-    wire = Wire()
-    buffer = TelemetryBuffer(TABLES, wire, 0, lambda: {"one": [(0, 10**9)]})
-    for number in range(20 * BATCH):
-        buffer.append(Record("one", row(number)))
-    buffer.flush()
-    assert buffer.resend({"one": [(0, 20 * BATCH)]}, Wire()) == 0
-
-
-def test_every_batch_that_overlaps_a_missing_range_is_sent_again() -> None:
-    buffer = TelemetryBuffer(TABLES, Wire())
-    for number in range(30):
-        buffer.append(Record("one", row(number)))
-        if number % 10 == 9:
-            buffer.flush()
-
-    def firsts(*ranges: tuple[int, int], table: str = "one") -> list[int]:
-        again = Wire()
-        buffer.resend({table: list(ranges)}, again)
-        return [first for _, first, _, _ in again.batches]
-
-    assert firsts((10, 20)) == [10]
-    assert firsts((9, 10)) == [0]
-    assert firsts((9, 11)) == [0, 10]
-    assert firsts((0, 1), (29, 30)) == [0, 20]
-    assert firsts((0, 30)) == [0, 10, 20]
-    assert firsts((30, 40)) == firsts() == firsts((0, 30), table="two") == []
-
-
-def test_notices_are_handed_over_at_once_and_numbered() -> None:
+def test_notices_are_published_at_once_and_numbered() -> None:
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire)
     buffer.append(Record("one", row(0)))
@@ -227,8 +198,10 @@ def test_notices_are_handed_over_at_once_and_numbered() -> None:
     assert len({notices_of(role) for role in ("plant", "sensor", "netem")}) == 3
 
 
-def test_what_is_kept_is_bounded_and_the_oldest_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(telemetry, "_KEPT_BYTES", 25 * ROW.itemsize)
+def test_the_oldest_batch_is_dropped_at_the_memory_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(telemetry, "_HELD_BYTES", 25 * ROW.itemsize)
     wire, again = Wire(), Wire()
     buffer = TelemetryBuffer(TABLES, wire)
     for number in range(40):

@@ -1,4 +1,4 @@
-"""The loop as a diagram, in which every update is seen to travel, to arrive, or to be lost.
+"""The loop as a diagram that animates every update until it arrives or is lost.
 
 A real flight takes microseconds. It is drawn as if each leg took ``LEG_S`` of simulated time, so
 that it can be followed at the speed of the run: a dot leaves the sensor at the broadcast, and what
@@ -31,8 +31,8 @@ _APART = 4.4
 _BOXES = {name: i * _APART for i, name in enumerate(("plant", "sensor", "network", "controller"))}
 _, _SENSOR, _NETWORK, _CONTROLLER = _BOXES.values()
 _HALF_WIDE, _HALF_HIGH = 1.6, 0.62
-_BACK = -0.4
-"""Acknowledgements go back a little below the updates."""
+_REVERSE_Y = -0.4
+"""Height of acknowledgements, a little below the updates."""
 _LOW = -2.5
 _SIZE = 0.17
 
@@ -41,20 +41,20 @@ Reals = NDArray[np.float64]
 
 
 class Moving(NamedTuple):
-    """What becomes of one entity: columns of rows at times (r,)."""
+    """Rows of one entity: columns at times (r,)."""
 
     t_ns: Times
     columns: Columns
 
 
-class _Flying(NamedTuple):
-    """Packets that are under way, in the drawing (p,)."""
+class _InFlight(NamedTuple):
+    """Packets that are in flight, in the drawing (p,)."""
 
     t_ns: Times
     out_ns: Times
     """When they leave the network; of those that are lost, when they begin to fall."""
     fate: NDArray[np.int64]
-    back: NDArray[np.bool_]
+    reverse: NDArray[np.bool_]
     """Whether they go from the controller to the sensor."""
 
     @property
@@ -62,9 +62,11 @@ class _Flying(NamedTuple):
         """When nothing more is to be seen of them."""
         return self.out_ns + np.where(effective(self.fate), _LEG_NS, _FALL_NS)
 
-    def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "_Flying":
-        """Some of them."""
-        return _Flying(self.t_ns[which], self.out_ns[which], self.fate[which], self.back[which])
+    def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "_InFlight":
+        """Return a subset."""
+        return _InFlight(
+            self.t_ns[which], self.out_ns[which], self.fate[which], self.reverse[which]
+        )
 
 
 _NONE = np.zeros(0, np.int64)
@@ -74,12 +76,12 @@ class NetworkDiagram:
     """Boxes, the ways between them, and packets.
 
     Args:
-        acknowledged: whether packets also go back.
+        acknowledged: whether packets also go reverse.
     """
 
     def __init__(self, *, acknowledged: bool = False) -> None:
         self._acknowledged = acknowledged
-        self._flying = _Flying(_NONE, _NONE, _NONE, np.zeros(0, np.bool_))
+        self._in_flight = _InFlight(_NONE, _NONE, _NONE, np.zeros(0, np.bool_))
         self._drawn_ns = -1
         self._last_ns = {False: -_APART_NS, True: -_APART_NS}
         self._shown: dict[str, int] = {}
@@ -109,7 +111,7 @@ class NetworkDiagram:
         ways = [_arrow(a + _HALF_WIDE, b - _HALF_WIDE, 0.0) for a, b in pairwise(_BOXES.values())]
         if self._acknowledged:
             ways += [
-                _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _BACK)
+                _arrow(a - _HALF_WIDE, b + _HALF_WIDE, _REVERSE_Y)
                 for a, b in ((_CONTROLLER, _NETWORK), (_NETWORK, _SENSOR))
             ]
         found["ways"] = lines([line for way in ways for line in way], STILL, 0.03)
@@ -118,7 +120,7 @@ class NetworkDiagram:
         found["input"] = lines([home, head], STILL, 0.03)
         found["input/word"] = label("u = K x_c", (_SENSOR, _LOW + 0.4), STILL)
         found["lost/word"] = label("lost", (_NETWORK + 1.1, -1.0), LOST)
-        found["forced/word"] = label("forced through", (_NETWORK + _APART / 2, 1.55), FORCED)
+        found["forced/word"] = label("forced", (_NETWORK + _APART / 2, 1.55), FORCED)
         for entity, colour in (
             ("broadcast", SENSOR), ("delivered", CONTROLLER), ("acknowledgement", NETWORK),
         ):  # fmt: skip
@@ -132,7 +134,7 @@ class NetworkDiagram:
         return found
 
     def add(
-        self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, back: bool = False
+        self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, reverse: bool = False
     ) -> None:
         """Take packets (p,) that follow those added before.
 
@@ -140,33 +142,33 @@ class NetworkDiagram:
             t_ns: their broadcasts, or of acknowledgements, when they reached the network.
             release_ns: when they leave the network.
             fate: what the network did with them.
-            back: they are acknowledgements.
+            reverse: they are acknowledgements.
 
         Of packets that are closer to each other than a dot's size, the first is drawn.
         """
         drawn = np.zeros(len(t_ns), np.bool_)
         for i, sent_ns in enumerate(t_ns.tolist()):
-            if sent_ns - self._last_ns[back] >= _APART_NS:
+            if sent_ns - self._last_ns[reverse] >= _APART_NS:
                 drawn[i] = True
-                self._last_ns[back] = sent_ns
+                self._last_ns[reverse] = sent_ns
         t_ns, release_ns, fate = t_ns[drawn], release_ns[drawn], fate[drawn]
         arrived_ns = t_ns + _LEG_NS
         out_ns = np.where(effective(fate), np.maximum(arrived_ns, release_ns), arrived_ns)
-        before = self._flying
-        self._flying = _Flying(
+        before = self._in_flight
+        self._in_flight = _InFlight(
             np.concatenate([before.t_ns, t_ns]),
             np.concatenate([before.out_ns, out_ns]),
             np.concatenate([before.fate, fate]),
-            np.concatenate([before.back, np.full(len(t_ns), back)]),
+            np.concatenate([before.reverse, np.full(len(t_ns), reverse)]),
         )
 
     def advance(self, until_ns: int) -> Mapping[str, Moving]:
-        """What moves up to a time by which all packets are in; nothing if nothing is under way."""
+        """Return the rows up to a time by which all packets were added."""
         first, last = self._drawn_ns // _FRAME_NS + 1, until_ns // _FRAME_NS
         if last < first:
             return {}
         self._drawn_ns = last * _FRAME_NS
-        flying = self._flying
+        flying = self._in_flight
         begin = np.maximum(-(-flying.t_ns // _FRAME_NS), first)
         end = np.minimum(-(-flying.end_ns // _FRAME_NS), last + 1)
         counts = np.maximum(end - begin, 0)
@@ -176,10 +178,12 @@ class NetworkDiagram:
         )
         order = np.argsort(frame, kind="stable")
         pairs, frame = flying.of(packet[order]), frame[order]
-        self._flying = flying.of(flying.end_ns > self._drawn_ns)
+        self._in_flight = flying.of(flying.end_ns > self._drawn_ns)
         return self._moving(pairs, frame, first, last)
 
-    def _moving(self, pairs: _Flying, frame: Times, first: int, last: int) -> Mapping[str, Moving]:
+    def _moving(
+        self, pairs: _InFlight, frame: Times, first: int, last: int
+    ) -> Mapping[str, Moving]:
         """Rows of all entities; ``pairs`` are packets, each at a frame (q,), in order of frames."""
         now_ns = frame * _FRAME_NS
         survives, leaves = effective(pairs.fate), now_ns >= pairs.out_ns
@@ -187,20 +191,20 @@ class NetworkDiagram:
         onward = (now_ns - pairs.out_ns) / _LEG_NS
         gap = _APART - 2 * _HALF_WIDE
         x = _NETWORK - _HALF_WIDE - gap * (1.0 - there)
-        # What waits does so inside; what goes on begins at the other side.
+        # A waiting packet is drawn inside the network; a released one at its other side.
         x = np.where(there >= 1.0, _NETWORK, x)
         x = np.where(leaves & survives, _NETWORK + _HALF_WIDE + gap * onward, x)
         fall = (now_ns - pairs.out_ns) / _FALL_NS
         y = np.where(leaves & ~survives, -_HALF_HIGH - 0.2 - 1.3 * fall, 0.0)
         forced = pairs.fate == Fate.FORCED
-        x = np.where(pairs.back, 2 * _NETWORK - x, x)
-        y = np.where(pairs.back & (survives | ~leaves), _BACK, y)
+        x = np.where(pairs.reverse, 2 * _NETWORK - x, x)
+        y = np.where(pairs.reverse & (survives | ~leaves), _REVERSE_Y, y)
         places = upright(np.column_stack([x, y]))
         what = {
-            "broadcast": ~leaves & ~pairs.back,
-            "delivered": leaves & survives & ~forced & ~pairs.back,
-            "acknowledgement": (survives | ~leaves) & pairs.back,
-            "forced": leaves & forced & ~pairs.back,
+            "broadcast": ~leaves & ~pairs.reverse,
+            "delivered": leaves & survives & ~forced & ~pairs.reverse,
+            "acknowledgement": (survives | ~leaves) & pairs.reverse,
+            "forced": leaves & forced & ~pairs.reverse,
             "lost": leaves & ~survives,
         }
         found: dict[str, Moving] = {}

@@ -239,7 +239,7 @@ def test_acknowledgements_go_back() -> None:
     diagram = NetworkDiagram(acknowledged=True)
     diagram.add(
         np.array([S, 2 * S]), np.array([S, 2 * S]), np.array([Fate.DELIVERED, Fate.DROPPED]),
-        back=True,
+        reverse=True,
     )  # fmt: skip
     seen = rows_of(diagram, [4 * S])
     assert seen.keys() == {"acknowledgement", "lost"}

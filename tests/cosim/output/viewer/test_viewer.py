@@ -24,8 +24,10 @@ from cosim.output.viewer.live_viewer import LiveView, has_display, view_recordin
 from cosim.output.viewer.pictures.lane_picture import LanePicture
 from cosim.output.viewer.pictures.network_picture import NetworkDiagram
 from cosim.output.viewer.pictures.picture import TIMELINE, Frames, Picture
-from cosim.output.viewer.recording import APPLICATION_ID, RunView, ViewError
+from cosim.output.viewer.recording import RunView
+from cosim.output.viewer.recording_file import APPLICATION_ID, ViewError
 from cosim.output.viewer.viewer_server import RECORDING, RecordingServer
+from cosim.record.align import AlignedRun
 from noack.core.errors import CallerError, ExitStatus
 from noack.protocol.record_tables import Fate
 from tests.integration.conftest import wait_for
@@ -80,7 +82,16 @@ def add_samples(view: RunView, batches: int, n: int = 4, first: int = 0) -> None
         norm = t_ns.astype(np.float64) * 1e-9
         x: Floats = norm[:, None] + np.arange(n)
         bounds = np.stack([norm + 3, norm + 4], axis=1)
-        view.samples(t_ns, x, x + 100, x + 200, norm, norm + 1, norm + 2, bounds, norm + 5)
+        found = aligned(t_ns, (x, x + 100, x + 200), (norm, norm + 1, norm + 2))
+        view.samples(found, bounds, norm + 5)
+
+
+def aligned(
+    t_ns: NDArray[np.int64], states: tuple[Floats, ...], norms: tuple[Floats, ...]
+) -> AlignedRun:
+    """x, x_s, x_c and ‖e_s‖, threshold, ‖e_c‖ at times (k,)."""
+    none = np.full(len(t_ns), -1)
+    return AlignedRun(t_ns, *states, *norms, received=none, sensor=none)
 
 
 def read(path: Path, kind: str = "recording") -> dict[str, list[Any]]:
@@ -334,9 +345,8 @@ def test_the_logarithm_of_a_reset_error_stays_in_sight(tmp_path: Path) -> None:
         x = np.zeros((3, 4))
         error, threshold = np.array([0.1, 0.0, np.nan]), np.array([0.1, 0.1, 0.1])
         none = np.full(3, np.nan)
-        view.samples(
-            times(0, 3), x, x, x, error, threshold, error, np.stack([none, none], axis=1), none
-        )
+        found = aligned(times(0, 3), (x, x, x), (error, threshold, error))
+        view.samples(found, np.stack([none, none], axis=1), none)
     _, values = series(read(path), "error/log10")
     np.testing.assert_allclose(values[:, 1], [-1.0, -4.0, np.nan], rtol=1e-12)
     np.testing.assert_allclose(values[:, 2], -1.0, rtol=1e-12)
@@ -348,7 +358,8 @@ def test_a_rule_without_a_threshold_still_gives_a_plot(tmp_path: Path, threshold
     with new_view(path) as view:
         x, e = np.zeros((2, 4)), np.array([1e-3, 0.0])
         none = np.full((2, 2), np.nan)
-        view.samples(times(0, 2), x, x, x, e, np.full(2, threshold), e, none, none[:, 0])
+        found = aligned(times(0, 2), (x, x, x), (e, np.full(2, threshold), e))
+        view.samples(found, none, none[:, 0])
     for entity in ("error/norm", "error/log10"):
         assert not np.isinf(series(read(path), entity)[1]).any()
     assert series(read(path), "error/log10")[1][0, 1] == pytest.approx(-3.0)
@@ -398,8 +409,9 @@ def test_lateness_and_log_are_recorded(tmp_path: Path) -> None:
 def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
     with new_view(tmp_path / "recording.rrd") as view:
         x, e = np.zeros((2, 4)), np.zeros(2)
+        found = aligned(times(0, 2), (x, x[:, :3], x), (e, e, e))
         with pytest.raises(ValueError, match=r"x_s: expected shape \(2, 4\), found \(2, 3\)"):
-            view.samples(times(0, 2), x, x[:, :3], x, e, e, e, np.ones((2, 2)), e)
+            view.samples(found, np.ones((2, 2)), e)
         with pytest.raises(ValueError, match=r"u: expected shape \(2, 2\), found \(2, 4\)"):
             view.inputs(times(0, 2), x)
 
@@ -678,7 +690,7 @@ def test_a_recording_that_is_not_there_is_the_callers_error(tmp_path: Path) -> N
 def test_what_is_no_recording_is_not_served(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     path.write_bytes(content)
-    with pytest.raises(CallerError, match=r"recording\.rrd: is no rerun recording"):
+    with pytest.raises(CallerError, match=r"recording\.rrd: not a rerun recording"):
         view_recording(path)
 
 

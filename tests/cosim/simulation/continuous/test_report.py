@@ -58,7 +58,9 @@ def test_the_command_prints_a_table_or_json() -> None:
     arguments = ("simulate", str(SCENARIOS / "lane_following.toml"), "--trigger", "continuous")
     told = noack(*arguments)
     assert told.exit_code == 0, told.output
-    assert "delivered" in told.stdout
+    completed, transmissions, *_ = told.stdout.splitlines()
+    assert completed == "completed 20 s"
+    assert transmissions == "20 transmissions, 7 delivered"
     document = json.loads(noack(*arguments, "--json").stdout)
     assert document["summary"]["kind"] == "continuous"
     assert document["summary"]["exit"]["status"] == 0

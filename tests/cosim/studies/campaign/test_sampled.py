@@ -52,7 +52,7 @@ def test_a_row_says_what_the_runs_summary_says(overrides: tuple[str, ...]) -> No
     one = work(*overrides)
     for draw, row in enumerate(one.run(range(3))):
         record = record_of(one, draw)
-        told = summarise(record, ExitStatus.OK, "")
+        told = summarise(record, ExitStatus.OK, "").to_json()
         assert row["status"] == OK
         assert row["transmissions"] == told["events"]
         assert row["deliveries"] == told["deliveries"]

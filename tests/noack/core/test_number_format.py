@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from cosim.output.number_format import plus_minus
+from noack.core.number_format import plus_minus
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import copy
 import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,8 @@ from rich.console import Console
 
 import noack
 from cosim.analysis.run_outcome import Outcome
-from cosim.analysis.run_summary import dumps, summarise
-from cosim.analysis.summary_check import can_be_shown
+from cosim.analysis.run_summary import summarise
+from cosim.analysis.summary_model import RunSummary, can_be_shown
 from cosim.output.report.report_page import page
 from cosim.output.run_verdict import print_outcome
 from cosim.record.environment import changed_since, kind_of
@@ -37,27 +38,37 @@ DIFFERS = {
 }  # fmt: skip
 FULL = {
     "kind": "live",
-    "restarts": [{"process": "sensor", "last_s": 0.5, "first_s": 0.6, "what": ""}],
-    "changes": [{"t_s": 0.1, "what": "trigger.beta = 0.3"}],
-    "watchdog": {"policy": "hold", "trips": 2, "first_s": 0.1, "total_s": 0.5},
-    "estimation": {"observer": "kalman", "rms_second_half": 0.1, "expected_rms": 0.1, "max": 1.0,
-                   "sup_e_c_norm": 1.0},
-    "disturbances": [{"at": "input", "rms": 0.1, "max": 0.2}],
-    "assumption_violations": [{"t_s": 0.1, "process": "netem", "what": "MANSD violated"}],
-    "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_burst": 1},
+    "restarts": [
+        {"process": "sensor", "generation": 1, "last_s": 0.5, "first_s": 0.6, "what": ""}
+    ],
+    "changes": [{
+        "number": 0, "t_s": 0.1, "settings": {"trigger.beta": 0.3}, "what": "trigger.beta = 0.3",
+        "in_force_from_s": {"sensor": 0.1},
+    }],
+    "watchdog": {"policy": "hold", "timeout_s": 0.1, "trips": 2, "first_s": 0.1, "total_s": 0.5},
+    "estimation": {
+        "observer": "kalman", "outputs": 1, "noise_std": [0.1], "rms": 0.1, "rms_second_half": 0.1,
+        "expected_rms": 0.1, "max": 1.0, "sup_e_c_norm": 1.0,
+    },
+    "disturbances": [{"at": "input", "kinds": ["step"], "rms": 0.1, "max": 0.2}],
+    "assumption_violations": [
+        {"t_s": 0.1, "process": "netem", "cause": "dropouts", "what": "MANSD violated"}
+    ],
+    "acknowledgements": {"sent": 3, "lost": 1, "longest_loss_burst": 1, "received": 2},
     "lateness_us": {"plant": QUANTILES | {"steps": 3, "late_steps": 3}},
     "latency_us": QUANTILES | {"updates": 3},
     "realtime": {"plant": {"sched_fifo": "applied"}},
-    "linearisation": {"A": [[1.0]], "eigenvalues": [[1.0, 0.0]], "off_A": [[1.0]],
+    "linearisation": {"A": [[1.0]], "B": [[1.0]], "eigenvalues": [[1.0, 0.0]], "off_A": [[1.0]],
                       "off_B": [[1.0]], "in_box": True},
     "replay": DIFFERS,
     "fidelity": {
         "reason": None, "explained": True, "explained_relative": 0.1, "rms_x": 0.1, "max_x": 0.2,
         "rms_x_live": 1.0, "shares": {"sampling": 0.5, "delay": -0.5}, "events_ideal": 1,
-        "events_live": 2, "max_event_difference_s": 0.1, "parted_event": None,
+        "events_live": 2, "max_event_difference_s": 0.1, "first_different_event": None,
     },
-    "claims": [{"what": "state", "source": "S", "bound": "B", "ratio": 0.5, "verdict": "void",
-                "since_s": 0.1, "why": "late", "from_s": 0.1, "until_s": None}],
+    "claims": [{"what": "state", "source": "S", "bound": "B", "certified": 1.0, "observed": 0.5,
+                "ratio": 0.5, "verdict": "void", "since_s": 0.1, "why": "late", "from_s": 0.1,
+                "until_s": None}],
 }  # fmt: skip
 
 
@@ -68,7 +79,7 @@ def record() -> RunRecord:
 
 @pytest.fixture(scope="module")
 def summary(record: RunRecord) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(dumps(summarise(record, 0, "horizon") | FULL))
+    found: dict[str, Any] = summarise(record, 0, "horizon").to_json() | FULL
     return found
 
 
@@ -144,3 +155,10 @@ def show(record: RunRecord, summary: dict[str, Any]) -> None:
     run = noack.Run(outcome.run_dir, lambda: outcome)
     assert repr(run)
     assert run._repr_html_()
+
+
+def test_the_docs_list_every_key() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "record.md").read_text(encoding="utf-8")
+    rows = [line.split(" | ")[0] for line in text[text.index("\n## The summary") :].splitlines()]
+    keys = [key for row in rows if row.startswith("| `") for key in re.findall(r"`(\w+)`", row)]
+    assert sorted(keys) == sorted(RunSummary.model_fields)

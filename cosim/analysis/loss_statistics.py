@@ -1,0 +1,142 @@
+"""What a run lost: updates in the network, datagrams elsewhere, rows of its record."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosim.analysis.claims.observed_conditions import AssumptionViolation
+from cosim.analysis.summary_model import AcknowledgementsPart, ViolationPart
+from cosim.record.packet_outcomes import PacketOutcome, packet_outcomes
+from cosim.record.recorded_changes import NEVER_NS, changes_of
+from cosim.record.run_record import RunRecord
+from noack.protocol.machine_interface import GENERATION
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NO_SEQUENCE,
+    PLANT_ACTUATION,
+    PLANT_STEP,
+    SENSOR_ACKNOWLEDGEMENT,
+    SENSOR_MEASUREMENT,
+    Fate,
+    effective,
+)
+from noack.protocol.topology import LOOP_ROLES
+from noack.protocol.wire_format import Flow
+from noack.runtime.life_cycle import HORIZON
+
+VIOLATION = "violation"
+"""Level of a notice: a process saw that an assumption was violated."""
+
+
+def drops_by_cause(outcomes: PacketOutcome) -> dict[str, int]:
+    """How many updates were lost, by cause; causes without losses are left out."""
+    fates = outcomes.rows["fate"]
+    causes = {
+        fate.name.lower(): int((fates == fate).sum()) for fate in Fate if not fate.effective
+    } | {"delivered_out_of_order": int((effective(fates) & outcomes.lost).sum())}
+    return {cause: n for cause, n in causes.items() if n}
+
+
+def acknowledgements(record: RunRecord) -> AcknowledgementsPart:
+    """The outcome of the acknowledgements; the controller sends one for each update."""
+    outcomes = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
+    return AcknowledgementsPart(
+        sent=len(record[CONTROLLER_DELIVERY]),
+        lost=int(outcomes.lost.sum()),
+        longest_loss_burst=outcomes.longest_loss_burst(),
+        received=len(record[SENSOR_ACKNOWLEDGEMENT]),
+    )
+
+
+def unintended_losses(record: RunRecord) -> dict[str, int]:
+    """Datagrams that were lost without a decision of the emulator, by leg."""
+    sensor, outcomes = record[SENSOR_MEASUREMENT], packet_outcomes(record)
+    every = record.scenario.plant.measure_every
+    sent = record[PLANT_STEP]["sequence"]
+    received = record[CONTROLLER_DELIVERY]["sequence"]
+    legs = {
+        "measurement": (sent[sent % every == 0] // every, sensor["sequence"]),
+        "update to netem": (sensor["event"][sensor["event"] != NO_SEQUENCE], outcomes.sequence),
+        "update to controller": (outcomes.sequence[outcomes.left], received),
+        "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
+    }
+    if record.scenario.is_acknowledged:
+        answers = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
+        arrived = record[SENSOR_ACKNOWLEDGEMENT]["sequence"]
+        legs["acknowledgement to netem"] = (received, answers.sequence)
+        legs["acknowledgement to sensor"] = (answers.sequence[answers.left], arrived)
+    complete = all(record.reports.get(role, {}).get("ended") == HORIZON for role in LOOP_ROLES)
+    lost: dict[str, int] = {}
+    for leg, (out, arrived) in legs.items():
+        if not complete:  # a datagram in flight when a process ended is not lost
+            out = out[out <= arrived.max(initial=-1)]
+        lost[leg] = int(np.setdiff1d(out, arrived).size)
+    return lost
+
+
+def missing_rows(record: RunRecord) -> Counter[str]:
+    """Rows that a process wrote and the record lacks, by table.
+
+    For a process that died without a report: by process, from the gaps in its input numbers.
+    """
+    missing: Counter[str] = Counter()
+    for role in LOOP_ROLES:
+        for life in record.lives(role):
+            if life.report is not None:
+                for table, rows in life.rows.items():
+                    missing[table] += life.report["rows"][table] - len(rows)
+                continue
+            inputs = np.concatenate([rows["input"] for rows in life.rows.values()])
+            for generation in np.unique(inputs // GENERATION):
+                numbers = inputs[inputs // GENERATION == generation] % GENERATION
+                missing[role] += int(numbers.max()) + 1 - len(numbers)
+    return missing
+
+
+def reported_violations(record: RunRecord) -> list[ViolationPart]:
+    """Violations that the processes reported, and a loss burst at the end, which none can see."""
+    found = [
+        ViolationPart(
+            t_s=notice["t_ns"] * 1e-9,
+            process=notice["process"],
+            cause="change" if "a change" in notice["text"] else "dropouts",
+            what=notice["text"],
+        )
+        for notice in record.notices
+        if notice["level"] == VIOLATION
+    ]
+    outcomes = packet_outcomes(record)
+    delivered = np.flatnonzero(~outcomes.lost)
+    first = int(delivered[-1]) + 1 if len(delivered) else 0
+    mansd = _largest_mansd(record, int(outcomes.event_ns[first - 1]) if first else 0)
+    dropped = len(outcomes.lost) - first
+    if dropped > mansd:
+        what = f"MANSD violated: the last {dropped} updates were lost, at most {mansd} assumed"
+        at_s = float(outcomes.event_ns[first + mansd]) * 1e-9
+        found.append(ViolationPart(t_s=at_s, process="netem", cause="dropouts", what=what))
+    return found
+
+
+def list_violations(
+    reported: Sequence[ViolationPart], observed: Sequence[AssumptionViolation]
+) -> list[ViolationPart]:
+    """All violations of a run: those that processes reported, then those seen in its record.
+
+    A violation of M − 1 that a process reported is not repeated.
+    """
+    known = {one.cause for one in reported}
+    return [*reported] + [
+        ViolationPart(t_s=one.t_s, process="recorder", cause=one.cause, what=one.text)
+        for one in observed
+        if one.cause not in known
+    ]
+
+
+def _largest_mansd(record: RunRecord, since_ns: int) -> int:
+    """The largest M − 1 in force at any time from ``since_ns`` on."""
+    caps = [(0, record.scenario.network.mansd)]
+    caps += [(one.everywhere_ns, one.scenario.network.mansd) for one in changes_of(record)]
+    ends_ns = [*(from_ns for from_ns, _ in caps[1:]), NEVER_NS]
+    return max(cap for (_, cap), end_ns in zip(caps, ends_ns, strict=True) if end_ns > since_ns)

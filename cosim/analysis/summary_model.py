@@ -1,0 +1,310 @@
+"""The summary of a run, ``summary.json``, as a model; ``docs/record.md`` explains the keys."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from cosim.analysis.claims.claim import ClaimVerdict
+
+
+def _or_none(value: Any) -> Any:
+    """JSON has no infinity and no NaN: null instead."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+Text = Annotated[str, Field(pattern=r"^[^\[]*$")]
+"""Text that a table prints as it is: without a bracket, which would begin markup."""
+Count = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Real = Annotated[float | None, BeforeValidator(_or_none)]
+Counts = dict[Text, Count]
+Matrix = Annotated[list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1)]
+
+
+class SummaryPart(BaseModel):
+    """A part of a summary, checked when it is made and when it is read."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class AssumptionPart(SummaryPart):
+    """An assumption of the paper, and whether the scenario meets it."""
+
+    what: str
+    source: str
+    verdict: str
+    why: str
+
+
+class ViolationPart(SummaryPart):
+    """An assumption that the run violated."""
+
+    t_s: float
+    process: Text
+    cause: Text
+    what: str
+
+
+class Quantiles(SummaryPart):
+    """Quantiles of wall times in µs."""
+
+    p50: Real
+    p99: Real
+    p999: Real
+    max: Real
+
+
+class LatenessPart(Quantiles):
+    """How late a process was."""
+
+    steps: Count
+    late_steps: Count
+
+
+class LatencyPart(Quantiles):
+    """Time from an event to the controller's update."""
+
+    updates: Count
+
+
+class AcknowledgementsPart(SummaryPart):
+    """The outcome of acknowledgements."""
+
+    sent: Count
+    lost: Count
+    longest_loss_burst: Count
+    received: Count
+
+
+class WatchdogPart(SummaryPart):
+    """How often the plant's watchdog acted."""
+
+    policy: Text
+    timeout_s: float
+    trips: Count
+    first_s: Real
+    total_s: float
+
+
+class EstimationPart(SummaryPart):
+    """The sensor's estimation error."""
+
+    observer: Text | None
+    outputs: Count
+    noise_std: list[float]
+    rms: Real
+    rms_second_half: Real
+    expected_rms: Real
+    max: Real
+    sup_e_c_norm: Real
+
+
+class DisturbancePart(SummaryPart):
+    """The disturbances at one place."""
+
+    at: Text
+    kinds: list[Text]
+    rms: Real
+    max: Real
+
+
+class DifferencePart(SummaryPart):
+    """The first difference between record and replay."""
+
+    table: Text
+    row: Count
+    column: Text
+    recorded: Count | float | str | None
+    recorded_hex: str | None
+    replayed: Count | float | str | None
+    replayed_hex: str | None
+    what: str
+    now_ns: Count
+
+
+class ReplayPart(SummaryPart):
+    """The result of the replay."""
+
+    bit_exact: bool | None
+    complete: bool = True
+    inputs: Count = 0
+    first_difference: DifferencePart | None = None
+    error: str | None = None
+
+    @model_validator(mode="after")
+    def _names_the_difference(self) -> Self:
+        if self.bit_exact is False and self.first_difference is None:
+            raise ValueError("a replay that is not bit-exact has a first difference")
+        return self
+
+
+class FidelityPart(SummaryPart):
+    """The comparison with the ideal loop."""
+
+    reason: None
+    explained: bool
+    explained_relative: float
+    rms_x: float
+    max_x: float
+    rms_x_live: float
+    shares: dict[Text, float]
+    events_ideal: Count
+    events_live: Count
+    max_event_difference_s: Real
+    first_different_event: Count | None
+
+
+class NoFidelityPart(SummaryPart):
+    """Why the run was not compared with the ideal loop."""
+
+    reason: str
+
+
+class LinearisationPart(SummaryPart):
+    """A plant that is not linear, at its operating point."""
+
+    A: Matrix
+    B: Matrix
+    eigenvalues: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]], Field(min_length=1)
+    ]
+    off_A: Matrix
+    off_B: Matrix
+    in_box: bool | None
+
+
+class NoLinearisationPart(SummaryPart):
+    """A plant without a linearisation."""
+
+    A: None
+
+
+class ClaimPart(SummaryPart):
+    """A claim, checked against the run."""
+
+    what: str
+    source: str
+    bound: str
+    certified: Real
+    observed: Real
+    ratio: Real
+    verdict: Annotated[ClaimVerdict, Field(strict=False)]
+    since_s: Real
+    why: str
+    from_s: float
+    until_s: Real
+
+
+class ConditionsPart(SummaryPart):
+    """Largest observed values of the certificates' conditions."""
+
+    dropouts: Real
+    sampling_s: Real
+    delay_s: Real
+    hold_s: Real
+    start_s: Real
+
+
+class ChangePart(SummaryPart):
+    """A change of settings during the run."""
+
+    number: Count
+    t_s: float
+    settings: dict[str, Any]
+    what: str
+    in_force_from_s: dict[Text, float]
+
+
+class RestartPart(SummaryPart):
+    """A process that was restarted during the run."""
+
+    process: Text
+    generation: Count
+    last_s: Real
+    first_s: Real
+    what: str | None
+
+
+class ExitPart(SummaryPart):
+    """How the run ended."""
+
+    status: Count
+    reason: str
+
+
+class RunSummary(SummaryPart):
+    """Everything that ``summary.json`` says about a run."""
+
+    kind: Literal["live", "simulated"]
+    startup_s: Real
+    scenario: Text
+    mode: str
+    mansd: Count
+    horizon_s: float
+    speed: float
+    reached_s: float
+    events: Count
+    deliveries: Count
+    drops: Count
+    loss_expected: Real
+    drops_by_cause: Counts
+    forced_deliveries: Count
+    longest_loss_burst: Count
+    acknowledgements: AcknowledgementsPart | None = None
+    assumption_violations: list[ViolationPart]
+    assumptions: list[AssumptionPart]
+    restarts: list[RestartPart]
+    changes: list[ChangePart]
+    missing_samples: Count
+    missing_by_table: Counts
+    unintended_losses: Count
+    unintended_losses_by_leg: Counts
+    rejected_datagrams: dict[Text, Counts]
+    inter_event_min_s: Real
+    inter_event_median_s: Real
+    inter_delivery_median_s: Real
+    initial_state_norm: Real
+    final_state_norm: Real
+    sup_e_s_norm: Real
+    sup_e_c_norm: Real
+    sup_e_c_at_s: Real
+    identity_residual_max: Real
+    identity_residual_relative: Real
+    lateness_us: dict[Text, LatenessPart]
+    latency_us: LatencyPart | None
+    realtime: dict[Text, dict[Text, str]]
+    watchdog: WatchdogPart
+    estimation: EstimationPart | None
+    disturbances: list[DisturbancePart]
+    diverged_at_s: Real
+    replay: ReplayPart | None = None
+    linearisation: LinearisationPart | NoLinearisationPart | None = None
+    fidelity: FidelityPart | NoFidelityPart | None = None
+    conditions: ConditionsPart | None = None
+    claims: list[ClaimPart] = []
+    judged_until_s: Real = None
+    exit: ExitPart
+
+    @model_validator(mode="after")
+    def _has_both_timings(self) -> Self:
+        if self.lateness_us and self.latency_us is None:
+            raise ValueError("a live run has a latency")
+        return self
+
+    def with_results(self, **results: Any) -> "RunSummary":
+        """Return the summary with more of its fields set."""
+        return RunSummary.model_validate(dict(self) | results)
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of ``summary.json``."""
+        return self.model_dump(mode="json")
+
+
+def can_be_shown(summary: Mapping[str, Any]) -> bool:
+    """Whether a file holds a whole summary of this version."""
+    try:
+        RunSummary.model_validate(summary)
+    except ValidationError:
+        return False
+    return True

@@ -1,0 +1,74 @@
+"""How late the processes of a live run were, in wall time."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.analysis.summary_model import LatencyPart, LatenessPart
+from cosim.record.packet_outcomes import packet_outcomes
+from cosim.record.run_record import RunRecord
+from noack.protocol.record_tables import (
+    CONTROLLER_DELIVERY,
+    CONTROLLER_STEP,
+    NO_SEQUENCE,
+    PLANT_STEP,
+    SENSOR_MEASUREMENT,
+)
+
+
+def lateness_us(record: RunRecord, role: str) -> NDArray[np.float64]:
+    """Wall time between a process's actions and their nominal times, (k,).
+
+    Plant and controller have deadlines of their own; the nominal time is that of the measurement
+    for the sensor, and that of the event for the network.
+    """
+    if role == "netem":
+        outcomes = packet_outcomes(record)
+        rows, due_ns = outcomes.rows, outcomes.event_ns
+    else:
+        steps = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
+        rows = record[steps[role]]
+        due_ns = rows["t_ns"]
+    late_us: NDArray[np.float64] = (rows["now_ns"] - due_ns) / (1e3 * record.scenario.speed)
+    return late_us
+
+
+def lateness(record: RunRecord, role: str) -> LatenessPart:
+    """Quantiles of a process's lateness, and its late steps: those late by more than a period."""
+    timing = record.scenario.timing
+    period_ns = {
+        "plant": timing.plant_period_ns,
+        "sensor": timing.measurement_period_ns,
+        "controller": timing.controller_period_ns,
+        "netem": timing.plant_period_ns,
+    }[role]
+    late_us = lateness_us(record, role)
+    late_steps = int((late_us * 1e3 * record.scenario.speed > period_ns).sum())
+    return LatenessPart(**_quantiles(late_us), steps=len(late_us), late_steps=late_steps)
+
+
+def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Wall time from the sensor's event to the controller's update, one way.
+
+    Returns:
+        Event times in ns (d,) and latencies in µs (d,), of the delivered updates.
+    """
+    sensor, deliveries = record[SENSOR_MEASUREMENT], record[CONTROLLER_DELIVERY]
+    events = sensor[sensor["event"] != NO_SEQUENCE]
+    _, at_sensor, at_controller = np.intersect1d(
+        events["event"], deliveries["sequence"], return_indices=True
+    )
+    passed_ns = deliveries["now_ns"][at_controller] - events["now_ns"][at_sensor]
+    return events["t_ns"][at_sensor], passed_ns / (1e3 * record.scenario.speed)
+
+
+def latency(record: RunRecord) -> LatencyPart:
+    """Quantiles of the latency."""
+    _, passed_us = latency_us(record)
+    return LatencyPart(**_quantiles(passed_us), updates=len(passed_us))
+
+
+def _quantiles(times_us: NDArray[np.float64]) -> dict[str, float | None]:
+    if not len(times_us):
+        return dict.fromkeys(("p50", "p99", "p999", "max"))
+    values = np.quantile(times_us, [0.5, 0.99, 0.999, 1.0]).tolist()
+    return dict(zip(("p50", "p99", "p999", "max"), values, strict=True))

@@ -1,0 +1,1 @@
+"""Kinds of controllers, one per file: settings and control law."""

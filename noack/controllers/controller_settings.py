@@ -1,0 +1,86 @@
+"""What every kind of controller has."""
+
+from typing import Annotated, ClassVar, NamedTuple, Protocol, Self
+
+from pydantic import Field, FiniteFloat, model_validator
+
+from noack.core.errors import NoackError
+from noack.core.linear_systems import Matrix, Vector
+from noack.settings.matrices import Row
+from noack.settings.rates import RateHz, require_whole_period
+from noack.settings.section import ScenarioSection
+
+
+class ControlModel(NamedTuple):
+    """What a control law knows of the loop."""
+
+    A: Matrix
+    """Â, (n, n)."""
+    B: Matrix
+    """B̂, (n, m)."""
+    K: Matrix
+    """The scenario's gain, (m, n): x_s and x_c follow Â + B̂K between updates."""
+    period_s: float
+    """Time between two ticks."""
+
+
+class ControlFailedError(NoackError):
+    """A control law cannot continue; the message is one line that names it."""
+
+
+class ControlLaw(Protocol):
+    """Computes the control input."""
+
+    def update(self, t_s: float, x: Vector) -> None:
+        """Process a state x(t), shape (n,), that the sensor has sent.
+
+        Raises:
+            ControlFailedError: it cannot; the law must not be used again.
+        """
+        ...
+
+    def input(self, t_s: float, x_c: Vector, setpoint: tuple[Vector, Vector] | None) -> Vector:
+        """Return u, shape (m,).
+
+        Args:
+            t_s: simulated time of the tick.
+            x_c: the model state, shape (n,).
+            setpoint: x_r and u_r, shapes (n,) and (m,); None is 0.
+
+        Raises:
+            ControlFailedError: it cannot; the law must not be used again.
+        """
+        ...
+
+
+class ControllerSettings(ScenarioSection):
+    """Settings of a controller."""
+
+    is_linear: ClassVar[bool] = False
+    """Whether u = K(x_c − x_r) + u_r, as the theory assumes."""
+
+    kind: str
+    """What the controller is."""
+    rate_hz: RateHz = 500.0
+    """Control inputs per second of simulated time."""
+    phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
+    """Offset of its ticks from the plant's, in periods; half a period lets a fresh update act
+    within the same period."""
+    safe_input: Row | None = None
+    """The input before the first update, m entries; by default 0."""
+    setpoint: Row | None = None
+    """x_r, n entries: the state at which the loop is to rest; by default 0. It must be an
+    equilibrium of the model, Âx_r + B̂u_r = 0; then u = K(x_c − x_r) + u_r."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        require_whole_period(self.rate_hz, "rate_hz")
+        return self
+
+    def law(self, model: ControlModel) -> ControlLaw:
+        """Return the control law.
+
+        Raises:
+            CallerError: it cannot be made.
+        """
+        raise NotImplementedError

@@ -1,0 +1,80 @@
+"""Numbers as people read them: with units, with the digits that matter, with an interval."""
+
+import math
+from decimal import Decimal
+
+NONE = "-"
+"""In the place of a number that is missing."""
+
+_DIGITS = 2
+"""Digits of the half-width."""
+_ALONE = 4
+"""Digits of a mean without an interval, or with one that is not written out."""
+_FIXED = range(-5, 7)
+"""Powers of ten that are written out."""
+_SIZES = (1e9, 1e6, 1e3)
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Write a number with so many significant digits."""
+    return NONE if value is None or math.isnan(value) else f"{value:.{digits}g}"
+
+
+def whole(value: float | None) -> str:
+    """Write a number without decimals."""
+    return NONE if value is None else f"{value:.0f}"
+
+
+def seconds(value_s: float | None, decimals: int = 3) -> str:
+    """Write a time in seconds with so many decimals."""
+    return NONE if value_s is None else f"{value_s:.{decimals}f} s"
+
+
+def duration(value_s: float) -> str:
+    """Write a time with three digits, in s, ms, µs or ns."""
+    return _with_unit(value_s * 1e9, ("s", "ms", "µs", "ns"))
+
+
+def byte_size(value: float) -> str:
+    """Write a number of bytes with three digits, in GB, MB, kB or bytes."""
+    return _with_unit(value, ("GB", "MB", "kB", "bytes"))
+
+
+def ratio(part: int, of: int) -> str:
+    """Write a share of a count in whole percent."""
+    return f"{100 * part / of:.0f} %" if of else NONE
+
+
+def percent(share: float, decimals: int = 1) -> str:
+    """Write a share in percent; the smallest shares have no sign."""
+    return f"{round(100 * share, decimals) + 0.0:.{decimals}f} %"
+
+
+def _with_unit(value: float, units: tuple[str, str, str, str]) -> str:
+    size, unit = next(
+        (pair for pair in zip(_SIZES, units, strict=False) if abs(value) >= pair[0]), (1, units[-1])
+    )
+    return f"{value / size:.3g} {unit}"
+
+
+def plus_minus(mean: float, halfwidth: float) -> str:
+    """Write ``mean ± halfwidth``; the mean alone where there is no interval.
+
+    The half-width has two digits, the mean as many places: ``0.1594 ± 0.016`` is ``0.159 ± 0.016``.
+    """
+    if not (math.isfinite(mean) and math.isfinite(halfwidth) and halfwidth > 0):
+        return f"{mean:.{_ALONE}g}".replace("-", "−")
+    last = _power(float(f"{halfwidth:.{_DIGITS - 1}e}")) - _DIGITS + 1
+    if last + _DIGITS - 1 not in _FIXED or _power(mean) not in _FIXED:
+        return f"{mean:.{_ALONE}g} ± {halfwidth:.{_DIGITS}g}".replace("-", "−")
+    return f"{_rounded(mean, last)} ± {_rounded(halfwidth, last)}".replace("-", "−")
+
+
+def _power(number: float) -> int:
+    return math.floor(math.log10(abs(number))) if number else 0
+
+
+def _rounded(number: float, last: int) -> str:
+    """Round to a multiple of 10^last, which is the last digit that is written."""
+    rounded = Decimal(repr(number)).quantize(Decimal(1).scaleb(last)) + 0  # no −0
+    return f"{rounded:.{max(-last, 0)}f}"

@@ -1,0 +1,211 @@
+"""Controllers of the user's own: the shipped examples, whole runs, refusals and mistakes."""
+
+import importlib.util
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from cosim.analysis.replay import replay
+from cosim.analysis.run_summary import summarise
+from cosim.live.simulated_run import simulate_run
+from cosim.record.run_record import RunRecord, load_record
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from noack.config.resolution import resolve
+from noack.config.scenario_file import load
+from noack.controllers.controller_settings import ControlModel
+from noack.core.errors import CallerError, ExitStatus
+from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+EXAMPLES = ("saturated_lqr", "model_predictive")
+A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+GAIN = np.array([[-1.0, -np.sqrt(2.0)]])
+LIMIT = 0.5
+
+
+def example(name: str, class_name: str, period_s: float, **parameters: Any) -> Any:
+    """An object of a shipped class, started on the double integrator."""
+    spec = importlib.util.spec_from_file_location(name, SCENARIOS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    made = getattr(module, class_name)(state_weights=[1.0, 0.0], input_weights=[1.0], **parameters)
+    made.start(ControlModel(A, B, GAIN, period_s))
+    return made
+
+
+def predictive(state_limit: float = LIMIT) -> Any:
+    limits = {"input_limit": [LIMIT], "state_limit": [0.0, state_limit]}
+    return example("model_predictive", "ModelPredictive", 0.05, horizon=30, **limits)
+
+
+def discrete_gain(period_s: float) -> np.ndarray:
+    held = control.c2d(control.ss(A, B, np.eye(2), np.zeros((2, 1))), period_s)
+    gain: np.ndarray = control.dlqr(held, np.diag([1.0, 0.0]), np.eye(1))[0]
+    return gain
+
+
+def test_the_saturated_regulator_is_another_packages_between_its_limits() -> None:
+    law = example("saturated_lqr", "SaturatedLqr", 0.01, limit=[LIMIT])
+    x = np.array([0.1, 0.05])
+    assert law.on_tick(0.0, x) == pytest.approx(-discrete_gain(0.01) @ x, rel=1e-9)
+    assert law.on_tick(0.0, np.array([9.0, 0.0])).tolist() == [-LIMIT]
+
+
+def test_the_predictive_controller_without_active_limits_is_the_regulator() -> None:
+    x = np.array([0.1, 0.05])
+    assert predictive().solve(x)[0] == pytest.approx((-discrete_gain(0.05) @ x)[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("x", [(2.0, 0.0), (1.0, -0.5), (-1.0, 0.3), (0.5, 0.45)])
+def test_the_predictive_controller_solves_its_programme(x: tuple[float, float]) -> None:
+    law, x0 = predictive(), np.array(x)
+    bound = {
+        "type": "ineq",
+        "fun": lambda z: law.h - np.abs(law.G @ z + law.E @ x0),
+    }
+    found = minimize(
+        lambda z: 0.5 * z @ law.P @ z + (law.F @ x0) @ z, np.zeros(30), method="SLSQP",
+        jac=lambda z: law.P @ z + law.F @ x0, constraints=[bound],
+        options={"ftol": 1e-13, "maxiter": 1000},
+    )  # fmt: skip
+    assert found.success
+    np.testing.assert_allclose(law.solve(x0), found.x, atol=1e-4)
+
+
+def test_limits_of_states_that_cannot_be_met_leave_those_of_the_inputs() -> None:
+    z = predictive().solve(np.array([0.0, 5.0]))  # ten times the velocity's limit
+    assert z[0] == pytest.approx(-LIMIT)
+    assert (np.abs(z) <= LIMIT * (1 + 1e-9)).all()
+
+
+def shortened(name: str) -> RunRecord:
+    return simulate(resolve(load(SCENARIOS / f"{name}.toml", ["horizon_s=8.0"])))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_settle_within_their_limits(name: str) -> None:
+    record = shortened(name)
+    u, x = record[CONTROLLER_STEP]["u"][:, 0], record[PLANT_STEP]["x"]
+    assert np.abs(u).max() == LIMIT
+    assert (np.abs(u) == LIMIT).sum() > 5
+    assert np.linalg.norm(x[-1]) < 0.1
+    if name == "model_predictive":
+        # Predictions err by what is lost on the way: the trigger's threshold, for some updates.
+        assert 0.4 < np.abs(x[:, 1]).max() < 1.2 * LIMIT
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_run_keeps_the_class_and_is_replayed_bit_for_bit(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "given"
+    folder.mkdir()
+    for suffix in (".py", ".toml"):
+        (folder / f"{name}{suffix}").write_bytes((SCENARIOS / f"{name}{suffix}").read_bytes())
+    ending = simulate_run(load(folder / f"{name}.toml", ["horizon_s=2.0"]), tmp_path / "runs")
+    assert ending.status == ExitStatus.OK
+    (folder / f"{name}.py").unlink()
+    record = load_record(ending.run_dir)
+    assert (ending.run_dir / "controller" / f"{name}.py").is_file()
+    assert replay(record).bit_exact
+
+
+def test_a_sampled_campaign_draws_runs_of_it() -> None:
+    work = SampledWork(
+        in_virtual_time(load(SCENARIOS / "saturated_lqr.toml", ["horizon_s=2.0"])),
+        7, None, None, 0.5, 1000,
+    )  # fmt: skip
+    first, second = work.run(range(2)), work.run(range(2))
+    assert [row["transmissions"] for row in first] == [row["transmissions"] for row in second]
+    assert all(row["transmissions"] > 1 for row in first)
+
+
+def test_what_is_not_covered_is_named_in_one_line() -> None:
+    coverage = resolve(load(SCENARIOS / "saturated_lqr.toml")).coverage
+    assert coverage.beyond_theory == 'controller.kind = "python": u is not K x_c'
+    with pytest.raises(CallerError, match=r"^controller\.kind: needs the controller u = K x_c"):
+        coverage.require_exact()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("controller.setpoint=[1.0, 0.0]", 'controller.setpoint.*: not with controller.kind = "py'),
+        ("plant.watchdog.policy=model", 'plant.watchdog.policy.*"model" predicts u = K x_c; not'),
+        ("controller.kind=pyton", "controller.kind.*must be one of linear, python; did you mean"),
+        ("controller.file=nothing.py", "controller.file = .nothing.py.: cannot be read: No such"),
+        ("controller.name=Other", "controller.name = .Other.: LookupError: saturated_lqr.py has"),
+        ("controller.parameters={}", "SaturatedLqr.: TypeError: .*missing 3 required positional"),
+    ],
+)
+def test_mistakes_in_the_settings(setting: str, message: str) -> None:
+    with pytest.raises(CallerError, match=message) as refused:
+        simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", [setting])))
+    assert "\n" not in str(refused.value)
+
+
+CODE = """
+    class Law:
+        def __init__(self):
+            self.updates = []
+
+        def on_update(self, t_s, x):
+            {on_update}
+
+        def on_tick(self, t_s, x_c):
+            {on_tick}
+"""
+
+
+def run_of(tmp_path: Path, **methods: str) -> RunRecord:
+    code = dedent(CODE).format(**{"on_update": "pass", "on_tick": "return [0.0]"} | methods)
+    (tmp_path / "law.py").write_text(code)
+    settings = [
+        f"controller.file={tmp_path / 'law.py'}", "controller.name=Law", "controller.parameters={}",
+        "controller.safe_input=[0.25]", "horizon_s=2.0",
+    ]  # fmt: skip
+    return simulate(resolve(load(SCENARIOS / "saturated_lqr.toml", settings)))
+
+
+@pytest.mark.parametrize(
+    ("methods", "message"),
+    [
+        ({"on_tick": "return [0.0, 1.0]"}, "on_tick has shape (2,), expected (1,)"),
+        ({"on_tick": "return 'left'"}, "on_tick is not of real numbers"),
+        ({"on_tick": "return [float('nan')]"}, "on_tick is not finite: [nan]"),
+        ({"on_tick": "x_c[0] = 1.0"}, "assignment destination is read-only (law.py, line 10)"),
+        ({"on_update": "raise KeyError('x')"}, "KeyError: 'x' (law.py, line 7)"),
+        ({"on_tick": "raise SystemExit(3)"}, "SystemExit: 3 (law.py, line 10)"),
+    ],
+)
+def test_a_law_that_fails_sends_the_safe_input_from_then_on(
+    methods: dict[str, str], message: str, tmp_path: Path
+) -> None:
+    record = run_of(tmp_path, **methods)
+    (notice,) = [one for one in record.notices if one["level"] == "failed"]
+    assert notice["text"].startswith('controller.name = "Law": ')
+    assert message in notice["text"]
+    assert set(record[CONTROLLER_STEP]["u"][:, 0]) <= {0.0, 0.25}
+    assert record[CONTROLLER_STEP]["u"][-1] == 0.25
+    end = summarise(record, ExitStatus.OK, "")["exit"]
+    assert end["status"] == ExitStatus.FAILED
+    assert message in end["reason"]
+
+
+def test_the_law_receives_each_update_at_its_own_time(tmp_path: Path) -> None:
+    methods = {
+        "on_update": "self.updates.append((t_s, *x))",
+        "on_tick": "return [self.updates[-1][0]]",  # the time of the newest update, as the input
+    }
+    record = run_of(tmp_path, **methods)
+    deliveries, steps = record["controller_delivery"], record[CONTROLLER_STEP]
+    for row in steps[1:]:
+        received = deliveries["t_ns"][deliveries["now_ns"] <= row["now_ns"]]
+        if len(received):
+            assert row["u"][0] == pytest.approx(received.max() * 1e-9)

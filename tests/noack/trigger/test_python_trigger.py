@@ -1,0 +1,153 @@
+"""A trigger that is a class in a user's file."""
+
+from pathlib import Path
+from textwrap import dedent
+
+import numpy as np
+import pytest
+
+from cosim.analysis.replay import replay
+from cosim.record.run_directory import write_scenario
+from cosim.record.run_record import RunRecord
+from cosim.simulation.batch.batch_interface import setting_of
+from cosim.simulation.batch.batch_status import OK
+from cosim.simulation.continuous.continuous_loop import continuous_loop_of
+from cosim.simulation.virtual_time import simulate
+from cosim.studies.campaign.sampled_draws import SampledWork, in_virtual_time
+from noack.config.resolution import resolve
+from noack.config.scenario import Scenario
+from noack.config.scenario_file import load
+from noack.core.errors import CallerError
+from noack.protocol.record_tables import SENSOR_MEASUREMENT
+
+SCENARIOS = Path(__file__).parents[3] / "scenarios"
+SEND_ON_DELTA = """
+    import numpy as np
+
+    class Delta:
+        def __init__(self, delta):
+            self.delta = delta
+
+        def start(self, t_s, x):
+            pass
+
+        def test(self, t_s, x, e_s):
+            return np.linalg.norm(e_s), self.delta
+"""
+
+
+def scenario(folder: Path, code: str, name: str = "Delta", parameters: str = "{}") -> Scenario:
+    path = folder / "own.py"
+    path.write_text(dedent(code))
+    trigger = f'{{policy="python", file="{path}", name="{name}", parameters={parameters}}}'
+    overrides = [f"trigger={trigger}", "horizon_s=4.0", "plant.rate_hz=100.0"]
+    return resolve(load(SCENARIOS / "lane_following.toml", overrides))
+
+
+def events(record: RunRecord) -> list[int]:
+    rows = record[SENSOR_MEASUREMENT]
+    return rows["t_ns"][rows["event"] >= 0].tolist()
+
+
+@pytest.mark.parametrize("protocol", ["none", "ack"])
+def test_a_class_that_sends_on_delta_runs_as_the_policy_does(tmp_path: Path, protocol: str) -> None:
+    own = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    network = own.network.model_copy(update={"protocol": protocol})
+    own = own.model_copy(update={"network": network})
+    built_in = resolve(
+        load(
+            SCENARIOS / "lane_following.toml",
+            ['trigger={policy="absolute", delta=0.05}', "horizon_s=4.0", "plant.rate_hz=100.0"],
+        )
+    ).model_copy(update={"network": network})
+    found, expected = simulate(own), simulate(built_in)
+    assert len(events(found)) > 3
+    assert events(found) == events(expected)
+    rows, others = found[SENSOR_MEASUREMENT], expected[SENSOR_MEASUREMENT]
+    different = {name for name in rows.dtype.names if (rows[name] != others[name]).any()}
+    assert different <= {"compared"}  # two functions for the same norm
+    np.testing.assert_allclose(rows["compared"], others["compared"], rtol=1e-14)
+
+
+def test_a_run_keeps_the_file_and_replays_with_it(tmp_path: Path) -> None:
+    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+    kept = write_scenario(resolved, run_dir)
+    (tmp_path / "own.py").write_text("class Delta: pass")
+    assert (run_dir / "trigger" / "own.py").is_file()
+    assert replay(simulate(kept)).bit_exact
+    with pytest.raises(CallerError, match=r"trigger\.file = .*has changed"):
+        simulate(resolved)
+
+
+def test_a_sampled_campaign_draws_it(tmp_path: Path) -> None:
+    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    rows = SampledWork(in_virtual_time(resolved), 1, None, None, 0.5, 1000).run(range(2))
+    assert (rows["status"] == OK).all()
+    assert np.isfinite(rows["sup_e_c_scaled"]).all()
+
+
+def test_what_needs_a_rule_refuses_it_in_one_line(tmp_path: Path) -> None:
+    resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
+    for refuses in (continuous_loop_of, setting_of):
+        with pytest.raises(CallerError, match="decides at measurements only") as refused:
+            refuses(resolved)
+        assert "\n" not in str(refused.value)
+    assert resolved.coverage.beyond_theory == (
+        'trigger.policy = "python": not the paper\'s trigger'
+    )
+    rule = '{policy="python", name="a:B"}'
+    with pytest.raises(CallerError, match='"python" cannot be combined'):
+        load(
+            SCENARIOS / "lane_following.toml",
+            [f'trigger={{policy="dwell", interval_s=0.1, rule={rule}}}'],
+        )
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        ("x = 1", "LookupError: own.py has no Delta"),
+        ("class Delta: pass", "TypeError: it has no method start"),
+        ("class Delta:\n  def start(self, t_s, x): pass", "TypeError: it has no method test"),
+        ("class Delta:\n  def __init__(self, gain): pass", "TypeError: Delta.__init__() missing 1"),
+        ("class Delta:\n  def start(self, t_s, x): x[0] = 1\n  def test(self, *given): return True",
+         "ValueError: assignment destination is read-only (own.py, line 2)"),
+        ("class Delta:\n  def start(self, t_s, x): pass\n  def test(self, *given): return None",
+         "TypeError: test(t_s, x, e_s) must return True, False or a pair of numbers"),
+        ("class Delta:\n  def start(self, t_s, x): pass\n  def test(self, *given): return 1 / 0",
+         "ZeroDivisionError: division by zero (own.py, line 3)"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_the_class_gives_one_line(tmp_path: Path, code: str, expected: str) -> None:
+    with pytest.raises(CallerError) as refused:
+        simulate(scenario(tmp_path, code))
+    assert str(refused.value).startswith(f'trigger.name = "Delta": {expected}')
+    assert "\n" not in str(refused.value)
+
+
+def test_a_class_may_return_whether_to_transmit(tmp_path: Path) -> None:
+    code = """
+        class Delta:
+            def start(self, t_s, x):
+                self.since_s = t_s
+
+            def test(self, t_s, x, e_s):
+                return t_s - self.since_s > 0.4999
+    """
+    found = np.diff(events(simulate(scenario(tmp_path, code))))
+    assert len(found) > 5
+    assert set(found) == {500_000_000}
+
+
+def test_the_shipped_trigger_keeps_to_its_grid_and_threshold() -> None:
+    record = simulate(resolve(load(SCENARIOS / "lane_python_trigger.toml", ["horizon_s=6.0"])))
+    rows = record[SENSOR_MEASUREMENT]
+    of_events = rows[rows["event"] > 0]  # the first update is sent without a test
+    assert len(of_events) > 3
+    assert (of_events["t_ns"] % 20_000_000 == 0).all()
+    levels = 0.5 * np.exp(-0.25 * of_events["t_ns"] * 1e-9)
+    since_ns = np.diff(of_events["t_ns"], prepend=0)
+    levels[since_ns < 500_000_000] *= 0.5
+    assert (of_events["e_s_norm"] > levels).all()
