@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.netem.engine.impairments import settings
 
 from netem.fates.fate_replay import read_fates
 from netem.link_machine import Link
@@ -21,6 +20,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
+from tests.netem.any_settings import harsh as settings
 from tests.netem.fates.links import MAX_GAP_NS, Arrival, Run, arrivals, drive, payload, record
 
 BAD = LinkSettings(
