@@ -22,81 +22,81 @@ LIVE ?=
 override FLAGS := $(if $(filter-out 0 no,$(LIVE)),--live) $(ARGS)
 
 .PHONY: help
-help: ## Explain the targets
+help: ## List the targets
 	@awk 'BEGIN {FS = ":.*## "} /^##@/ {printf "\n%s\n", substr($$0, 5)} \
 		/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: SCENARIO=FILE  CAMPAIGN=NAME  LIVE=1 (show it live)  ARGS="--set speed=2"  SESSION=NAME\n'
+	@printf '\nVariables: SCENARIO=NAME or FILE  CAMPAIGN=NAME or FILE  LIVE=1 (live viewer)  ARGS="--set speed=2"  SESSION=NAME\n'
 
 ##@ Run
 .PHONY: doctor demo demo-zoh run simulate view summary replay fidelity compare report certify adversary paper campaign design
-doctor: setup ## Say what this machine grants, and what that means for a run of SCENARIO
+doctor: setup ## Check this machine for SCENARIO: real-time settings, timers, ports, disk
 	@$(BIN)/noack doctor "$(SCENARIO)" $(ARGS)
 
 demo: setup ## Run the paper's lane-following example live (20 s)
 	@$(BIN)/noack demo $(FLAGS)
 
-demo-zoh: setup ## The same with zero-order hold instead of a model
+demo-zoh: setup ## The same with a zero-order hold instead of a model
 	@$(BIN)/noack demo --zoh $(FLAGS)
 
-run: setup ## Run SCENARIO=FILE, all processes at once
+run: setup ## Run SCENARIO live
 	@$(BIN)/noack run "$(SCENARIO)" $(FLAGS)
 
-simulate: setup ## Run SCENARIO=FILE in virtual time (a second or so)
+simulate: setup ## Run SCENARIO in virtual time (takes about a second)
 	@$(BIN)/noack simulate "$(SCENARIO)" $(ARGS)
 
-view: setup ## Open the last recording in the rerun viewer
+view: setup ## Show the last run in the rerun viewer
 	@$(BIN)/noack view $(ARGS)
 
-summary: setup ## Show the last run's summary again
+summary: setup ## Show the last run's summary
 	@$(BIN)/noack summary $(ARGS)
 
-replay: setup ## Feed the last run's machines their inputs again; compare bit for bit
+replay: setup ## Replay the last run's inputs; compare the outputs bit for bit
 	@$(BIN)/noack replay $(ARGS)
 
 fidelity: setup ## Compare the last run with the ideal loop, effect by effect
 	@$(BIN)/noack fidelity $(ARGS)
 
-compare: setup ## Compare RUNS="runs/A runs/B": numbers side by side, curves overlaid
+compare: setup ## Compare RUNS="runs/A runs/B": key numbers, and curves overlaid
 	@$(BIN)/noack compare $(RUNS) $(ARGS)
 
-report: setup ## Write the last run's report anew, a page with all figures; print its path
+report: setup ## Write the last run's report (a page with all figures) and print its path
 	@$(BIN)/noack report $(ARGS)
 
-certify: setup ## Say what is guaranteed of SCENARIO, under which conditions
+certify: setup ## Compute the guaranteed bounds of SCENARIO and their conditions
 	@$(BIN)/noack certify "$(SCENARIO)" $(ARGS)
 
-adversary: setup ## Search the worst losses that SCENARIO's network may make
+adversary: setup ## Search for the worst losses that SCENARIO's network may cause
 	@$(BIN)/noack adversary "$(SCENARIO)" $(ARGS)
 
 paper: setup ## Reproduce the paper's Section V over 1,000 draws into docs/ (3 minutes)
 	@$(BIN)/noack paper --out docs $(ARGS)
 
-campaign: setup ## Run CAMPAIGN=NAME or FILE: many runs over a grid of settings, with figures
+campaign: setup ## Run CAMPAIGN: many random draws over a grid of settings
 	@$(BIN)/noack campaign "$(CAMPAIGN)" $(ARGS)
 
-design: setup ## Choose SCENARIO's trigger for the fewest transmissions; SETTLING=SECONDS
+design: setup ## Choose SCENARIO's trigger: fewest transmissions, settled within SETTLING seconds
 	@$(BIN)/noack design "$(SCENARIO)" --settling $(SETTLING) $(ARGS)
 
-##@ Five terminals, one process each (start `make record` in one, the others in any order)
+##@ One terminal per process (start `make record` first, then the others in any order)
 .PHONY: record plant sensor controller netem
 record: setup ## Open a run of SCENARIO and record it
 	@$(BIN)/noack record "$(SCENARIO)" --session $(SESSION) $(FLAGS)
 
-plant: setup ## The plant: owns the true state x
+plant: setup ## The plant: integrates the state x
 	@$(BIN)/noack plant --session $(SESSION) $(ARGS)
 
-sensor: setup ## The sensor: owns the model x_s and the trigger
+sensor: setup ## The sensor: model x_s and trigger
 	@$(BIN)/noack sensor --session $(SESSION) $(ARGS)
 
-controller: setup ## The controller: owns the model x_c, sends u = K x_c
+controller: setup ## The controller: model x_c, input u = K x_c
 	@$(BIN)/noack controller --session $(SESSION) $(ARGS)
 
-netem: setup ## The network: loses packets, at most M - 1 in a row
+netem: setup ## The network: loses at most M - 1 consecutive packets
 	@$(BIN)/noack netem --session $(SESSION) $(ARGS)
 
 ##@ Work on noack
 .PHONY: setup setup-dev test pytest fuzz attack soak check format bench screenshots schema docs docs-serve lock dist clean
-setup: $(VENV)/.installed $(if $(filter setup,$(MAKECMDGOALS)),$(VENV)/.compiled) ## Make the environment in .venv (the other targets do it by themselves)
+setup: $(VENV)/.installed $(if $(filter setup,$(MAKECMDGOALS)),$(VENV)/.compiled) ## Create the environment in .venv (the other targets do this if needed)
 
 setup-dev: $(VENV)/.installed-dev
 
@@ -105,13 +105,13 @@ test: check pytest ## Lint, types, import rules, and all tests (ARGS are pytest'
 pytest: setup-dev
 	$(BIN)/python -m pytest $(or $(ARGS),--numprocesses=3 --dist=loadfile)
 
-fuzz: setup-dev ## Fuzz every parser, MINUTES=10 in all; exit status 1 if something is found
+fuzz: setup-dev ## Fuzz every parser for MINUTES=10 in total; exit status 1 if an input fails
 	$(BIN)/python -m tests.fuzz run --minutes $(MINUTES) $(ARGS)
 
-attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes); 1 if any gets in
+attack: setup-dev ## Send N=1000000 hostile datagrams to each port of a run (5 minutes)
 	$(BIN)/python -m tests.attacks --number $(N) $(ARGS)
 
-soak: setup-dev ## Watch a run for an hour, then a day at speed 48; MINUTES=5 is a short one
+soak: setup-dev ## Soak test: one hour, then a day at speed 48; MINUTES=5 is short
 	$(BIN)/python -m benchmarks.soak $(if $(filter file,$(origin MINUTES)),,--minutes $(MINUTES)) $(ARGS)
 
 check: setup-dev ## Lint, format, strict types, import rules
@@ -124,10 +124,10 @@ format: setup-dev ## Format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: setup-dev ## Measure against the alternatives, in one run; prints tables
+bench: setup-dev ## Run the benchmarks and print tables
 	$(BIN)/python -m benchmarks $(ARGS)
 
-screenshots: setup ## Make docs/run.png, light as the page it is on; needs Chromium
+screenshots: setup ## Make docs/run.png; needs Chromium
 	@$(BIN)/noack simulate lane_following --no-report
 	@$(BIN)/python tools/screenshot_recording.py runs/latest/recording.rrd docs/run.png --size 1600x900
 
@@ -140,10 +140,10 @@ docs: setup-dev ## Build the documentation site into site/; a warning is an erro
 	$(BIN)/sphinx-build -b html -E -W --keep-going --jobs auto --quiet docs site
 	@echo site/index.html
 
-docs-serve: docs ## Build it, and serve it on http://127.0.0.1:8000
+docs-serve: docs ## Build the site and serve it on http://127.0.0.1:8000
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory site 8000
 
-lock: setup-dev ## Pin the dependencies anew
+lock: setup-dev ## Update the pinned dependencies
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
 		--no-header pyproject.toml --extra vehicle --group build -o requirements.lock
 	$(BIN)/uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-emit-index-url \
@@ -154,7 +154,7 @@ dist: setup-dev ## Build the sdist, and the wheel from it, into dist/
 	$(BIN)/uv build --quiet --no-build-isolation --out-dir dist .
 	@ls dist/*
 
-clean: ## Remove the environment and caches; keep runs/
+clean: ## Remove the environment and caches, not runs/
 	rm -rf $(VENV) site .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 
 $(VENV)/bin/python:

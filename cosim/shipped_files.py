@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from noack.config import toml_file
-from noack.core.errors import CallerError
+from noack.core.errors import CallerError, shortened
 
 KINDS = ("scenarios", "campaigns")
-"""And the folders in which they lie."""
+"""Kinds of shipped files, and their folders."""
 
 _SCHEMA = "#:schema"
-"""The line that tells an editor where the schema lies, which is not beside a copy."""
+"""Begins the line that names the schema for editors; a copy does not have it."""
 
 _FILE = re.compile(r'^file = "([\w.]+\.py)"$', re.MULTILINE)
 """A file beside a scenario, which a copy of the scenario names by its absolute path."""
@@ -35,21 +35,25 @@ def find_shipped(name: str, folder: str) -> Path:
         folder: scenarios or campaigns.
 
     Raises:
-        CallerError: a bare name that is none of the shipped ones.
+        CallerError: a name without a folder that is neither a file nor a shipped one.
     """
-    path = Path(name)
-    if path.exists() or path.suffix == ".toml":
+    path, names = Path(name), shipped_names(folder)
+    try:
+        exists = path.exists()
+    except OSError:  # the name is too long
+        exists = False
+    if exists or (path.parent.name and name not in names) or not names:
         return path
-    names = shipped_names(folder)
     if name in names:
         return _path_of(name, folder)
-    if path.parent.name or not names:
-        return path
     kind = folder.removesuffix("s")
     for other in KINDS:
         if name in shipped_names(other):
-            raise CallerError(f"{name}: that is a shipped {other.removesuffix('s')}, no {kind}")
-    raise CallerError(f"{name}: no such file, nor a shipped {kind}; {_hint(name, names)}")
+            raise CallerError(f"{name}: a shipped {other.removesuffix('s')}, not a {kind}")
+    if path.suffix == ".toml":
+        names = [*sorted(str(one) for one in Path().glob("*.toml")), *names]
+    shown = shortened(name)
+    raise CallerError(f"{shown}: no such file, nor a shipped {kind}; {_hint(name, names)}")
 
 
 def shipped_names(folder: str) -> list[str]:
@@ -64,10 +68,10 @@ def all_shipped(folder: str) -> list[ShippedFile]:
 
 
 def text_of(name: str) -> str:
-    """Return what a shipped scenario or campaign says, to be copied.
+    """Return the text of a shipped scenario or campaign, to be copied.
 
     Raises:
-        CallerError: there is none of this name.
+        CallerError: there is no such file.
     """
     for folder in KINDS:
         if name in shipped_names(folder):
@@ -76,7 +80,7 @@ def text_of(name: str) -> str:
             text = "".join(line for line in lines if not line.startswith(_SCHEMA))
             return _FILE.sub(rf'file = "{path.absolute().parent}/\1"', text)
     names = [known for folder in KINDS for known in shipped_names(folder)]
-    raise CallerError(f"{name}: nothing of that name is shipped; {_hint(name, names)}")
+    raise CallerError(f"{shortened(name)}: not a shipped file; {_hint(name, names)}")
 
 
 def _hint(name: str, names: Sequence[str]) -> str:
@@ -85,12 +89,12 @@ def _hint(name: str, names: Sequence[str]) -> str:
 
 
 def _path_of(name: str, folder: str) -> Path:
-    """Where a shipped file lies; relative to the working directory if that is around it."""
+    """Return the path of a shipped file, relative to the working directory if inside it."""
     path = _place(folder) / f"{name}.toml"
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def _place(folder: str) -> Path:
-    """Where they lie: in the package that was installed, or beside it in the repository."""
+    """Return their folder: in the installed package, or beside it in the repository."""
     here = Path(__file__).parent
     return here / folder if (here / folder).is_dir() else here.parent / folder

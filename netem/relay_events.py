@@ -9,7 +9,10 @@ EVENT = np.dtype(
         ("t_ns", "<i8"),  # Unix time
         ("flow", "<i8"),  # number of the flow within the link
         ("packet", "<i8"),  # number of the datagram within its flow
-        ("run", "<i8"),  # arrival: successive losses up to and including this datagram
+        (
+            "consecutive_losses",
+            "<i8",
+        ),  # arrival: successive losses up to and including this datagram
         ("mansd", "<i8"),  # the cap on successive losses, -1 none
         ("delay_ns", "<i8"),  # arrival: the delay decided, -1 never leaves; departure: the real one
         ("copy_delay_ns", "<i8"),  # arrival: the delay decided for its copy, -1 there is none

@@ -29,7 +29,6 @@ from noack.config.triggers import POLICIES
 from noack.impairments.disciplines import DISCIPLINES
 from noack.impairments.kinds import IMPAIRMENTS
 from noack.impairments.loss_models import LOSS_MODELS
-from noack.protocol.record_tables import tables
 
 ROOT = Path(__file__).parents[1]
 PAGES = (
@@ -242,26 +241,6 @@ def test_every_option_of_design_is_documented_and_no_other() -> None:
     parameters = get_command(app).commands["design"].params  # type: ignore[attr-defined]
     known = {name for one in parameters for name in one.opts if name.startswith("--")}
     assert documented | {"--help"} == known | {"--help"}
-
-
-def test_every_column_of_the_record_is_documented() -> None:
-    everything = tables(
-        1, 1, acknowledged=True, predictive=True, internal=1,
-        disturbed_input=True, disturbed_state=True, outputs=1, inputs_reported=1,
-    )  # fmt: skip
-    text = (ROOT / "docs/record.md").read_text()
-    for table, dtype in everything.items():
-        (row,) = [line for line in text.splitlines() if line.startswith(f"| `{table}`")]
-        for name in dtype.names or ():
-            common = name in ("input", "sequence", "t_ns", "now_ns")
-            assert common or f"`{name}`" in row, f"{table}.{name}"
-
-
-def test_every_key_of_the_summary_is_documented(run_folder: Path) -> None:
-    summary: dict[str, Any] = json.loads((run_folder / "runs/latest/summary.json").read_text())
-    text = (ROOT / "docs/record.md").read_text()
-    documented = set(re.findall(r"`([a-z_]+)`", text.partition("## The summary")[2]))
-    assert summary.keys() <= documented, summary.keys() - documented
 
 
 def test_the_exported_schema_is_the_codes() -> None:

@@ -1,4 +1,4 @@
-"""Processes of this machine that compute for one parent."""
+"""Worker processes of this machine."""
 
 import multiprocessing
 import os
@@ -12,28 +12,27 @@ from multiprocessing.connection import Connection
 _ENVIRONMENT = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 ) | {"PYTHONSAFEPATH": "1"}
-"""One thread each; and none imports from the current folder (:mod:`noack.core.python_process`), as
-Python would before multiprocessing hands it the parent's path."""
+"""One thread each, and no imports from the current folder (:mod:`noack.core.python_process`)."""
 
 
 @contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes, each on one thread; submit to them with :func:`interrupts_held`.
+    """Start processes of one thread each; submit to them within :func:`interrupts_held`.
 
-    None outlives the parent, however it ends.
+    They end with the parent, however it ends.
     """
-    # A fork would inherit whatever threads the libraries have started.
+    # A fork would inherit threads of the libraries.
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
-    os.environ.update(_ENVIRONMENT)  # for the children, who inherit it
-    with interrupts_held():  # it starts a process that keeps account of semaphores
+    os.environ.update(_ENVIRONMENT)  # inherited by the children
+    with interrupts_held():  # it starts a process for semaphores
         pool = ProcessPoolExecutor(workers, context, _depend_on, (theirs,))
     try:
         yield pool
         pool.shutdown()
     finally:
-        ours.close()  # ends those that are still at work
+        ours.close()  # ends processes that still compute
         pool.shutdown(cancel_futures=True)
         theirs.close()
         for name, value in before.items():
@@ -44,7 +43,7 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _depend_on(parent: Connection) -> None:
-    """No worker outlives the parent's end of the pipe."""
+    """End this process when the parent closes its end of the pipe."""
 
     def follow() -> None:
         parent.poll(None)
@@ -55,9 +54,9 @@ def _depend_on(parent: Connection) -> None:
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C and a closed terminal back: what is started meanwhile never hears of them.
+    """Block Ctrl-C and hang-up signals in processes that are started meanwhile.
 
-    The parent decides what they mean.
+    The parent handles them.
     """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
     try:

@@ -231,7 +231,7 @@ def _folded(total: int) -> int:
 @_part
 def _put_comment(out: Bytes, start: int, event: Any) -> int:
     """Write the comment as an option."""
-    fate, losses, mansd = min(event["fate"], _UNKNOWN), event["run"], event["mansd"]
+    fate, losses, mansd = min(event["fate"], _UNKNOWN), event["consecutive_losses"], event["mansd"]
     at = start + 4
     if event["copy"]:
         at = _put(out, at, _COPY)

@@ -63,7 +63,7 @@ class PlainTaps:
         """Tell that a datagram has come, and what was decided."""
         event = self._add(way, ends, way.back, data, now_ns)
         event["flow"], event["packet"], event["fate"] = flow, verdict.packet, verdict.fate
-        event["run"] = verdict.consecutive_losses
+        event["consecutive_losses"] = verdict.consecutive_losses
         event["delay_ns"] = _delay(verdict.release_ns, now_ns)
         event["copy_delay_ns"] = _delay(verdict.copy_ns, now_ns)
         event["hold_back_ns"] = verdict.hold_back_ns
@@ -79,7 +79,7 @@ class PlainTaps:
         event["fate"] = departure.fate
         event["delay_ns"] = now_ns - departure.arrival_ns
         event["copy_delay_ns"] = event["copy_bit"] = -1
-        event["run"] = event["hold_back_ns"] = 0
+        event["consecutive_losses"] = event["hold_back_ns"] = 0
         event["bit"] = departure.bit
         event["departure"] = 1
         event["copy"], event["stale"] = departure.copy, departure.stale

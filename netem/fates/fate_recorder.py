@@ -18,7 +18,7 @@ from netem.relay_events import EVENT
 from netem.standard_error import say
 from noack.core.errors import CallerError
 
-_FIELDS = {"arrival_ns": "t_ns", "consecutive_losses": "run"}
+_FIELDS = {"arrival_ns": "t_ns"}
 """Fields of an event whose columns have another name."""
 _RAW = np.dtype((np.void, EVENT.itemsize))
 """Events without their fields, which numpy copies ten times as fast."""

@@ -12,7 +12,7 @@ from noack.config import toml_file
 from noack.config.matrix_files import with_matrices
 from noack.config.scenario import Scenario
 from noack.config.sections.network_section import AcknowledgementSection, NetworkSection
-from noack.core.errors import CallerError, printable
+from noack.core.errors import CallerError, printable, shortened
 from noack.settings.user_files import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
@@ -120,14 +120,16 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
     except CallerError:
         alone = False
 
+    names = [shortened(key) for key in keys]
+
     def said_of(line: re.Match[str]) -> str:
-        if any(re.match(rf"{re.escape(key)}[.:=\s]", line["rest"]) for key in keys):
+        if any(re.match(rf"{re.escape(name)}[.:=\s]", line["rest"]) for name in names):
             return f"--set {line['rest']}"
         if not alone:
             return line[0]
         place = re.split(r"[:\s]", line["rest"], maxsplit=1)[0].split(".")
         shared = [_shared(place, key.split(".")) for key in keys]
-        nearest = [key for key, parts in zip(keys, shared, strict=True) if parts == max(shared)]
+        nearest = [name for name, parts in zip(names, shared, strict=True) if parts == max(shared)]
         return f"{line['file']} with --set {', '.join(nearest)}: {line['rest']}"
 
     file = re.escape(printable(str(path)))
@@ -145,7 +147,7 @@ def _apply(content: dict[str, Any], override: str) -> str:
     """Put ``key=value`` into the content; return the key."""
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        shown = printable(override)
+        shown = shortened(printable(override))
         raise CallerError(f"--set {shown}: write it as key=value, e.g. trigger.beta=0.3")
     put(content, key.strip(), value_of(text, f"--set {key}"), f"--set {override}")
     return key.strip()

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from noack.core.errors import printable
+from noack.core.errors import printable, shortened
 
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$": "use letters, digits, _ and -, beginning with a letter "
@@ -66,7 +66,7 @@ def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
 
 def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
     at = _locate(mistake["loc"], root)
-    key = ".".join(map(str, at.path))
+    key = shortened(".".join(map(str, at.path)))
     value, kind = mistake["input"], mistake["type"]
     shown = f"{key} = {_show(value)}"
     if kind == "missing":

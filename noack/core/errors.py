@@ -64,6 +64,11 @@ def why(error: OSError) -> str:
     return os.strerror(error.errno) if error.errno else one_line(error)
 
 
+def shortened(text: str, longest: int = 80) -> str:
+    """Return a text, or its beginning and ``...`` if it has more than so many characters."""
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
+
+
 def printable(text: str) -> str:
     r"""Return a text as one line with unprintable characters escaped (``\x1b``, ``\n``)."""
     if text.isprintable():

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from typing import NoReturn, TypeVar
 
-from noack.core.errors import CallerError, printable
+from noack.core.errors import CallerError, printable, shortened
 from noack.impairments.quantities import Quantity
 
 T = TypeVar("T")
@@ -34,8 +34,7 @@ class WordReader:
     @property
     def clause(self) -> str:
         """What has been taken of this clause, for messages."""
-        text = printable(shlex.join(self._clause))
-        return text if len(text) <= 80 else text[:77] + "..."
+        return shortened(printable(shlex.join(self._clause)))
 
     def wrong(self, expected: str) -> NoReturn:
         """Raise a CallerError about the last word."""
@@ -45,13 +44,13 @@ class WordReader:
         """Take a word."""
         word = self._take()
         if word is None:
-            self.wrong(f"expected after it: {expected}")
+            self.wrong(f"a value is missing: {expected}")
         return word
 
     def file(self, expected: str) -> str:
         """Take the name of a file, which may contain spaces."""
         if not self._words:
-            self.wrong(f"expected after it: {expected}")
+            self.wrong(f"a value is missing: {expected}")
         name = self._words.popleft()
         self._clause.append(name)
         if not name:

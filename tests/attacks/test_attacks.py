@@ -35,7 +35,7 @@ def test_every_kind_was_sent_to_every_port(attacked: Attacked) -> None:
         assert attacked.sent_to(role).total() > 1000  # as many as a busy machine sends in time
 
 
-def test_what_comes_with_a_peers_address_is_rejected_by_its_content(attacked: Attacked) -> None:
+def test_datagrams_with_a_forged_peer_address_are_rejected_by_content(attacked: Attacked) -> None:
     if not may_forge_addresses():
         pytest.skip("only an administrator may send with another's address")
     for role in ("plant", "sensor", "controller"):
@@ -44,7 +44,7 @@ def test_what_comes_with_a_peers_address_is_rejected_by_its_content(attacked: At
 
 
 @pytest.mark.parametrize("kind", FROM_ANYWHERE)
-def test_a_kind_is_what_it_says(kind: str) -> None:
+def test_each_kind_of_attack_is_rejected_for_its_reasons(kind: str) -> None:
     """Of a stranger and in the peer's name, with the reasons that the kind allows."""
     target = Target("sensor", 1, 2, Flow.MEASUREMENT, 4, 9, bytes(range(32)))
     allowed = {

@@ -71,7 +71,7 @@ def test_a_planted_index_is_not_unpickled(
 
 @pytest.mark.parametrize("level", ["up", "up/cache", "the folder"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_where_another_user_may_write_on_the_way_nothing_is_kept(
+def test_no_cache_below_a_folder_that_others_may_write(
     change: Callable[[Path], None], level: str, home: Path, tmp_path: Path
 ) -> None:
     folder = cache_folder("netem", SOURCES)
@@ -89,7 +89,7 @@ def test_nor_where_a_file_is_another_users(home: Path) -> None:
     assert cache_folder("netem", SOURCES) is None
 
 
-def test_what_it_makes_is_the_users_alone(home: Path) -> None:
+def test_created_folders_are_private(home: Path) -> None:
     before = os.umask(0)
     try:
         folder = cache_folder("netem", SOURCES)
@@ -122,7 +122,7 @@ def test_unless_another_user_has_put_his_own_there(level: str, home: Path) -> No
     assert cache_folder("netem", SOURCES) is None
 
 
-def test_a_folder_in_one_for_temporary_files_is_as_good(home: Path) -> None:
+def test_a_cache_below_a_sticky_folder_is_allowed(home: Path) -> None:
     """There others may make files, but neither replace nor remove the user's."""
     home.mkdir(parents=True)
     home.parent.chmod(0o1777)

@@ -95,7 +95,9 @@ def test_a_link_in_the_folders_place_is_refused(
         ("netem", "publish an emulator"), ("netem", "list emulators"),
     ],
 )  # fmt: skip
-def test_so_is_one_inside_it(kind: str, use: str, shared: Path, ticket: Ticket) -> None:
+def test_a_folder_of_another_user_inside_is_refused(
+    kind: str, use: str, shared: Path, ticket: Ticket
+) -> None:
     for folder in (shared / OWN, shared / "own"):
         folder.mkdir(mode=0o700)
     (shared / OWN / kind).symlink_to(shared / "own")
@@ -152,16 +154,14 @@ def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
 
 @needs_root
 @pytest.mark.parametrize("theirs", ["folder", "file"])
-def test_what_belongs_to_another_user_is_not_read(
-    theirs: str, shared: Path, ticket: Ticket
-) -> None:
+def test_a_file_of_another_user_is_not_read(theirs: str, shared: Path, ticket: Ticket) -> None:
     with published(ticket, "default") as path:
         os.chown(path if theirs == "file" else path.parent, NOBODY, NOBODY)
         with pytest.raises(CallerError, match="of yours"):
             join()
 
 
-def test_nor_is_what_is_no_file(shared: Path) -> None:
+def test_only_regular_files_are_read(shared: Path) -> None:
     """A named pipe would hold up whoever reads it."""
     (shared / OWN).mkdir(mode=0o700)
     os.mkfifo(ticket_path("default"))
@@ -169,7 +169,7 @@ def test_nor_is_what_is_no_file(shared: Path) -> None:
         join()
 
 
-def test_the_doctor_says_what_is_wrong_with_the_folder(shared: Path) -> None:
+def test_the_doctor_reports_a_folder_that_cannot_be_used(shared: Path) -> None:
     (shared / "own").mkdir(mode=0o700)
     (shared / OWN).symlink_to(shared / "own")
     assert "closed to others" in str(_runtime_folder())

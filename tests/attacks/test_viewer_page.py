@@ -61,7 +61,7 @@ def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage
             return answer.status, answer.headers, answer.read()
 
 
-def test_the_page_is_at_the_one_address_that_is_printed(server: RecordingServer) -> None:
+def test_the_page_is_only_at_the_printed_address(server: RecordingServer) -> None:
     address = server.start_page()
     status, headers, _ = ask(f"{address}?theme=light")
     assert status == 302
@@ -84,13 +84,13 @@ def test_through_a_forwarded_port_the_page_finds_the_recording(server: Recording
     "path",
     ["", "/", "/recording.rrd", "/re_viewer.js", "//", "/x/recording.rrd", "/%2e/recording.rrd"],
 )
-def test_without_the_secret_nothing_is_there(server: RecordingServer, path: str) -> None:
+def test_without_the_secret_every_path_is_404(server: RecordingServer, path: str) -> None:
     server.start_page()
     assert ask(f"{server.origin}{path or '/'}")[0] == 404
 
 
 @pytest.mark.parametrize("change", ["", "shorter", "longer", "other case", "no slash"])
-def test_nor_with_nearly_the_secret(server: RecordingServer, change: str) -> None:
+def test_a_similar_secret_is_404(server: RecordingServer, change: str) -> None:
     server.start_page()
     secret = urlsplit(server.address).path.strip("/")
     path = {
@@ -121,7 +121,7 @@ def test_the_secret_is_on_no_command_line(server: RecordingServer) -> None:
 
 
 @pytest.mark.parametrize("path", ["\xe9", "\x01", "\x7f", "?\xe9"])
-def test_what_is_no_path_gets_a_line(
+def test_an_invalid_path_gives_one_line(
     server: RecordingServer, path: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     server.start_page()

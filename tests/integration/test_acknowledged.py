@@ -90,7 +90,7 @@ def test_only_an_acknowledgement_resets_the_sensors_model(record: RunRecord) -> 
     assert at_once > 3  # events whose update or acknowledgement was lost, which reset nothing
 
 
-def test_everyone_hears_only_whom_it_should(finished: Finished) -> None:
+def test_each_process_receives_from_its_senders_only(finished: Finished) -> None:
     import json
 
     reports = json.loads((finished.run_dir / "reports.json").read_text())

@@ -33,7 +33,7 @@ def ended(process: subprocess.Popen[str]) -> tuple[str, str]:
     return process.communicate(timeout=PATIENCE_S)
 
 
-def test_who_waits_for_one_that_never_comes_may_interrupt(
+def test_a_wait_for_a_missing_process_can_be_interrupted(
     start: Start, by_hand: ByHand, tmp_path: Path
 ) -> None:
     recording = start(command=RECORD)

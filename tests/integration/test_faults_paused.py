@@ -31,7 +31,7 @@ def pause(process: psutil.Process, pause_s: float) -> None:
     process.send_signal(signal.SIGCONT)
 
 
-def test_each_process_may_stand_still_and_the_run_catches_up(start: Start) -> None:
+def test_a_run_catches_up_after_each_process_was_paused(start: Start) -> None:
     running = start(*AT_RATE, *settings(speed=4.0, horizon_s=28.0))
     wait_recording(running)
     for role in ROLE_MODULES:
@@ -70,7 +70,7 @@ def test_each_process_may_stand_still_and_the_run_catches_up(start: Start) -> No
     assert running.left_behind() == []
 
 
-def test_a_recorder_that_stands_still_for_long_is_named_and_nothing_is_lost(start: Start) -> None:
+def test_a_frozen_recorder_is_named_and_no_row_is_lost(start: Start) -> None:
     """The run is ended, as nobody would show it any more; everyone else writes down its rows."""
     running = start(*LONG)
     wait_recording(running)

@@ -98,11 +98,11 @@ def unheard(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return (runs / "latest").resolve()
 
 
-def test_a_reader_that_leaves_does_not_end_the_run(unheard: Path) -> None:
+def test_a_closed_pipe_does_not_end_the_run(unheard: Path) -> None:
     assert is_whole(unheard)
 
 
-def test_rows_of_a_process_that_wakes_up_late_are_merged(unheard: Path, tmp_path: Path) -> None:
+def test_rows_spooled_after_the_end_are_merged(unheard: Path, tmp_path: Path) -> None:
     run_dir = shutil.copytree(unheard, tmp_path / "run")
     record = load_record(run_dir)
     writer = SpoolWriter(run_dir / "spool", "plant")

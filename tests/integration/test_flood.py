@@ -17,7 +17,7 @@ needs_shield = pytest.mark.skipif(sys.platform != "linux", reason="there is a sh
 
 
 @needs_shield
-def test_a_run_outlasts_a_flood_and_says_so(start: Callable[..., Running]) -> None:
+def test_a_run_survives_a_flood_and_logs_it(start: Callable[..., Running]) -> None:
     running = start(*settings(horizon_s=8.0))
     wait_recording(running)
     ports = [running.udp_port(role) for role in LOOP_ROLES]

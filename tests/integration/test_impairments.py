@@ -79,7 +79,7 @@ def test_the_run_ends_well_and_replays_to_the_bit(finished: Finished) -> None:
     assert not any("Traceback" in log for log in logs)
 
 
-def test_the_table_says_what_was_lost_by_what(finished: Finished) -> None:
+def test_the_table_lists_losses_by_cause(finished: Finished) -> None:
     rows = dict(key_numbers(finished.summary))
     causes = finished.summary["drops_by_cause"]
     assert {"dropped", "corrupted"} <= set(causes)
@@ -104,7 +104,7 @@ def test_every_impairment_happened(live: RunRecord) -> None:
     assert released["stale"].any()
 
 
-def test_what_left_the_network_reached_the_controller(finished: Finished, live: RunRecord) -> None:
+def test_forwarded_packets_reach_the_controller(finished: Finished, live: RunRecord) -> None:
     packets = live[NETEM_PACKET]
     left = int((packets["release_ns"] >= 0).sum() + (packets["copy_ns"] >= 0).sum())
     rejected = finished.summary["rejected_datagrams"]["controller"]

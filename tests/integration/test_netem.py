@@ -98,7 +98,7 @@ def test_it_serves_any_udp_program(words: str, run: int, engine: str) -> None:
 
 
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6], ids=["IPv4", "IPv6"])
-def test_answers_find_back_and_have_words_of_their_own(family: int) -> None:
+def test_the_reverse_direction_has_its_own_impairments(family: int) -> None:
     host = "[::1]" if family == socket.AF_INET6 else "127.0.0.1"
     with server(family) as (there, to), client(family) as here:
         arguments = ["--listen", f"{host}:0", "--to", to, "--reverse", "loss periodic 1/2"]
@@ -140,7 +140,7 @@ def test_several_links_come_from_a_file(tmp_path: Path) -> None:
     assert [link["name"] for link in totals_of(stdout)["links"]] == ["first", "second"]
 
 
-def test_fates_are_recorded_and_taken_again(tmp_path: Path) -> None:
+def test_recorded_fates_are_replayed(tmp_path: Path) -> None:
     """With another seed and other words, but the same fates."""
     arrived = []
     record, again = tmp_path / "fates.parquet", tmp_path / "again.parquet"
@@ -184,7 +184,7 @@ def test_a_capture_and_statistics_are_written(tmp_path: Path) -> None:
     assert told[-1]["links"][0]["forward"]["arrived"] == 2
 
 
-def test_a_taken_port_is_told(tmp_path: Path) -> None:
+def test_a_taken_port_is_reported(tmp_path: Path) -> None:
     with server() as (_, taken):
         done = subprocess.run(
             [*COMMAND, "--listen", taken, "--to", ":9"],
@@ -224,7 +224,7 @@ def test_a_script_can_wait_for_it(engine: str) -> None:
     assert stdout == ""
 
 
-def test_while_it_compiles_it_is_starting_and_says_how_long(tmp_path: Path) -> None:
+def test_show_names_the_compilation_and_its_duration(tmp_path: Path) -> None:
     """An empty cache; show names the state, and the next start knows how long this one took."""
     environment = os.environ | {
         "XDG_CACHE_HOME": str(tmp_path / "cache"), "XDG_RUNTIME_DIR": str(tmp_path),
@@ -255,7 +255,7 @@ def test_while_it_compiles_it_is_starting_and_says_how_long(tmp_path: Path) -> N
     assert float(record.read_text()) > 0
 
 
-def test_losses_of_its_own_have_an_exit_status_of_their_own() -> None:
+def test_unintended_losses_have_their_own_exit_status() -> None:
     """The kernel's buffer overflows while it stands still."""
     with (
         client() as here,

@@ -34,7 +34,7 @@ def outage(start: Start) -> Finished:
     return running.finish()
 
 
-def test_the_plant_goes_on_by_its_policy_and_the_run_says_so(start: Start) -> None:
+def test_the_plant_applies_its_watchdog_policy_and_logs_it(start: Start) -> None:
     finished = outage(start)
     assert finished.status == 130, finished.stderr
     summary, record = finished.summary, load_record(finished.run_dir)

@@ -104,7 +104,7 @@ def restarted(tmp_path_factory: pytest.TempPathFactory) -> Finished:
         return finished
 
 
-def test_the_run_goes_on_and_says_who_was_away_when(restarted: Finished) -> None:
+def test_the_run_goes_on_and_lists_its_restarts(restarted: Finished) -> None:
     assert restarted.status == 130, restarted.stderr
     assert restarted.summary["exit"]["reason"] == "stopped by the user (SIGINT)"
     restarts = {one["process"]: one for one in restarted.summary["restarts"]}
@@ -144,7 +144,7 @@ def test_a_restarted_network_passes_its_first_packet(restarted: Finished) -> Non
     assert packets["consecutive_losses"].max() <= 1
 
 
-def test_a_restarted_controller_puts_out_nothing_until_it_knows_a_state(
+def test_a_restarted_controller_outputs_zero_until_its_first_update(
     restarted: Finished,
 ) -> None:
     record = load_record(restarted.run_dir)
@@ -181,7 +181,7 @@ def test_claims_are_void_from_the_first_outage_on(restarted: Finished) -> None:
     assert all(claim.since_s <= gone_s + 0.1 for claim in claims if claim.since_s is not None)
 
 
-def test_nobody_can_mistake_an_old_update_for_news(restarted: Finished) -> None:
+def test_a_restarted_process_accepts_no_old_message(restarted: Finished) -> None:
     """Whoever takes over knows nothing of what was accepted before; its own number tells it."""
     record = load_record(restarted.run_dir)
     for role, table in (("sensor", "sensor_measurement"), ("controller", "controller_delivery")):

@@ -100,7 +100,7 @@ def test_the_sdist_makes_the_same_wheel_as_the_repository(dist: Path, tmp_path: 
     assert content(from_sdist) == content(from_tree)
 
 
-def test_the_wheel_has_what_noack_reads_and_nothing_else(dist: Path) -> None:
+def test_the_wheel_contains_the_packages_and_their_data_only(dist: Path) -> None:
     (wheel,) = dist.glob("*.whl")
     with zipfile.ZipFile(wheel) as file:
         names = set(file.namelist())
@@ -129,7 +129,7 @@ def test_the_sdist_has_the_documentation_and_the_tests(dist: Path) -> None:
     assert not [name for name in names if name.startswith((".venv", "runs", ".ci"))]
 
 
-def test_what_is_installed_runs_without_the_repository(noack: Installed) -> None:
+def test_the_installed_wheel_runs_without_the_repository(noack: Installed) -> None:
     assert noack("--version").stdout.startswith("noack ")
     assert noack.json("check", "lane_following")["name"] == "lane_following"
     short = ("--set", "horizon_s=0.5", "--no-report")
@@ -141,7 +141,7 @@ def test_what_is_installed_runs_without_the_repository(noack: Installed) -> None
     assert noack("netem", "--explain", "loss", "5%").returncode == 0
 
 
-def test_the_doctor_says_what_is_missing(noack: Installed) -> None:
+def test_the_doctor_names_missing_extras(noack: Installed) -> None:
     done = noack("doctor", *EPHEMERAL, "--seconds", "0.1", "--json")
     said = json.loads(done.stdout)
     assert said["measured"]["extras"] == {"fmi": False, "vehicle": False, "cluster": False}
@@ -153,7 +153,7 @@ def test_the_doctor_says_what_is_missing(noack: Installed) -> None:
     (("check", "lane_vehicle"), "vehicle"),
     (("campaign", "mb_vs_zoh", "--scheduler", "tcp://127.0.0.1:9"), "cluster"),
 ])  # fmt: skip
-def test_what_an_extra_brings_names_it_where_it_is_missing(
+def test_a_command_names_its_missing_extra(
     noack: Installed, command: tuple[str, ...], extra: str
 ) -> None:
     done = noack(*command)

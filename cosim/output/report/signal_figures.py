@@ -93,30 +93,13 @@ def paper_figure(
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
-    columns = drawn if drawn <= 3 else 2 if drawn == 4 else 3 if drawn <= 12 else 4
-    rows = math.ceil(drawn / columns)
-    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, head_in(())
-    width_in = (WIDTH_IN - RIGHT_IN) / columns - LEFT_IN
-    # A last row that is not full leaves room for the numbers of the time axes above its gap.
-    gaps_in = [0.22] * (rows - 2) + [0.22 if drawn % columns == 0 else BELOW_IN] * (rows > 1)
-    tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
-    above_in = tops_in[-1] + height_in + BELOW_IN + head
-    below_in = above_in + interval_in + head
-    figure = NotebookFigure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
-    for i in range(drawn):
-        row, column = divmod(i, columns)
-        left_in = LEFT_IN + column * (LEFT_IN + width_in)
-        axes = place(figure, left_in, tops_in[row], width_in, height_in)
+    figure, panels, above, below = _paper_panels(drawn)
+    for i, axes in enumerate(panels):
         known = None if x_hat is None else x_hat[:, i]
         shown = _state(axes, t_s, x[:, i], x_s[:, i], x_c[:, i], known)
         axes.set_ylabel(plain(state_names[i]))
-        axes.tick_params(labelbottom=i + columns >= drawn)
-        axes.set_xlabel(TIME if i + columns >= drawn else "")
         finish(axes, t_s)
     _heading(figure, mode, title, f"{drawn} of {n} states" if drawn < n else "", shown)
-    whole_in = WIDTH_IN - LEFT_IN - RIGHT_IN
-    above = place(figure, LEFT_IN, above_in, whole_in, interval_in)
-    below = place(figure, LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above)
     _broadcasts(above, broadcast_s, dropped)
     _receptions(below, received_s, forced, broadcast_s[dropped])
     above.tick_params(labelbottom=False)
@@ -127,6 +110,32 @@ def paper_figure(
     below.set_xlabel(TIME)
     figure.align_ylabels()
     return figure
+
+
+def _paper_panels(states: int) -> tuple[Figure, list[Axes], Axes, Axes]:
+    """Place the panels of the states, of the broadcasting and of the receiving intervals."""
+    columns = states if states <= 3 else 2 if states == 4 else 3 if states <= 12 else 4
+    rows = math.ceil(states / columns)
+    height_in, interval_in, head = (1.45 if rows <= 2 else 1.15), 1.2, head_in(())
+    width_in = (WIDTH_IN - RIGHT_IN) / columns - LEFT_IN
+    # If the last row is not full, the time axes of the row above need room for their numbers.
+    gaps_in = [0.22] * (rows - 2) + [0.22 if states % columns == 0 else BELOW_IN] * (rows > 1)
+    tops_in = [head + i * height_in + sum(gaps_in[:i]) for i in range(rows)]
+    above_in = tops_in[-1] + height_in + BELOW_IN + head
+    below_in = above_in + interval_in + head
+    figure = NotebookFigure(figsize=(WIDTH_IN, below_in + interval_in + BELOW_IN))
+    panels = []
+    for i in range(states):
+        row, column = divmod(i, columns)
+        left_in = LEFT_IN + column * (LEFT_IN + width_in)
+        axes = place(figure, left_in, tops_in[row], width_in, height_in)
+        axes.tick_params(labelbottom=i + columns >= states)
+        axes.set_xlabel(TIME if i + columns >= states else "")
+        panels.append(axes)
+    whole_in = WIDTH_IN - LEFT_IN - RIGHT_IN
+    above = place(figure, LEFT_IN, above_in, whole_in, interval_in)
+    below = place(figure, LEFT_IN, below_in, whole_in, interval_in, sharex=above, sharey=above)
+    return figure, panels, above, below
 
 
 def _state(

@@ -1,4 +1,4 @@
-"""The campaign file: what is varied, what is drawn, what is measured and shown.
+"""The campaign file: axes of the grid, draws, metrics and figures.
 
 Settings are those of a scenario, as after ``--set``: a key with dots, in quotes, sets one value
 (``"trigger.beta" = 0.3``), a key without them a whole table (``trigger = { policy = … }``).
@@ -53,7 +53,7 @@ Values = Annotated[tuple[Value, ...], Field(min_length=1), BeforeValidator(_requ
 
 
 def label_of(value: JsonValue) -> str:
-    """How a value of an axis is written."""
+    """Return the text of a value of an axis."""
     if isinstance(value, bool):
         return str(value).lower()
     if not isinstance(value, float):
@@ -63,7 +63,7 @@ def label_of(value: JsonValue) -> str:
 
 
 def replaced(before: Iterable[str], after: Iterable[str]) -> tuple[str, str] | None:
-    """A key and the later one that replaces its value, or the table that it lies in."""
+    """Return a key and a later key that replaces its value or its table; None if there is none."""
     pairs = itertools.product(before, after)
     return next(((old, new) for old, new in pairs if f"{old}.".startswith(f"{new}.")), None)
 
@@ -72,22 +72,22 @@ def _require_kept(place: str, settings: Mapping[str, JsonValue]) -> None:
     keys = list(settings)
     for i in range(1, len(keys)):
         if (lost := replaced(keys[:i], keys[i : i + 1])) is not None:
-            raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which stands before it")
+            raise ValueError(f"{place}: {lost[1]} replaces {lost[0]}, which is given before it")
 
 
 class Axis(ScenarioSection):
-    """What is varied: a key of the scenario with its values, or variants of several keys each."""
+    """An axis of the grid: a key of the scenario with its values, or variants of several keys."""
 
     name: Identifier
-    """Names the column of the results: small letters, digits and _."""
+    """Name of the column of the results: small letters, digits and _."""
     title: str = ""
-    """What figures and tables call it; the name unless given."""
+    """Name in figures and tables; the name unless given."""
     key: str | None = None
-    """A key of the scenario, e.g. network.mansd; goes with values."""
+    """A key of the scenario, e.g. network.mansd; needs values."""
     values: Values | None = None
     """Its values."""
     variants: Annotated[dict[str, Settings], Field(min_length=1)] | None = None
-    """Instead of key and values: names, each with the settings that it stands for."""
+    """Instead of key and values: names, each with its settings."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -95,15 +95,15 @@ class Axis(ScenarioSection):
             raise ValueError("key: give key and values, or variants")
         if self.variants is None and (self.key is None or self.values is None):
             missing = "key" if self.key is None else "values"
-            raise ValueError(f"{missing}: missing; key and values go together")
+            raise ValueError(f"{missing}: missing; an axis needs both key and values")
         if self.name in (*(ROW.names or ()), *METRICS, "draw"):
-            raise ValueError(f"name: {self.name} is a column already; take another")
+            raise ValueError(f"name: {self.name} is a column already; use another name")
         for name, settings in (self.variants or {}).items():
             _require_kept(f"variants.{name}", settings)
         labels = self.labels
         twice = next((label for i, label in enumerate(labels) if label in labels[:i]), None)
         if twice is not None:
-            raise ValueError(f"values: {twice} is there twice")
+            raise ValueError(f"values: {twice} is given twice")
         return self
 
     @property
@@ -113,19 +113,19 @@ class Axis(ScenarioSection):
 
     @property
     def labels(self) -> list[str]:
-        """Of the values or variants, in order."""
+        """Texts of the values or variants, in order."""
         return list(self.variants) if self.variants else [label_of(v) for v in self.values or ()]
 
     @property
     def settings(self) -> list[Mapping[str, JsonValue]]:
-        """What each value or variant sets."""
+        """Settings of each value or variant."""
         if self.variants is not None:
             return list(self.variants.values())
         return [{self.key or "": value} for value in self.values or ()]
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """All keys that it sets."""
+        """All keys that the axis sets."""
         return tuple({key: None for settings in self.settings for key in settings})
 
     @property
@@ -138,7 +138,7 @@ class Axis(ScenarioSection):
 
 
 class Metrics(ScenarioSection):
-    """How runs are measured, and what of it tables show."""
+    """How runs are measured, and the columns of the tables."""
 
     shown: Annotated[tuple[Metric, ...], Field(min_length=1)] = (
         "transmissions",
@@ -156,16 +156,16 @@ class Metrics(ScenarioSection):
     settle: Annotated[FiniteFloat, Field(gt=0, lt=1)] = 0.02
     """A run has settled when ‖x‖ stays below this share of ‖x(0)‖."""
     most_events: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
-    """A run with more transmissions is given up."""
+    """A run with more transmissions is stopped."""
 
 
 class PairedComparison(ScenarioSection):
-    """Differences draw by draw: the same plant, start and losses at two values of an axis."""
+    """Differences draw by draw: the same plant, x(0) and losses at two values of an axis."""
 
     axis: Identifier
     """The axis."""
     reference: Value
-    """The value or variant that the others are compared with."""
+    """The value or variant to which the others are compared."""
 
 
 class _Figure(ScenarioSection):
@@ -174,12 +174,12 @@ class _Figure(ScenarioSection):
 
 
 class Pareto(_Figure):
-    """Means of two metrics against each other; of each series the points that none dominates."""
+    """Means of two metrics against each other, with the non-dominated points of each series."""
 
     kind: Literal["pareto"] = "pareto"
-    """Cost against transmissions, or whatever two are to be small."""
+    """One metric against another; both should be small."""
     series: Identifier
-    """The axis whose values have a front each."""
+    """The axis with one front per value."""
     x: Metric = "transmissions"
     """The horizontal axis."""
     y: Metric = "cost"
@@ -187,7 +187,7 @@ class Pareto(_Figure):
 
 
 class Curve(_Figure):
-    """The mean of a metric over the values of an axis; what else varies makes several curves."""
+    """The mean of a metric over an axis; one curve per combination of the other axes."""
 
     kind: Literal["curve"] = "curve"
     """A metric over an axis."""
@@ -198,7 +198,7 @@ class Curve(_Figure):
 
 
 class HeatMap(_Figure):
-    """The mean of a metric over two axes; what else varies makes several maps."""
+    """The mean of a metric over two axes; one map per combination of the other axes."""
 
     kind: Literal["heat_map"] = "heat_map"
     """A metric over two axes."""
@@ -211,7 +211,7 @@ class HeatMap(_Figure):
 
 
 class Distribution(_Figure):
-    """The share of runs in which a metric is at most so much; one curve for each grid point."""
+    """The cumulative distribution of a metric over the runs; one curve per grid point."""
 
     kind: Literal["distribution"] = "distribution"
     """A metric over all draws."""
@@ -223,7 +223,7 @@ Figure = Annotated[Pareto | Curve | HeatMap | Distribution, Field(discriminator=
 
 
 def spanned(figure: Pareto | Curve | HeatMap | Distribution) -> tuple[str, ...]:
-    """The axes that a figure has a place of its own for."""
+    """Return the axes that a figure shows as coordinates or series."""
     match figure:
         case Pareto():
             return (figure.series,)
@@ -239,29 +239,29 @@ class Campaign(ScenarioSection):
     """Many runs over a grid of settings."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-    """Names the campaign's folder: letters, digits, _ and -."""
+    """Name of the campaign's folder: letters, digits, _ and -."""
     description: str = ""
-    """What the campaign is to find out."""
+    """The question that the campaign answers."""
     scenario: Annotated[str, Field(min_length=1)]
-    """What all runs start from: a scenario file beside this one, or the name of a shipped one."""
+    """The scenario of all runs: a file beside this one, or the name of a shipped scenario."""
     settings: dict[str, JsonValue] = Field({})
-    """Settings of all runs, in place of the scenario's."""
+    """Settings of all runs, replacing the scenario's."""
     time: Literal["continuous", "sampled"] = "continuous"
-    """continuous: the trigger watches all the time and the network takes none, exactly, compiled.
-    sampled: the machines of a live run in virtual time, with the schedule's sampling, delays and
+    """continuous: continuous trigger, network without delay; exact and compiled. sampled: the
+    machines of a live run in virtual time, with the schedule's sampling, delays and
     acknowledgements; a thousand times slower."""
     draws: Annotated[int, Field(ge=1, le=100_000_000)]
-    """Runs at each grid point: plants from the box, initial states, losses."""
+    """Runs at each grid point, with different plants from the box, initial states and losses."""
     seed: Seed = 0
-    """Of the draws. Draw i has the same plant, start and losses at every grid point."""
+    """Seed of the draws. Draw i has the same plant, x(0) and losses at every grid point."""
     chunk: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
-    """Draws in a file of the results: what a worker does at a time, and what a kill may cost."""
+    """Draws per file of the results. A worker computes one file at a time."""
     axes: Annotated[tuple[Axis, ...], Field(min_length=1)]
-    """What is varied; the grid is all combinations."""
+    """The axes; the grid has all combinations of their values."""
     metrics: Metrics = Metrics()
     compare: PairedComparison | None = None
     figures: tuple[Figure, ...] = ()
-    """What the page shows."""
+    """The figures of the page."""
 
     @cached_property
     def by_name(self) -> Mapping[str, Axis]:
@@ -273,18 +273,19 @@ class Campaign(ScenarioSection):
         if len(self.by_name) < len(self.axes):
             names = [axis.name for axis in self.axes]
             twice = next(i for i, name in enumerate(names) if name in names[:i])
-            raise ValueError(f"axes.{twice}.name: there is such an axis already")
+            raise ValueError(f"axes.{twice}.name: another axis has this name")
         for i, axis in enumerate(self.axes):
             for other in self.axes[:i]:
                 if (lost := replaced(other.keys, axis.keys)) is not None:
                     raise ValueError(
                         f"axes.{i}.name: {lost[1]} would replace {lost[0]} of axis {other.name}; "
-                        "an axis that sets a whole table comes first, and no two set the same key"
+                        "an axis that sets a whole table comes first, "
+                        "and two axes cannot set the same key"
                     )
         _require_kept("settings", self.settings)
         size = math.prod(len(axis.labels) for axis in self.axes)
         if size > MOST_POINTS:
-            raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} may be")
+            raise ValueError(f"axes: the grid has {size} points; at most {MOST_POINTS} are allowed")
         if self.compare is not None:
             self._require_axis("compare.axis", self.compare.axis)
             self._require_value("compare.reference", self.compare.axis, self.compare.reference)
@@ -309,8 +310,8 @@ class Campaign(ScenarioSection):
             count = math.prod(len(axis.labels) for axis in rest)
         if count > MOST_SERIES:
             raise ValueError(
-                f"{place}: {count} series are too many to tell apart, {MOST_SERIES} at most; "
-                "choose values of other axes by where = { axis = value }"
+                f"{place}: {count} series are too many, at most {MOST_SERIES}; "
+                "select values of other axes with where = { axis = value }"
             )
 
     def _require_axis(self, place: str, name: str) -> None:
@@ -323,7 +324,7 @@ class Campaign(ScenarioSection):
             raise ValueError(f"{place}: no such value; {axis} has {', '.join(labels)}")
 
     def selected(self, where: Mapping[str, Value]) -> Iterator[tuple[int, ...]]:
-        """Places in the grid, one number for each axis, that have these values."""
+        """Places in the grid, one number per axis, with these values."""
         ranges = [
             [i for i, label in enumerate(axis.labels) if axis.name not in where
              or label == label_of(where[axis.name])]

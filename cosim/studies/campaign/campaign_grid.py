@@ -1,4 +1,4 @@
-"""From a campaign file to the points of its grid, each a scenario and what its runs share."""
+"""The grid points of a campaign file: each has a scenario and the work for its draws."""
 
 import copy
 import pickle
@@ -40,40 +40,40 @@ class Point:
     labels: Mapping[str, str]
     """By axis."""
     values: Mapping[str, Value]
-    """By axis: numbers where all values of it are numbers, otherwise labels."""
+    """By axis: numbers if all values of the axis are numbers, otherwise labels."""
     scenario: Scenario
-    """Its plant and initial state not yet drawn."""
+    """The scenario; its plant and initial state are not yet drawn."""
     certified_error: float | None
     """Δβ, or None."""
     work: Work
-    """Runs its draws."""
+    """Computes its draws."""
 
 
 @dataclass(frozen=True)
 class ContinuousWork:
-    """What a worker needs to know of a point in continuous time; the same for all its chunks."""
+    """Computes draws of a grid point in continuous time."""
 
     setting: Setting
     box: Box
     seed: int
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Run some successive draws; one row each."""
+        """Compute successive draws; one row each."""
         return run_batch(self.setting, self.box.population(self.seed, draws))
 
 
 def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
-    """Path and content of the scenario that all runs start from, the common settings made.
+    """Return path and content of the scenario of all runs, with the common settings.
 
     Raises:
-        CallerError: it cannot be read, or a setting does not fit.
+        CallerError: the scenario cannot be read, or a setting does not fit.
     """
     source = f'{path}: scenario = "{campaign.scenario}"'
     scenario = path.parent / campaign.scenario
     if not scenario.is_file():
         if scenario.suffix == ".toml" or scenario.exists():
             raise CallerError(
-                f"{source}: no such file; it lies beside the campaign's, or is shipped"
+                f"{source}: no such file beside the campaign file, and no shipped scenario"
             )
         try:
             scenario = find_shipped(campaign.scenario, SCENARIOS)
@@ -86,11 +86,11 @@ def base_of(campaign: Campaign, path: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def grid(campaign: Campaign, path: Path) -> list[Point]:
-    """All points of a campaign's grid, in order: the last axis varies fastest.
+    """Return all grid points, in order: the last axis varies fastest.
 
     Args:
         campaign: the campaign.
-        path: of its file; the scenario lies beside it, and mistakes name it.
+        path: of its file.
 
     Raises:
         CallerError: one line per mistake.
@@ -116,7 +116,11 @@ def grid(campaign: Campaign, path: Path) -> list[Point]:
 
 
 def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) -> None:
-    """Refuse an axis two of whose values are the same runs: what it sets plays no part in them."""
+    """Refuse an axis with two values that give the same runs.
+
+    Raises:
+        CallerError: an axis has no effect on the runs.
+    """
     runs = {point.place: blake2b(pickle.dumps(point.work)).digest() for point in points}
     for i, axis in enumerate(campaign.axes):
         found: dict[bytes, str] = {}
@@ -125,7 +129,7 @@ def _require_effects(campaign: Campaign, points: Sequence[Point], path: Path) ->
             if (other := found.setdefault(same, label)) != label:
                 raise CallerError(
                     f"{path}: axes.{i}: {axis.name} = {other} and {axis.name} = {label} are the "
-                    f"same runs: what {', '.join(axis.keys)} says there makes no difference to them"
+                    f"same runs: {', '.join(axis.keys)} has no effect on them"
                 )
 
 
@@ -153,15 +157,15 @@ def _point(
 def _work(
     campaign: Campaign, scenario: Scenario, resolved: Scenario, Q: Matrix | None, R: Matrix | None
 ) -> tuple[Work, float | None]:
-    """Who runs the draws, and the bound Δβ that no run may exceed, or None."""
+    """Return the work, and the certified bound Δβ or None."""
     settle, most_events = campaign.metrics.settle, campaign.metrics.most_events
     if campaign.time == "sampled":
         alone = in_virtual_time(scenario)
         return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
-    if resolved.is_acknowledged:
+    if resolved.protocol.acknowledges:
         raise CallerError(
-            'network.protocol: continuous time is for the loop without acknowledgements, "none"; '
-            'with time = "sampled" a campaign runs both'
+            'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
+            'time = "sampled" takes both'
         )
     _require_timeless(resolved)
     setting = replace(setting_of(resolved), Q=Q, R=R, settle=settle, most_events=most_events)
@@ -174,9 +178,9 @@ def _require_timeless(scenario: Scenario) -> None:
     taking_time = [one.kind for one in network.link.impairments if one not in kept]
     if taking_time:
         raise CallerError(
-            f"network.impairments: {', '.join(taking_time)}: in continuous time the network takes "
-            'no time; leave it out, e.g. settings = { "network.impairments" = [] }, '
-            'or let time = "sampled"'
+            f"network.impairments: {', '.join(taking_time)}: in continuous time the "
+            'network has no delay; leave it out, e.g. settings = { "network.impairments" = [] }, '
+            'or use time = "sampled"'
         )
 
 

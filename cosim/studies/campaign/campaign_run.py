@@ -1,4 +1,4 @@
-"""Runs a campaign: what is missing in its folder is made; what is there stays."""
+"""Runs a campaign: computes the runs that are missing in its folder."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -10,27 +10,27 @@ from cosim.studies.campaign.chunk_store import Store
 from noack.core.errors import ExitStatus, MachineError, NoackError
 
 Progress = Callable[[int, int], None]
-"""Told how many runs are there, and of how many."""
+"""Called with the number of finished runs and of all runs."""
 
 
 class InterruptedCampaignError(NoackError):
-    """A person wanted it to end; what is written stays."""
+    """A user interrupted the campaign; written runs are kept."""
 
     exit_status = ExitStatus.INTERRUPTED
 
 
 class TerminatedCampaignError(NoackError):
-    """The system, or who runs it, wanted it to end; what is written stays."""
+    """A signal ended the campaign; written runs are kept."""
 
     exit_status = ExitStatus.TERMINATED
 
 
 @contextmanager
 def terminations_raised() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the work in good order, unless they are ignored.
+    """Raise an exception on SIGTERM and SIGHUP, unless they are ignored.
 
     Raises:
-        TerminatedCampaignError: one of them came.
+        TerminatedCampaignError: one of them was received.
     """
 
     def terminated(number: int, _: FrameType | None) -> None:
@@ -48,16 +48,16 @@ def terminations_raised() -> Iterator[None]:
 
 
 def run_campaign(store: Store, runner: Runner, progress: Progress | None = None) -> int:
-    """Run what is missing; return how many runs that were.
+    """Compute the missing runs; return their number.
 
     Args:
         store: the campaign's folder.
-        runner: who runs the chunks.
-        progress: is told how far the work is.
+        runner: computes the chunks.
+        progress: called after each chunk.
 
     Raises:
         InterruptedCampaignError: by Ctrl-C.
-        TerminatedCampaignError: by a signal, where :func:`terminations_raised`.
+        TerminatedCampaignError: by a signal, within :func:`terminations_raised`.
         LostWorkersError: workers have died.
         MachineError: the results cannot be written.
     """
@@ -67,10 +67,10 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
     tell = progress or (lambda done, total: None)
     tell(done, total)
 
-    def told(what: str) -> str:
+    def message(what: str) -> str:
         return (
-            f"{what}; {done:,} of {total:,} runs are in {store.folder}, "
-            "the same command goes on from there"
+            f"{what}; {done:,} of {total:,} runs are in {store.folder}; "
+            "the same command continues the campaign"
         )
 
     try:
@@ -79,11 +79,13 @@ def run_campaign(store: Store, runner: Runner, progress: Progress | None = None)
                 store.write(chunk, rows)
             except OSError as error:
                 reason = error.strerror or str(error)
-                raise MachineError(told(f"{store.folder}: cannot be written: {reason}")) from None
+                raise MachineError(
+                    message(f"{store.folder}: cannot be written: {reason}")
+                ) from None
             done += len(chunk.draws)
             tell(done, total)
     except KeyboardInterrupt:
-        raise InterruptedCampaignError(told("interrupted")) from None
+        raise InterruptedCampaignError(message("interrupted")) from None
     except (LostWorkersError, OtherArithmeticError, TerminatedCampaignError) as error:
-        raise type(error)(told(str(error))) from None
+        raise type(error)(message(str(error))) from None
     return total - before

@@ -1,4 +1,4 @@
-"""What a campaign found: every metric at every grid point, and differences draw by draw."""
+"""The results of a campaign: every metric at every grid point, and paired differences."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -32,14 +32,14 @@ class GridPointResult(NamedTuple):
 
     point: Point
     ended: Mapping[str, int]
-    """How many ended how."""
+    """Number of runs by how they ended."""
     estimates: Mapping[Metric, Estimate]
     breaches: int
-    """Runs whose ‖e_c‖ exceeds what is certified: a mistake in the theory or in the code."""
+    """Runs in which ‖e_c‖ exceeds its certified bound: an error in the theory or in the code."""
 
 
 class ComparedResult(NamedTuple):
-    """Runs at a grid point, less those of the same draws at another."""
+    """Differences between two grid points, draw by draw."""
 
     point: Point
     reference: Point
@@ -47,7 +47,7 @@ class ComparedResult(NamedTuple):
 
 
 class CampaignSummary(NamedTuple):
-    """What a campaign found."""
+    """The results of a campaign."""
 
     campaign: Campaign
     draws: int
@@ -90,13 +90,13 @@ class CampaignSummary(NamedTuple):
 
 
 def summarise(campaign: Campaign, store: Store) -> CampaignSummary:
-    """Read all runs of a campaign, one or two grid points at a time."""
+    """Estimate all metrics; reads the runs of one or two grid points at a time."""
     found = [_found(point, store) for point in store.points]
     return CampaignSummary(campaign, store.draws, found, list(_compared(campaign, store)))
 
 
 def runs_at(point: Point, store: Store) -> tuple[dict[Metric, Vector], Vector]:
-    """All metrics of the runs at a grid point, and how each run ended."""
+    """Return all metrics of the runs at a grid point, and the status of each run."""
     columns = store.columns(point.number, ROW.names or ())
     return measured(columns, point.certified_error), columns["status"]
 

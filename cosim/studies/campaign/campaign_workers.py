@@ -1,6 +1,6 @@
-"""Who runs the chunks of a campaign: processes of this machine, or a Dask cluster.
+"""Computes the chunks of a campaign: in processes of this machine or on a Dask cluster.
 
-Either way chunks are independent, and their results come back here to be written by one process.
+Chunks are independent. This process receives and writes all results.
 """
 
 import logging
@@ -48,7 +48,7 @@ Runner = Callable[[Sequence[Work], Iterable[Chunk]], Iterator[Finished]]
 """Computes chunks, given the work of each grid point; yields results in any order."""
 
 _AHEAD = 2
-"""Chunks under way for each worker: one that runs, one that waits."""
+"""Chunks in flight per worker: one that runs and one that waits."""
 _LOOK_EVERY_S = 1.0
 _PATIENCE_S = 30.0
 _CONNECT_S = 10.0
@@ -56,11 +56,11 @@ _CONNECT_TRIES = 3
 
 
 class OtherArithmeticError(PeerError):
-    """A worker's results would not be the same, bit for bit."""
+    """A worker's results would differ."""
 
 
 class LostWorkersError(PeerError):
-    """Workers have died, or cannot be reached any more."""
+    """Workers have died or cannot be reached."""
 
 
 def alone(works: Sequence[Work], chunks: Iterable[Chunk]) -> Iterator[Finished]:
@@ -76,7 +76,7 @@ def run_draws(work: Work, draws: range) -> NDArray[Any]:
 
 @contextmanager
 def local(workers: int) -> Iterator[Runner]:
-    """Run chunks in so many processes of this machine."""
+    """Compute chunks in processes of this machine."""
     if workers == 1:
         yield alone
         return
@@ -86,15 +86,13 @@ def local(workers: int) -> Iterator[Runner]:
             try:
                 yield from _windowed(pool, works, chunks, lambda: _AHEAD * workers)
             except BrokenProcessPool:
-                raise LostWorkersError(
-                    "a worker process was killed (was there not enough memory?)"
-                ) from None
+                raise LostWorkersError("a worker process was killed (out of memory?)") from None
 
         yield run
 
 
 def _require_address(address: str) -> None:
-    """Dask's client begins to work before it looks at an address, and is long in ending."""
+    """Check an address first: Dask's client takes long to report a wrong one."""
     try:
         parts = urlsplit(address if "://" in address else f"tcp://{address}")
         known = parts.scheme in ("tcp", "tls") and parts.hostname and parts.port
@@ -105,7 +103,7 @@ def _require_address(address: str) -> None:
 
 
 def _client(connect: Any, address: str) -> Any:
-    """Connect; Dask gives its thread ten seconds to begin, which a busy machine may not keep."""
+    """Connect; on a busy machine Dask's thread may not start within its ten seconds."""
     for _ in range(_CONNECT_TRIES - 1):
         with suppress(AssertionError):
             return connect(address, timeout=_CONNECT_S, set_as_default=False)
@@ -113,33 +111,33 @@ def _client(connect: Any, address: str) -> Any:
         return connect(address, timeout=_CONNECT_S, set_as_default=False)
     except AssertionError:
         raise PeerError(
-            f"--scheduler {address}: the machine is too busy for Dask's client to begin"
+            f"--scheduler {address}: Dask's client does not start; the machine is too busy"
         ) from None
 
 
 def run_alike(work: Work, draws: range, wanted: Mapping[str, str]) -> NDArray[Any]:
-    """Run some draws on another machine.
+    """Compute successive draws on another machine.
 
     Raises:
-        OtherArithmeticError: its results would be others than those of who asks.
+        OtherArithmeticError: its results would differ from those of the caller.
     """
     if (other := difference(arithmetic(), wanted)) is not None:
         raise OtherArithmeticError(
-            f"a worker on {socket.gethostname()} would give other results: {other}"
+            f"a worker on {socket.gethostname()} would compute other results: {other}"
         )
     return work.run(draws)
 
 
 @contextmanager
 def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Iterator[Runner]:
-    """Run chunks on the Dask cluster of a scheduler; the workers need this noack, too.
+    """Compute chunks on the Dask cluster of a scheduler; its workers need the same noack.
 
     Args:
         address: of the scheduler.
-        say: is told, in a line, what the cluster is waited for.
+        say: called with a line when the campaign waits for the cluster.
 
     Raises:
-        CallerError: Dask is not installed, or the address is none.
+        CallerError: Dask is not installed, or the address is not valid.
         PeerError: the scheduler does not answer.
     """
     try:
@@ -150,7 +148,7 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
         ) from None
     _require_address(address)
     for name in list(logging.root.manager.loggerDict):
-        if name.startswith("distributed"):  # what is to be said of its troubles is said below
+        if name.startswith("distributed"):  # its errors are reported below
             logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = _client(distributed.Client, address)
@@ -168,13 +166,13 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
             if isinstance(error, RuntimeError) and "deserializ" not in str(error):
                 raise
             raise PeerError(
-                f"{address}: scheduler and workers need this noack and its libraries, too"
+                f"{address}: scheduler and workers need the same noack and its libraries"
             ) from None
         except CancelledError:
-            raise LostWorkersError(f"{address}: the scheduler is gone") from None
+            raise LostWorkersError(f"{address}: the scheduler has ended") from None
         except distributed.scheduler.KilledWorker:
             raise LostWorkersError(
-                f"{address}: several workers died over the same chunk (is there not enough memory?)"
+                f"{address}: several workers died with the same chunk (out of memory?)"
             ) from None
 
     with client:
@@ -182,12 +180,12 @@ def cluster(address: str, say: Callable[[str], None] = lambda line: None) -> Ite
 
 
 class _Watch:
-    """How many chunks may be under way on a cluster, which grows and shrinks.
+    """How many chunks may be in flight on a cluster with a varying number of workers.
 
     Args:
         client: of the cluster.
         address: of its scheduler.
-        say: is told what is waited for.
+        say: called with a line when there is no worker.
     """
 
     def __init__(self, client: Any, address: str, say: Callable[[str], None]) -> None:
@@ -196,17 +194,17 @@ class _Watch:
         self._cores, self._looked_s, self._seen_s = 0, -math.inf, time.monotonic()
 
     def __call__(self) -> int:
-        """Look, though not too often.
+        """Return the number of chunks; asks the cluster at most once per second.
 
         Raises:
-            LostWorkersError: the scheduler is gone, or there has been no worker for long.
+            LostWorkersError: the scheduler has ended, or there has been no worker for 30 s.
         """
         now_s = time.monotonic()
         if now_s - self._looked_s > _LOOK_EVERY_S:
             try:
                 self._cores = sum(self._client.ncores().values())
             except (OSError, TimeoutError):
-                raise LostWorkersError(f"{self._address}: the scheduler is gone") from None
+                raise LostWorkersError(f"{self._address}: the scheduler has ended") from None
             self._looked_s = now_s
             if self._cores:
                 self._seen_s, self._told = now_s, False
@@ -216,7 +214,7 @@ class _Watch:
             elif now_s - self._seen_s > _PATIENCE_S:
                 raise LostWorkersError(
                     f"{self._address}: the cluster has had no worker for {_PATIENCE_S:g} s "
-                    "(those with an older noack end at once)"
+                    "(workers with an older noack end at once)"
                 )
         return max(_AHEAD * self._cores, 1)
 
@@ -228,7 +226,7 @@ def _windowed(
     most: Callable[[], int],
     wanted: Mapping[str, str] | None = None,
 ) -> Iterator[Finished]:
-    """Keep so many chunks under way, so that memory does not grow with the campaign."""
+    """Keep a limited number of chunks in flight, so that memory use stays bounded."""
     rest = iter(chunks)
     in_flight: dict[Future[NDArray[Any]], Chunk] = {}
     while True:

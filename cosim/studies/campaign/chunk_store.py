@@ -1,7 +1,7 @@
-"""A campaign's folder: the runs in chunks of Parquet, each written whole or not at all.
+"""A campaign's folder: the runs in Parquet files, each written in full or not at all.
 
-``FOLDER/runs/point-00003/draws-000004000.parquet`` holds runs 4,000 … of grid point 3, a row each,
-with the values of the axes beside what was measured. A chunk that is there is never made again.
+``FOLDER/runs/point-00003/draws-000004000.parquet`` holds runs 4,000 … of grid point 3, one row
+each: the values of the axes and the metrics. A chunk that exists is not computed again.
 """
 
 import contextlib
@@ -71,12 +71,12 @@ class Store:
             yield Chunk(point, start, min(start + self._size, self.draws))
 
     def missing(self) -> Iterator[Chunk]:
-        """The chunks that are not there: of all points the first draws first."""
+        """Chunks without a file: the first draws of all points first."""
         for chunks in zip(*(self.chunks(point.number) for point in self.points), strict=True):
             yield from (chunk for chunk in chunks if not self._is_there(chunk))
 
     def write(self, chunk: Chunk, rows: NDArray[np.void]) -> None:
-        """Write a chunk; whoever looks sees all of it or nothing.
+        """Write a chunk in full or not at all.
 
         Raises:
             OSError: it cannot be written.
@@ -116,14 +116,14 @@ class Store:
             except (OSError, pa.ArrowException):
                 raise MachineError(
                     f"{path}: cannot be read, or is damaged; remove it, and the same command "
-                    "makes it again"
+                    "computes it again"
                 ) from None
             for name in names:
                 parts[name].append(table[name].to_numpy()[: len(chunk.draws)])
         return {name: np.concatenate(part) for name, part in parts.items()}
 
     def _is_there(self, chunk: Chunk) -> bool:
-        """Whether its file is sound; that of a campaign with more draws may hold more."""
+        """Whether its file is valid; it may hold more draws, of a campaign with more draws."""
         try:
             found = pq.read_metadata(self._path(chunk))
         except (OSError, pa.ArrowException):
@@ -139,27 +139,26 @@ class Store:
 
 @contextmanager
 def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterator[None]:
-    """Have a campaign's folder to oneself: a new one, or one of the same campaign.
+    """Lock a campaign's folder: a new one, or one of the same campaign.
 
-    What may differ is how many draws there are, and what is shown; also what the arithmetic
-    depends on, if nothing is to be made any more.
+    The number of draws and the figures may differ; also code and libraries, if no run is missing.
 
     Args:
         campaign: the campaign.
-        base: content of the scenario that all runs start from.
+        base: content of the scenario of all runs.
         store: its folder.
 
     Raises:
-        CallerError: it holds another campaign, or one made by another arithmetic, or someone else
-            is at work in it.
-        MachineError: it cannot be made.
+        CallerError: it holds another campaign, or runs of other code or libraries, or another
+            noack uses it.
+        MachineError: it cannot be created.
     """
     folder = store.folder
     manifest = {
         "format": _FORMAT,
         "campaign": _identity(campaign),
         "scenario": base,
-        # What the scenario's files say, and its defaults, is not in what stands above.
+        # Files that the scenario names, and defaults, are not in the entries above.
         "scenario_resolved": blake2b(
             "".join(point.scenario.model_dump_json() for point in store.points).encode(),
             digest_size=16,
@@ -171,7 +170,7 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if not stack.enter_context(locked(folder / _LOCK)):
-                raise CallerError(f"{folder}: another noack is at work in it")
+                raise CallerError(f"{folder}: another noack uses this folder")
             made_by = _claim(folder, manifest)
             for scratch in (folder / RUNS).glob(f"*/.*{_PARTIAL}"):
                 scratch.unlink(missing_ok=True)
@@ -181,14 +180,14 @@ def opened(campaign: Campaign, base: Mapping[str, Any], store: Store) -> Iterato
         other = difference(made_by, arithmetic())
         if other is not None and next(store.missing(), None) is not None:
             raise CallerError(
-                f"{folder}: cannot be gone on with, results would not be of one piece "
-                f"({other}); give another --out, or remove it"
+                f"{folder}: cannot be continued, new results would differ from the existing ones "
+                f"({other}); give another --out, or remove the folder"
             )
         yield
 
 
 def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
-    """Make the folder this campaign's; return the arithmetic that its runs are made by."""
+    """Write or check the folder's manifest; return the code and libraries of its runs."""
     path = folder / MANIFEST
     try:
         there = json.loads(path.read_text(encoding="utf-8"))
@@ -204,18 +203,18 @@ def _claim(folder: Path, manifest: Mapping[str, Any]) -> Mapping[str, str]:
     except ValueError:
         there = None
     if not isinstance(there, dict) or not isinstance(there.get("arithmetic"), dict):
-        raise CallerError(f"{path}: not a campaign's; give another --out")
+        raise CallerError(f"{path}: not a manifest of a campaign; give another --out")
     made_by: dict[str, str] = there.pop("arithmetic")
     found = _difference(there, {k: v for k, v in manifest.items() if k != "arithmetic"})
     if found is not None:
         raise CallerError(
-            f"{folder}: holds another campaign ({found}); give another --out, or remove it"
+            f"{folder}: holds another campaign ({found}); give another --out, or remove the folder"
         )
     return made_by
 
 
 def _identity(campaign: Campaign) -> dict[str, Any]:
-    """What results depend on."""
+    """The settings on which results depend."""
     content = campaign.model_dump(
         mode="json", exclude={"draws", "description", "figures", "compare"}
     )
@@ -226,7 +225,7 @@ def _identity(campaign: Campaign) -> dict[str, Any]:
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str | None:
-    """The first key whose values differ."""
+    """Return the first difference, in words; None if there is none."""
     if isinstance(there, dict) and isinstance(here, dict):
         for name in sorted(there.keys() | here.keys()):
             place = f"{key}.{name}" if key else name

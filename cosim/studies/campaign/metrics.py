@@ -1,4 +1,4 @@
-"""What is measured of each run of a campaign, and what a certificate says of it beforehand."""
+"""The metrics of the runs of a campaign, and the certified bound of ‖e_c‖."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
@@ -28,23 +28,23 @@ Metric = Literal[
 
 
 class Description(NamedTuple):
-    """How a metric is called."""
+    """Names of a metric."""
 
     title: str
     unit: str = ""
     meaning: str = ""
-    """What the title leaves open."""
+    """Formula, where the title needs one."""
     logarithmic: bool = False
-    """Whether its axis in a figure may be."""
+    """Whether the axis of a figure may be logarithmic."""
 
     @property
     def heading(self) -> str:
-        """Of a column."""
+        """Heading of a column."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
     @property
     def label(self) -> str:
-        """Of an axis."""
+        """Label of an axis."""
         return f"{self.title} {self.meaning}".strip() + (f" [{self.unit}]" if self.unit else "")
 
 
@@ -63,11 +63,13 @@ METRICS: Mapping[Metric, Description] = {
 
 
 def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> dict[Metric, Vector]:
-    """All metrics of some runs; infinite is what does not happen, and all of a run that fails.
+    """Return all metrics of k runs.
+
+    A time is infinite if its event does not happen; all metrics of a failed run are infinite.
 
     Args:
-        columns: what the batch engine says of k runs, (k,) each.
-        certified: Δβ; without it there is no ``certificate_used``.
+        columns: of the batch engine, (k,) each.
+        certified: Δβ; without it ``certificate_used`` is left out.
     """
     found: dict[Metric, Vector] = {}
     failed = columns["status"] != OK
@@ -85,10 +87,9 @@ def measured(columns: Mapping[str, NDArray[Any]], certified: float | None) -> di
 def certified_error(resolved: Scenario) -> float | None:
     """Δβ with ‖e_c‖_W ≤ Δβe^{−αt} for every plant and every x(0); None if there is none.
 
-    Δ sums the gains of the present error and of M − 1 missed ones, however close, by identity (I1):
-    it depends on the models alone. It needs models that decay faster than the threshold (which a
-    hold does not), a threshold without a floor within the horizon, and a network that keeps to
-    the cap.
+    By identity (I1), Δ is the sum of the gains of the present error and of M − 1 missed ones, at
+    any distance in time; it depends on the models alone. It needs models that decay faster than the
+    threshold (a hold does not), a threshold without a floor, and a network that enforces the cap.
     """
     network = resolved.network
     if not resolved.coverage.is_decaying or not network.enforce_mansd:

@@ -1,8 +1,7 @@
-"""What is drawn: plants from the box, initial states, losses, disturbances and noise.
+"""The draws of a campaign: plants from the box, initial states, losses, disturbances and noise.
 
-Each is from a stream of its own.
-
-Draw i depends on the campaign's seed and i alone: not on the grid point, the chunk or the worker.
+Each quantity has a random stream of its own. Draw i depends on the campaign's seed and on i only,
+not on the grid point, the chunk or the worker.
 """
 
 from functools import partial
@@ -21,7 +20,7 @@ _STREAM = "campaign"
 
 
 class Box(NamedTuple):
-    """Where plants and initial states are drawn from."""
+    """The box of plants and initial states."""
 
     A: Matrix
     """Centre, (n, n)."""
@@ -36,25 +35,25 @@ class Box(NamedTuple):
     half_x0: Vector
     """Half-widths, (n,)."""
     vertex: bool
-    """Plants are drawn from the box's corners only."""
+    """Whether plants are drawn from the corners of the box only."""
 
     def population(self, seed: int, draws: range) -> Population:
-        """Some successive draws."""
+        """Successive draws."""
         signs = partial(np.copysign, 1.0) if self.vertex else np.asarray
         A, B = (
             centre + half * signs(_units(seed, name, draws, centre.size)).reshape(-1, *centre.shape)
             for name, centre, half in (("A", self.A, self.half_A), ("B", self.B, self.half_B))
         )
         x0 = self.x0 + self.half_x0 * _units(seed, "initial_state", draws, self.x0.size)
-        # 63 bits: what TOML calls an integer.
+        # 63 bits: the range of a TOML integer.
         loss_seeds = words(seed, _STREAM, "loss", rows=draws, width=1)[:, 0] >> np.uint64(1)
         return Population(A, B, x0, loss_seeds)
 
 
 def box_of(scenario: Scenario) -> Box:
-    """The box of a scenario; of a plant that is given or nominal, without extent.
+    """The box of a scenario; a plant that is given or nominal has a box of width 0.
 
-    Of one that is not linear, it is around the model.
+    The box of a nonlinear plant is around the model.
     """
     loop = loop_of(
         resolve(

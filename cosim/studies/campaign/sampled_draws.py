@@ -1,12 +1,12 @@
 """Runs of a campaign by the machines of a live run, in virtual time.
 
-With the schedule's sampling, delays and acknowledgements, which continuous time has no place for.
+They have the schedule's sampling, delays and acknowledgements.
 
-The plant holds its input from step to step, so the cost is exact: over a step of h, with
-z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978). What
-disturbs it is held likewise, and belongs to z, weighing nothing. Of plants that are not linear it
-is by the trapezoidal rule over the plant's steps. The rest is of the samples: x at the plant's
-steps, e_c at the measurements.
+The plant holds its input from step to step, so the cost is exact: over a step of length h, with
+z = (x, u) and ż = G z, it is zᵀMz with M = ∫₀ʰ e^{Gᵀs} diag(Q, R) e^{Gs} ds (Van Loan 1978).
+Disturbances are held in the same way and are part of z, with weight 0. The cost of a nonlinear
+plant is computed by the trapezoidal rule over the plant's steps. All other metrics are computed
+from the samples: x at the plant's steps, e_c at the measurements.
 """
 
 from dataclasses import dataclass
@@ -35,15 +35,15 @@ from noack.protocol.record_tables import (
 
 @dataclass(frozen=True)
 class SampledWork:
-    """What a worker needs to know of a point; the same for all its chunks.
+    """Computes draws of a grid point in virtual time.
 
     Args:
-        scenario: its plant and initial state not yet drawn; see :func:`in_virtual_time`.
+        scenario: its plant and initial state are not yet drawn; see :func:`in_virtual_time`.
         seed: of the draws.
         Q: weight of the state in the cost, (n, n); None: the identity.
         R: weight of the input, (m, m); None: the identity.
-        settle: settled is when ‖x‖ stays at or below this share of ‖x(0)‖.
-        most_events: a run with more is given up.
+        settle: a run has settled when ‖x‖ stays at or below this share of ‖x(0)‖.
+        most_events: a run with more events is stopped.
     """
 
     scenario: Scenario
@@ -55,15 +55,15 @@ class SampledWork:
 
     @property
     def box(self) -> Box:
-        """Where plants and initial states are drawn from."""
+        """The box of plants and initial states."""
         return box_of(self.scenario)
 
     def run(self, draws: range) -> NDArray[np.void]:
-        """Run some successive draws; one row of ``batch_interface.ROW`` each."""
+        """Compute successive draws; one row of ``batch_interface.ROW`` each."""
         rows = np.zeros(len(draws), ROW)
         for row, draw in zip(rows, draws, strict=True):
             record = simulate(drawn_scenario(self.scenario, self.seed, draw))
-            with np.errstate(all="ignore"):  # a run that diverges is told by its status
+            with np.errstate(all="ignore"):  # the status reports a run that diverges
                 self._measure(record, row)
         return rows
 
@@ -129,7 +129,7 @@ class SampledWork:
 
 
 def in_virtual_time(scenario: Scenario) -> Scenario:
-    """The scenario without what plays no part in its simulation."""
+    """The scenario without the settings that do not affect its simulation."""
     return scenario.model_copy(
         update={
             "name": "campaign",

@@ -1,4 +1,4 @@
-"""What the bits of results depend on besides the campaign: noack's code, libraries, arithmetic."""
+"""Code, libraries and arithmetic, on which the bits of results depend besides the campaign."""
 
 import platform
 from collections.abc import Mapping
@@ -21,10 +21,10 @@ _NO_CODE_OF_RUNS = ("cli", "output", "studies")
 
 @cache
 def arithmetic() -> Mapping[str, str]:
-    """Names and contents: where all are the same, so are the bits of the results.
+    """Names and values; if all are equal, so are the bits of the results.
 
-    ``rounding`` is a digest of what this processor's libraries make of a few fixed matrices: they
-    choose their instructions by what they find it to be capable of.
+    ``rounding`` is a digest of computations on fixed matrices: libraries choose their instructions
+    by the processor.
     """
     return {
         **{name: metadata.version(name) for name in _PACKAGES},
@@ -36,7 +36,7 @@ def arithmetic() -> Mapping[str, str]:
 
 
 def difference(there: Mapping[str, str], here: Mapping[str, str]) -> str | None:
-    """The first thing that is another there, in words; None if nothing is."""
+    """Return the first difference, in words; None if there is none."""
     for name in here:
         if there.get(name) != here[name]:
             return f"{name} is {there.get(name, 'unknown')} there, {here[name]} here"

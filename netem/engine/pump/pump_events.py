@@ -45,7 +45,7 @@ def tell_arrival(
     pump, size_bytes = memory.pump[0], decision.size_bytes
     event = memory.events[pump.events]
     _fill(memory, event, way, client, pump.now_ns, decision.packet, decision.fate, size_bytes)
-    event.run = decision.consecutive_losses
+    event.consecutive_losses = decision.consecutive_losses
     event.delay_ns = -1
     event.copy_delay_ns = -1
     if decision.release_ns != NEVER_NS:
@@ -79,7 +79,7 @@ def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
         memory, event, leaving.direction, leaving.client, now_ns, leaving.packet, leaving.fate,
         leaving.size_bytes,
     )  # fmt: skip
-    event.run = 0
+    event.consecutive_losses = 0
     event.delay_ns = now_ns - leaving.arrival_ns
     event.copy_delay_ns = -1
     event.hold_back_ns = 0

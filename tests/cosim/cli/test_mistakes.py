@@ -39,7 +39,9 @@ MISTAKES = {
 NOT_FOUND = {
     "lane_folowing": "did you mean lane_following? There are cart_pole, ",
     "nothing": "nor a shipped scenario; there are cart_pole, ",
-    "mb_vs_zoh": "mb_vs_zoh: that is a shipped campaign, no scenario",
+    "quadrotor_hove.toml": "nor a shipped scenario; did you mean quadrotor_hover? There are ",
+    "q" * 3000: f"{'q' * 77}...: no such file",
+    "mb_vs_zoh": "mb_vs_zoh: a shipped campaign, not a scenario",
 }
 
 
@@ -48,21 +50,14 @@ def noack(line: str) -> Result:
 
 
 @pytest.mark.parametrize(("line", "said"), MISTAKES.items())
-def test_a_mistake_is_one_line_with_a_remedy(line: str, said: str) -> None:
+def test_a_mistake_is_one_line_and_with_json_a_document(line: str, said: str) -> None:
     done = noack(line)
-    assert done.exit_code == 2
-    assert done.stderr == said + "\n"
-    assert done.stdout == ""
-
-
-@pytest.mark.parametrize(("line", "said"), MISTAKES.items())
-def test_a_mistake_is_a_document_for_programs(line: str, said: str) -> None:
+    assert (done.exit_code, done.stdout, done.stderr) == (2, "", f"{said}\n")
     done = noack(f"{line} --json" if line != "demo --set" else "demo --json --set")
     document = json.loads(done.stdout)
-    who, _, message = said.partition(": ")
-    assert document["error"] == message
-    assert document["exit"] == {"status": 2, "reason": message}
-    assert done.stderr == f"{who}: {message}\n"
+    _, _, message = said.partition(": ")
+    assert document == {"error": message, "exit": {"status": 2, "reason": message}}
+    assert done.stderr == f"{said}\n"
 
 
 @pytest.mark.parametrize(("name", "said"), NOT_FOUND.items())
@@ -75,6 +70,13 @@ def test_a_scenario_that_is_not_there_suggests_the_nearest(
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert json.loads(done.stdout)["error"] in done.stderr
+
+
+def test_a_long_key_is_shortened() -> None:
+    done = noack(f"check lane_following --set trigger.{'k' * 3000}=1")
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"noack: --set trigger.{'k' * 69}... = 1: unknown key; ")
+    assert len(done.stderr) < 400
 
 
 def test_without_a_command_the_help_is_shown() -> None:

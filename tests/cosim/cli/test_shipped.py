@@ -63,7 +63,5 @@ def test_a_printed_scenario_is_the_shipped_one_wherever_it_is_put(
 def test_a_name_that_is_not_shipped_is_one_line(words: list[str]) -> None:
     done = scenarios(*words)
     assert done.exit_code == 2
-    assert "lane_folowing: nothing of that name is shipped; did you mean lane_following?" in (
-        done.stderr
-    )
+    assert "lane_folowing: not a shipped file; did you mean lane_following?" in (done.stderr)
     assert done.stderr.count("\n") == 1

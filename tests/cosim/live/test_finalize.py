@@ -156,7 +156,7 @@ def test_a_damaged_summary_is_written_again(whole: Path, end: Any) -> None:
     assert reopen(whole).summary == before
 
 
-def test_what_the_launcher_stored_is_how_the_run_ended(run_dir: Path) -> None:
+def test_the_stored_ending_is_used_without_a_summary(run_dir: Path) -> None:
     """A blank file is of a launcher that ended before the run."""
     with EndingFile(run_dir) as file:
         assert (reopen(run_dir).status, reopen(run_dir).reason) == (1, "the launcher ended early")

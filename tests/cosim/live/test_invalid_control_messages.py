@@ -25,7 +25,7 @@ JUNK: list[bytes | None] = [
 
 
 @pytest.mark.parametrize("junk", JUNK)
-def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
+def test_an_invalid_request_is_refused_and_the_others_join(
     content: dict[str, Any], junk: bytes | None, tmp_path: Path
 ) -> None:
     plane = FakePlane()
@@ -51,7 +51,7 @@ def test_who_does_not_ask_properly_does_not_join_and_the_others_do(
 
 
 @pytest.mark.parametrize("junk", JUNK)
-def test_the_recorder_keeps_what_is_good(
+def test_the_recorder_ignores_invalid_telemetry_and_stores_the_rest(
     content: dict[str, Any],
     junk: bytes | None,
     tmp_path: Path,

@@ -15,7 +15,7 @@ def batch(first: int, end: int) -> np.ndarray:
 
 
 @given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 12)), max_size=12))
-def test_each_row_comes_once_and_in_order(ranges: list[tuple[int, int]]) -> None:
+def test_merged_rows_are_unique_and_ordered(ranges: list[tuple[int, int]]) -> None:
     """Batches in any order, overlapping, repeated, empty; gaps stay gaps."""
     rows = merge_rows([batch(first, first + n) for first, n in ranges], ROW)
     present = sorted({k for first, n in ranges for k in range(first, first + n)})

@@ -14,7 +14,7 @@ from noack.protocol.machine_interface import GENERATION, RESTART
 from noack.protocol.record_tables import SENSOR_MEASUREMENT
 
 
-def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any]) -> None:
+def test_a_restart_without_rows_is_listed(content: dict[str, Any]) -> None:
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()
     rows["input"][50:] = 2 * GENERATION + np.arange(len(rows) - 50)
@@ -33,7 +33,7 @@ def test_one_that_died_before_it_left_a_row_is_among_them(content: dict[str, Any
 
 
 @pytest.mark.parametrize("newest", [1, 2])
-def test_rows_are_missing_of_one_whose_first_ones_are(content: dict[str, Any], newest: int) -> None:
+def test_missing_first_rows_of_a_restart_are_counted(content: dict[str, Any], newest: int) -> None:
     """It died before a recorder was back to which it could have sent them again."""
     record = simulate(resolve(validate(content, "")))
     rows = record[SENSOR_MEASUREMENT].copy()

@@ -84,7 +84,7 @@ def run(content: dict[str, Any], tmp_path: Path) -> Iterator[Run]:
     found.recorder.abandon()
 
 
-def test_it_asks_for_nothing_that_is_on_disk(run: Run) -> None:
+def test_a_restarted_recorder_requests_no_rows_that_are_on_disk(run: Run) -> None:
     run.rows(PLANT_STEP, 5)
     run.notice("plant")
     run.notice("sensor", 1)
@@ -94,7 +94,7 @@ def test_it_asks_for_nothing_that_is_on_disk(run: Run) -> None:
     assert run.report("controller", **{NOTICES: 1}) == {NOTICES: [[0, 1]]}
 
 
-def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run) -> None:
+def test_a_process_gets_the_acknowledgement_of_its_own_rows_only(run: Run) -> None:
     run.rows(SENSOR_MEASUREMENT, 7)
     run.follow(Start(1, 0), "b")
     run.rows(SENSOR_MEASUREMENT, 3, generation=1)
@@ -108,7 +108,9 @@ def test_a_process_is_told_of_its_own_rows_whatever_was_spooled_by_whom(run: Run
     assert run.plane.acknowledged["plant"] == {"generation": 0, "rows": {PLANT_STEP: [[0, 2]]}}
 
 
-def test_it_does_not_wait_for_who_has_left(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_restarted_recorder_does_not_wait_for_ended_processes(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run.follow(Start(1, 0), "a")
     assert not run.recorder.finished
     for role in LOOP_ROLES:

@@ -54,7 +54,7 @@ def test_the_directory_is_a_live_runs_directory(runs: Path) -> None:
     }
 
 
-def test_who_wants_no_report_gets_none_and_may_have_it_later(tmp_path: Path) -> None:
+def test_a_report_can_be_omitted_and_written_later(tmp_path: Path) -> None:
     settings = [word for setting in SHORT for word in ("--set", setting)]
     done = noack("simulate", str(PATH), "--runs", str(tmp_path), "--no-report", *settings)
     assert done.exit_code == 0, done.output
@@ -74,7 +74,7 @@ def test_the_record_on_disk_is_the_simulators(runs: Path) -> None:
     assert loaded.notices == again.notices
 
 
-def test_the_summary_says_that_it_was_simulated(runs: Path) -> None:
+def test_the_summary_names_the_kind_of_run(runs: Path) -> None:
     summary = json.loads((runs / "latest" / "summary.json").read_text())
     assert summary["kind"] == "simulated"
     assert summary["exit"] == {"status": 0, "reason": "horizon"}
@@ -87,7 +87,7 @@ def test_the_summary_says_that_it_was_simulated(runs: Path) -> None:
     assert "real-time" not in shown.stdout
 
 
-def test_a_lost_summary_is_made_anew_from_the_record(runs: Path, tmp_path: Path) -> None:
+def test_a_lost_summary_is_written_again_from_the_record(runs: Path, tmp_path: Path) -> None:
     summary = runs / "latest" / "summary.json"
     content = json.loads(summary.read_text())
     summary.unlink()
@@ -106,7 +106,9 @@ def test_the_recording_shows_the_run_without_lateness(runs: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_what_is_broken_off_leaves_nothing_behind(tmp_path: Path, error: BaseException) -> None:
+def test_an_interrupted_simulation_leaves_no_run_directory(
+    tmp_path: Path, error: BaseException
+) -> None:
     def broken(resolved: Scenario, *, progress: Progress | None) -> RunRecord:
         raise error
 
@@ -138,7 +140,7 @@ def test_the_view_opens_where_the_controller_errs_most(runs: Path) -> None:
     assert opening_time_ns(run_dir / "recording.rrd") == joined.t_ns[e_c.argmax()]
 
 
-def test_recorded_scenario_may_be_larger_than_one_that_a_person_writes(tmp_path: Path) -> None:
+def test_a_recorded_scenario_may_exceed_the_size_limit_of_scenarios(tmp_path: Path) -> None:
     (tmp_path / "long.txt").write_text("10" * 200_000)
     trace = f'network.loss={{model="trace",file="{tmp_path}/long.txt"}}'
     ending = simulate_run(load(PATH, (*SHORT, trace)), tmp_path, view=False)

@@ -16,18 +16,18 @@ def reached_after_s(limit: StartLimit, load: float, step_s: float = 0.125) -> fl
 @pytest.mark.parametrize(
     ("load", "times"), [(0.0, 1), (1.9, 1), (2.0, 1), (4.0, 2), (20.0, 10), (40.0, 20), (1e6, 20)]
 )
-def test_the_limit_is_as_many_times_longer_as_there_is_more_to_do(load: float, times: int) -> None:
+def test_the_start_limit_grows_with_the_load(load: float, times: int) -> None:
     assert reached_after_s(StartLimit(30.0, 2), load) == pytest.approx(30.0 * times, abs=0.25)
 
 
-def test_the_load_counts_while_it_lasts() -> None:
+def test_only_the_present_load_extends_the_limit() -> None:
     limit = StartLimit(30.0, 2)
     limit.wait(60.0, 6.0)
     assert not limit.is_reached
     assert reached_after_s(limit, 0.0) == pytest.approx(60.0 + 10.0, abs=0.25)
 
 
-def test_without_a_limit_one_waits_for_ever() -> None:
+def test_an_infinite_limit_is_never_reached() -> None:
     limit = StartLimit(math.inf, 1)
     limit.wait(1e9, 0.0)
     assert not limit.is_reached
@@ -43,7 +43,7 @@ def test_a_load_is_named_as_the_likely_cause_with_the_remedies() -> None:
 
 
 @pytest.mark.parametrize("load", [0.4, 2.2])
-def test_a_load_that_slows_nothing_down_is_not(load: float) -> None:
+def test_a_low_load_is_not_named_as_the_cause(load: float) -> None:
     limit = StartLimit(30.0, 2)
     waited_s = reached_after_s(limit, load)
     assert limit.explain() == (

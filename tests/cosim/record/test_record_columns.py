@@ -7,12 +7,12 @@ import pytest
 from noack.protocol.record_tables import COMMON, TABLES, Column, Table
 
 DOCS = Path(__file__).parents[3] / "docs" / "record.md"
-TEXT = DOCS.read_text(encoding="utf-8")
+TEXT = " ".join(DOCS.read_text(encoding="utf-8").split())
 
 
 def markdown(columns: tuple[Column, ...]) -> str:
     lines = [f"| `{one.name}` | {one.unit} | {one.meaning} |" for one in columns]
-    return "\n".join(["| column | unit | meaning |", "|---|---|---|", *lines]) + "\n\n"
+    return " ".join(" ".join(["| column | unit | meaning |", "|---|---|---|", *lines]).split())
 
 
 def test_the_docs_describe_the_common_columns() -> None:
@@ -21,5 +21,5 @@ def test_the_docs_describe_the_common_columns() -> None:
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 def test_the_docs_describe_every_table(table: Table) -> None:
-    head = f"`{table.name}` ({table.owner}): one row per {table.row}.\n\n"
-    assert head + markdown(table.columns) in TEXT, head + markdown(table.columns)
+    described = f"`{table.name}` ({table.owner}): one row per {table.row}. "
+    assert described + markdown(table.columns) in TEXT

@@ -32,7 +32,8 @@ SHARED = {
     "t_ns": i64, "interface": st.integers(0, 1), "departure": st.integers(0, 1),
     "direction": st.integers(0, 1), "fate": st.integers(0, 5), "copy": st.integers(0, 1),
     "stale": st.integers(0, 1), "source_port": st.integers(0, 65_535),
-    "destination_port": st.integers(0, 65_535), "flow": i64, "packet": i64, "run": i64,
+    "destination_port": st.integers(0, 65_535), "flow": i64, "packet": i64,
+    "consecutive_losses": i64,
     "mansd": st.integers(-1, 2**63 - 1), "delay_ns": i64, "hold_back_ns": i64,
     "bit": st.integers(-1, 2**63 - 1),
 }  # fmt: skip

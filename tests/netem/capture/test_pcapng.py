@@ -76,7 +76,7 @@ def test_a_file_says_who_wrote_it_and_describes_the_interfaces() -> None:
     ]
 
 
-LOST = {"fate": Fate.DROPPED, "run": 2}
+LOST = {"fate": Fate.DROPPED, "consecutive_losses": 2}
 
 
 @pytest.mark.parametrize(
@@ -92,12 +92,13 @@ LOST = {"fate": Fate.DROPPED, "run": 2}
          "forced: delivered as the first of its flow"),
         ({"fate": Fate.FORCED, "mansd": 4, "delay_ns": 10_000_000},
          "forced: delivered by the cap of 4 consecutive losses, delayed 10 ms"),
-        ({"fate": 3, "bit": 513, "run": 1, "mansd": 4, "delay_ns": 1_000_000},
+        ({"fate": 3, "bit": 513, "consecutive_losses": 1, "mansd": 4, "delay_ns": 1_000_000},
          "corrupted in bit 513, consecutive loss 1, cap 4, delayed 1 ms"),
-        ({"fate": 4, "run": 1, "mansd": 1}, "dropped by a full queue, consecutive loss 1, cap 1"),
-        ({"fate": 5, "run": 12}, "dropped in a blackout, consecutive loss 12"),
+        ({"fate": 4, "consecutive_losses": 1, "mansd": 1},
+         "dropped by a full queue, consecutive loss 1, cap 1"),
+        ({"fate": 5, "consecutive_losses": 12}, "dropped in a blackout, consecutive loss 12"),
         ({"fate": 99}, "unknown fate"),
-        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "run": 1, "mansd": 4},
+        ({"delay_ns": 12_345_000, "hold_back_ns": 1_200_000, "consecutive_losses": 1, "mansd": 4},
          "delivered, delayed 12.345 ms, held back 1.2 ms for the guarantee"),
         ({"departure": 1, "delay_ns": 12_345_678}, "delivered, after 12.346 ms"),
         ({"departure": 1, "delay_ns": -5}, "delivered, after 0 ms"),

@@ -23,7 +23,7 @@ def random_event(rng: random.Random, family: int, size: int) -> dict[str, Any]:
     departure = rng.randrange(2)
     return {
         "t_ns": T_NS + rng.randrange(10**10), "interface": rng.randrange(2),
-        "departure": departure, "fate": rng.randrange(6), "run": rng.randrange(3),
+        "departure": departure, "fate": rng.randrange(6), "consecutive_losses": rng.randrange(3),
         "family": family, "source": str(address(rng.randbytes(4 if family == 4 else 16))),
         "destination": str(address(rng.randbytes(4 if family == 4 else 16))),
         # Ports above those that Wireshark knows: what it thinks of the payload is not the matter.
@@ -72,7 +72,7 @@ def test_tshark_filters_by_fate_flow_and_datagram(tshark: Tshark, tmp_path: Path
     path.write_bytes(
         file_of(
             {"flow": 3, "packet": 1}, {"flow": 33, "packet": 1},
-            {"flow": 3, "packet": 2, "fate": 1, "run": 1, "mansd": 4},
+            {"flow": 3, "packet": 2, "fate": 1, "consecutive_losses": 1, "mansd": 4},
             {"flow": 3, "packet": 1, "interface": 1, "departure": 1, "delay_ns": 1_500_000},
         )
     )  # fmt: skip

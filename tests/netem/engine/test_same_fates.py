@@ -17,7 +17,7 @@ from tests.netem import any_settings
 from tests.netem.engine.relays import KeepAll, drain, endpoints, link, name_of, running
 
 CLIENTS = 3
-DECIDED = ("packet", "fate", "hold_back_ns", "bit", "copy_bit")
+DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_bit")
 
 
 def replayed(
@@ -43,10 +43,9 @@ def replayed(
         now_ns = int(event["t_ns"]) - began_ns
         let_out(now_ns)
         take(machine.handle(Datagram(int(event["flow"]), payload), now_ns))
-        decision = machine.decision
-        assert event["run"] == decision.consecutive_losses
-        assert [event[field] for field in DECIDED] == [getattr(decision, f) for f in DECIDED]
-        for field, t_ns in (("delay_ns", decision.release_ns), ("copy_delay_ns", decision.copy_ns)):
+        verdict = machine.verdict
+        assert [event[field] for field in DECIDED] == [getattr(verdict, f) for f in DECIDED]
+        for field, t_ns in (("delay_ns", verdict.release_ns), ("copy_delay_ns", verdict.copy_ns)):
             assert event[field] == (-1 if t_ns < 0 else t_ns - now_ns)
     let_out(np.inf)
     return left

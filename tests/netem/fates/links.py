@@ -61,8 +61,7 @@ class Run:
         for event, verdict, came in zip(events, self.verdicts, self.arrivals, strict=True):
             now_ns, event["flow"], event["size_bytes"] = came
             event["t_ns"] = 10**18 + now_ns
-            event["run"] = verdict.consecutive_losses
-            for name in ("packet", "fate", "bit", "copy_bit", "hold_back_ns"):
+            for name in ("packet", "consecutive_losses", "fate", "bit", "copy_bit", "hold_back_ns"):
                 event[name] = getattr(verdict, name)
             gone, copied = verdict.release_ns != -1, verdict.copy_ns != -1
             event["delay_ns"] = verdict.release_ns - now_ns if gone else -1

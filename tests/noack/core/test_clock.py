@@ -50,7 +50,7 @@ def test_time_never_runs_back(speed: float, walls: list[int]) -> None:
 
 
 @given(speeds, st.integers(0, 10**12), st.integers(0, 10**13))
-def test_whoever_waits_as_told_wakes_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
+def test_the_computed_wait_ends_at_the_deadline(speed: float, wall_ns: int, t_ns: int) -> None:
     wall = Wall()
     clock = RunClock(EPOCH_NS, speed, wall)
     wall.now_ns = EPOCH_NS + wall_ns
@@ -62,6 +62,6 @@ def test_whoever_waits_as_told_wakes_at_the_deadline(speed: float, wall_ns: int,
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
-def test_time_that_stands_or_runs_back_is_refused(speed: float) -> None:
+def test_a_speed_that_is_not_positive_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="speed must be positive"):
         RunClock(EPOCH_NS, speed)

@@ -41,7 +41,7 @@ def test_other_sources_have_another_folder(home: Path) -> None:
     assert cache_folder("netem", [*SOURCES, other]) not in folders
 
 
-def test_what_is_compiled_is_kept_there(home: Path) -> None:
+def test_compiled_code_is_cached(home: Path) -> None:
     folder = cache_folder("netem", SOURCES)
     assert folder is not None
     assert compiler(folder)(doubled)(21) == 42
@@ -61,7 +61,7 @@ print(len(function.stats.cache_hits), flush=True)
 """
 
 
-def test_who_comes_while_another_compiles_waits_and_takes_what_is_kept(home: Path) -> None:
+def test_a_second_process_waits_for_the_compilation_and_uses_the_cache(home: Path) -> None:
     folder = cache_folder("netem", SOURCES)
     assert folder is not None
     with (folder / ".lock").open("w") as lock:
@@ -78,7 +78,7 @@ def test_who_comes_while_another_compiles_waits_and_takes_what_is_kept(home: Pat
     assert later.communicate(timeout=60)[0] == "1\n"
 
 
-def test_what_a_power_failure_left_empty_is_compiled_anew(home: Path) -> None:
+def test_empty_cache_files_are_compiled_again(home: Path) -> None:
     for suffix in ("nbi", "nbc"):
         folder = cache_folder("netem", SOURCES)
         assert folder is not None
@@ -89,9 +89,7 @@ def test_what_a_power_failure_left_empty_is_compiled_anew(home: Path) -> None:
         assert file.stat().st_size > 0
 
 
-def test_without_a_home_nothing_is_kept_and_nothing_fails(
-    home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_home_there_is_no_cache(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (home / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "file" / "below"))
     assert cache_folder("netem", SOURCES) is None
@@ -100,7 +98,9 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(
     assert kept_at(function) is None  # numba has no place of its own for it, with older rules
 
 
-def test_nor_in_a_folder_of_somebody_else(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_folder_of_another_user_is_not_used(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(**_: Any) -> NoReturn:
         raise PermissionError(errno.EACCES, "Permission denied")
 
@@ -109,7 +109,7 @@ def test_nor_in_a_folder_of_somebody_else(home: Path, monkeypatch: pytest.Monkey
     assert cache_folder("netem", SOURCES) is None
 
 
-def test_nor_on_a_full_disk_unless_it_is_there_already(
+def test_on_a_full_disk_only_an_existing_cache_is_used(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: int) -> NoReturn:

@@ -7,7 +7,7 @@ from noack.core.errors import CallerError, one_line, printable
 
 
 @given(st.text())
-def test_what_is_quoted_can_be_printed_on_one_line(text: str) -> None:
+def test_quoted_text_is_one_printable_line(text: str) -> None:
     assert printable(text).isprintable()
     assert printable(text) == text or not text.isprintable()
 
@@ -20,5 +20,5 @@ def test_each_mistake_has_a_line() -> None:
     assert str(CallerError("a: wrong\nb: \twrong")) == "a: wrong\nb: \\twrong"
 
 
-def test_an_error_of_others_becomes_one_line() -> None:
+def test_a_foreign_error_becomes_one_line() -> None:
     assert one_line(ValueError("Couldn't read:\n  no data\n")) == "Couldn't read: no data"

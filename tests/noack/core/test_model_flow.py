@@ -20,7 +20,7 @@ def test_without_a_set_point_it_is_the_propagator_bit_for_bit() -> None:
     assert flow(X, 3, 10**9).tobytes() == Propagator(H)(X, 10**9 - 3).tobytes()
 
 
-def test_it_rests_at_the_set_point_and_goes_there() -> None:
+def test_the_model_converges_to_the_set_point() -> None:
     x_r = np.array([2.0, 0.0])
     flow = ModelFlow(H, (), x_r)
     assert flow(x_r, 0, 10**9).tolist() == x_r.tolist()

@@ -20,7 +20,7 @@ def test_a_stream_is_fixed_by_its_seed_and_name(seed: int, name: list[str]) -> N
     assert first.random(20).tobytes() == again.random(20).tobytes()
 
 
-def test_a_stream_is_what_it_is_documented_to_be() -> None:
+def test_a_stream_is_the_documented_one() -> None:
     """NumPy's PCG64DXSM, seeded by the seed and a hash of the name: the same everywhere, always."""
     digest = hashlib.blake2b(b"netem\0update\0loss\0" + b"0", digest_size=16).digest()
     key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]

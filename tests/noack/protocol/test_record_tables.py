@@ -15,7 +15,7 @@ def test_every_table_has_an_owner_in_the_loop() -> None:
     assert set(OWNER.values()) == set(LOOP_ROLES)
 
 
-def test_the_kept_head_of_a_datagram_is_its_whole_header() -> None:
+def test_the_recorded_head_of_a_datagram_is_its_whole_header() -> None:
     """So that the record tells which update was dropped, though the network reads no payload."""
     assert wire_format.HEADER_BYTES == PACKET_HEAD_BYTES
     assert tables(1, 1)[NETEM_PACKET]["head"].itemsize == PACKET_HEAD_BYTES

@@ -140,7 +140,7 @@ def test_the_page_gives_the_reasons_in_the_order_of_the_tests() -> None:
 
 @given(flows, run_ids, sequences, times_ns, vectors)
 @example(Flow.UPDATE, 0, 0, 0, [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308])
-def test_what_is_sent_is_what_arrives(
+def test_encoded_messages_decode_unchanged(
     flow: Flow, run_id: int, sequence: int, t_ns: int, values: list[float]
 ) -> None:
     values = [] if flow is Flow.ACKNOWLEDGEMENT else values
@@ -170,7 +170,7 @@ def reason_by_offset(offset: int) -> Rejection:
 
 
 @given(vectors, sequences, times_ns)
-def test_any_flipped_bit_is_noticed(values: list[float], sequence: int, t_ns: int) -> None:
+def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: int) -> None:
     decoder = new_decoder(dimension=len(values))
     data = datagram(values, sequence=sequence, t_ns=t_ns)
     stride = 1 if len(values) <= 3 else 7  # of the longer ones every seventh bit
@@ -182,7 +182,7 @@ def test_any_flipped_bit_is_noticed(values: list[float], sequence: int, t_ns: in
 
 
 @given(vectors, st.binary(min_size=1, max_size=64))
-def test_any_other_length_is_noticed(values: list[float], more: bytes) -> None:
+def test_any_other_length_is_rejected(values: list[float], more: bytes) -> None:
     decoder = new_decoder(dimension=len(values))
     data = datagram(values)
     for size in range(len(data)):
@@ -192,7 +192,9 @@ def test_any_other_length_is_noticed(values: list[float], more: bytes) -> None:
 
 
 @given(vectors, vectors)
-def test_a_vector_of_another_dimension_is_noticed(expected: list[float], sent: list[float]) -> None:
+def test_a_vector_of_another_dimension_is_rejected(
+    expected: list[float], sent: list[float]
+) -> None:
     decoder = new_decoder(dimension=len(expected))
     if len(sent) != len(expected):
         assert_rejected(decoder, datagram(sent), Rejection.LENGTH)
@@ -202,7 +204,7 @@ def test_a_vector_of_another_dimension_is_noticed(expected: list[float], sent: l
 
 
 @given(st.binary(min_size=32, max_size=32), run_ids, st.integers(0, 255), st.integers(0, 255))
-def test_other_keys_runs_flows_and_versions_are_noticed(
+def test_other_keys_runs_flows_and_versions_are_rejected(
     key: bytes, run_id: int, flow: int, version: int
 ) -> None:
     decoder, values = new_decoder(), [1.0, 2.0, 3.0]
@@ -233,7 +235,7 @@ def test_only_newer_datagrams_are_accepted(arrivals: list[int]) -> None:
 
 
 @given(vectors, st.data(), st.sampled_from([math.inf, -math.inf, math.nan]))
-def test_infinities_and_nans_are_noticed(
+def test_infinities_and_nans_are_rejected(
     values: list[float], data: st.DataObject, bad: float
 ) -> None:
     decoder = new_decoder(dimension=len(values))

@@ -11,7 +11,7 @@ from noack.runtime.address import Address, family_of, parse_address, text_of
 
 
 @given(st.one_of(st.ip_addresses(v=4), st.ip_addresses(v=6)), st.integers(0, 65_535))
-def test_an_address_is_written_so_that_it_is_read_back(host: object, port: int) -> None:
+def test_addresses_survive_formatting_and_parsing(host: object, port: int) -> None:
     address = (str(host), port)
     read = parse_address(text_of(address), "here")
     family = family_of(address)
@@ -30,7 +30,7 @@ def test_an_address_is_written_so_that_it_is_read_back(host: object, port: int) 
         ("192.0.2.1:9000", ("::1", 1), ("192.0.2.1", 9000)),
     ],
 )
-def test_what_is_left_out_is_the_loopback_of_the_same_family(
+def test_a_missing_host_is_the_loopback_of_the_same_family(
     text: str, like: Address | None, address: Address
 ) -> None:
     assert parse_address(text, "here", like) == address

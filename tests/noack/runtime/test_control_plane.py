@@ -65,14 +65,16 @@ def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("stranger", STRANGERS)
-def test_a_stranger_is_not_let_in(coordinator: Coordinator, ticket: Ticket, stranger: str) -> None:
+def test_a_connection_without_the_secret_is_refused(
+    coordinator: Coordinator, ticket: Ticket, stranger: str
+) -> None:
     for mode in ("client", "peer", "router"):
         more = {"mode": mode, "connect/timeout_ms": 200, **shown_by(stranger, ticket)}
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             zenoh.open(session_config(ticket.endpoint, listen=False, more=more))
 
 
-def test_who_is_not_let_in_neither_hears_nor_says_anything(
+def test_a_refused_session_neither_sends_nor_receives(
     coordinator: Coordinator, ticket: Ticket
 ) -> None:
     """Sessions that stay open and try again and again, as zenoh's do by default."""
@@ -134,7 +136,7 @@ def _is_own(sample: zenoh.Sample) -> bool:
     return True
 
 
-def test_a_process_does_not_go_in_where_nothing_is_asked_of_it(ticket: Ticket) -> None:
+def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) -> None:
     """Whoever has taken a dead coordinator's port, without knowing the key."""
     secret = secret_of(ticket)._asdict()
     shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
@@ -163,7 +165,7 @@ def test_the_secret_follows_from_the_key_and_does_not_tell_it(ticket: Ticket) ->
     assert secret_of(ticket._replace(key=bytes(32))).password != secret.password
 
 
-def test_it_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
+def test_the_coordinator_listens_on_loopback_only(coordinator: Coordinator, ticket: Ticket) -> None:
     port = int(ticket.endpoint.rpartition(":")[2])
     own = psutil.Process().net_connections()
     listening = {c.laddr for c in own if c.status == psutil.CONN_LISTEN}
@@ -215,7 +217,7 @@ def pipes() -> set[str]:
         ('{"rows": {"plant_step": [[0, -5]]}}', MissingRows, "plant_step"),
     ],
 )
-def test_an_answer_that_is_none_is_a_line(
+def test_an_invalid_answer_gives_one_line(
     coordinator: Coordinator, ticket: Ticket, answer: str | bytes, kind: Any, line: str
 ) -> None:
     queries = coordinator.plane.session.declare_queryable(
@@ -234,7 +236,7 @@ def test_an_answer_that_is_none_is_a_line(
     assert len(str(caught.value)) < 500
 
 
-def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticket) -> None:
+def test_an_answer_arrives_unchanged(coordinator: Coordinator, ticket: Ticket) -> None:
     address = ["127.0.0.1", 5]
     said = {"epoch_ns": 7, "addresses": dict.fromkeys(LOOP_ROLES, address), "more": [1]}
     queries = coordinator.plane.session.declare_queryable(
@@ -247,7 +249,7 @@ def test_an_answer_comes_as_what_it_says(coordinator: Coordinator, ticket: Ticke
     assert told["addresses"] == dict.fromkeys(LOOP_ROLES, ("127.0.0.1", 5))
 
 
-def test_a_question_whose_answer_was_lost_is_asked_again(
+def test_a_request_is_sent_again_when_its_answer_was_lost(
     coordinator: Coordinator, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(noack.runtime.control_plane, "_REQUEST_AGAIN_S", 0.2)
@@ -267,7 +269,7 @@ def test_a_question_whose_answer_was_lost_is_asked_again(
 
 
 @pytest.mark.parametrize("launched", [True, False])
-def test_a_launched_process_connects_anew_until_it_is_let_in(
+def test_a_launched_process_connects_again_until_it_is_admitted(
     ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
 ) -> None:
     """A connection over which nothing is answered stays so; a person is told of it instead."""
@@ -303,7 +305,7 @@ def meet(plane: ControlPlane) -> None:
     wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
 
 
-def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> None:
+def test_a_short_loss_of_the_coordinator_is_tolerated(ticket: Ticket) -> None:
     """As when the machine did not run one end of a connection for a lease."""
     first = Coordinator(ticket)
     with ControlPlane(ticket, "plant") as plant:
@@ -319,7 +321,7 @@ def test_a_coordinator_that_comes_back_in_time_is_not_gone(ticket: Ticket) -> No
         assert not plant.coordinator_gone(for_s=3600)
 
 
-def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> None:
+def test_an_admission_request_waits_for_a_coordinator_to_come_back(ticket: Ticket) -> None:
     ticket = ticket._replace(launched=False)
     first = Coordinator(ticket)
     with ControlPlane(ticket, "plant") as plane, ThreadPoolExecutor() as pool:
@@ -335,7 +337,7 @@ def test_who_knocks_waits_for_a_coordinator_that_comes_back(ticket: Ticket) -> N
         knocking.result()
 
 
-def test_a_process_that_gets_no_answer_is_named_by_who_reports_it(
+def test_a_missing_answer_does_not_name_the_process_twice(
     ticket: Ticket, coordinator: Coordinator
 ) -> None:
     """So that nobody reads ``noack sensor: sensor: no answer``."""

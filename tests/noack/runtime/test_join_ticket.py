@@ -40,7 +40,7 @@ def test_a_ticket_is_read_back(fields: dict[str, Any]) -> None:
         ("scenario", None), ("scenario", {}), ("more", 0),
     ],
 )  # fmt: skip
-def test_what_is_no_ticket_gets_a_line_without_the_key(
+def test_an_invalid_ticket_gives_one_line_without_the_key(
     fields: dict[str, Any], key: str, value: object
 ) -> None:
     with pytest.raises(CallerError) as caught:
@@ -59,7 +59,7 @@ def test_neither_is_other_text(text: str) -> None:
 
 
 @pytest.mark.parametrize("left_behind", [False, True])
-def test_of_many_who_open_a_session_at_once_one_succeeds(
+def test_of_many_concurrent_runs_of_a_session_one_succeeds(
     fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

@@ -24,7 +24,7 @@ def looked_at(watch: FloodWatch, came: int) -> int:
     return came - looked
 
 
-def test_a_few_strangers_are_no_flood() -> None:
+def test_a_few_datagrams_from_unknown_sources_are_no_flood() -> None:
     watch = FloodWatch()
     for came in (0, 1, IN_AN_INTERVAL - 1, 0, IN_AN_INTERVAL - 1):
         assert looked_at(watch, came) == 0
@@ -32,7 +32,7 @@ def test_a_few_strangers_are_no_flood() -> None:
         assert watch.left == IN_AN_INTERVAL
 
 
-def test_a_flood_is_said_once_and_its_end_with_what_was_dropped() -> None:
+def test_a_flood_is_logged_once_and_its_end_with_the_drops() -> None:
     watch, dropped, lines = FloodWatch(), 7, []
     assert watch.next_interval(dropped) is not None  # what was dropped before counts as the first
     watch = FloodWatch()
@@ -62,7 +62,7 @@ def test_a_pause_does_not_end_a_flood() -> None:
     assert watch.is_flood
 
 
-def test_what_is_no_flood_by_itself_does_not_prolong_one() -> None:
+def test_moderate_traffic_does_not_prolong_a_flood() -> None:
     watch, dropped = FloodWatch(), 5000
     assert watch.next_interval(dropped) is not None
     for _ in range(100):
@@ -95,7 +95,7 @@ needs_linux = pytest.mark.skipif(
 
 
 @needs_linux
-def test_each_hears_its_own_and_nobody_can_join_in(stack: ExitStack) -> None:
+def test_each_socket_receives_its_peer_and_the_port_cannot_be_bound_again(stack: ExitStack) -> None:
     endpoint, first, second, stranger = (stack.enter_context(opened()) for _ in range(4))
     beside = open_beside(endpoint, [first.getsockname(), second.getsockname()])
     for one in beside:
@@ -116,7 +116,7 @@ def test_each_hears_its_own_and_nobody_can_join_in(stack: ExitStack) -> None:
 
 
 @needs_linux
-def test_a_flood_displaces_nothing_and_every_datagram_is_accounted_for(stack: ExitStack) -> None:
+def test_a_flood_displaces_no_peer_datagram_and_all_are_counted(stack: ExitStack) -> None:
     peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
     ear = stack.enter_context(closing(Ear(peer)))
     stranger_sent = 0
@@ -139,7 +139,7 @@ def test_a_flood_displaces_nothing_and_every_datagram_is_accounted_for(stack: Ex
 
 
 @needs_linux
-def test_a_peer_is_heard_before_strangers(stack: ExitStack) -> None:
+def test_a_peer_is_read_before_unknown_sources(stack: ExitStack) -> None:
     peer, stranger = stack.enter_context(opened()), stack.enter_context(opened())
     ear = stack.enter_context(closing(Ear(peer)))
     ear.tend()
@@ -160,7 +160,7 @@ def test_work_between_two_looks_at_the_clock_is_bounded(stack: ExitStack) -> Non
     assert 0 < ear.decoder.rejected[Rejection.LENGTH] <= 16
 
 
-def test_what_came_before_the_peer_was_known_is_heard_first(stack: ExitStack) -> None:
+def test_datagrams_before_the_peer_sockets_are_read_first(stack: ExitStack) -> None:
     """Who takes another's place in a run is sent to before it can know by whom."""
     peer = stack.enter_context(opened())
     endpoint = stack.enter_context(bind(0, "port"))
@@ -174,7 +174,7 @@ def test_what_came_before_the_peer_was_known_is_heard_first(stack: ExitStack) ->
     assert ear.lines == []
 
 
-def test_without_a_shield_the_loop_hears_as_well(
+def test_the_loop_receives_without_peer_sockets(
     stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(udp_sockets, "open_beside", lambda endpoint, peers: ())
@@ -210,7 +210,7 @@ def test_many_sources_take_bounded_memory_and_a_short_report() -> None:
     assert count.report() == report
 
 
-def test_the_kernels_count_of_what_it_dropped_is_exact(stack: ExitStack) -> None:
+def test_the_kernel_drop_counter_is_exact(stack: ExitStack) -> None:
     endpoint, sender = stack.enter_context(opened()), stack.enter_context(opened())
     for _ in range(2000):
         sender.sendto(b"x", endpoint.getsockname())

@@ -18,7 +18,7 @@ def test_a_signal_is_noted_once_however_often_it_is_passed_on() -> None:
         assert signals.status is ExitStatus.INTERRUPTED
 
 
-def test_who_asks_again_later_means_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_signal_ends_the_process_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = time.monotonic_ns()
     with Signals().handled() as signals:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -30,7 +30,7 @@ def test_who_asks_again_later_means_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("ignored", [False, True])
-def test_a_terminal_that_closes_ends_what_nohup_does_not_keep(ignored: bool) -> None:
+def test_sighup_ends_a_process_unless_nohup_ignores_it(ignored: bool) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
     try:
         with Signals().handled() as signals:

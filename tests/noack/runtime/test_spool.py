@@ -47,7 +47,7 @@ def test_a_batch_is_on_disk_as_soon_as_it_is_appended(tmp_path: Path) -> None:
     writer.close()
 
 
-def test_a_chunk_that_was_cut_short_is_ignored_wherever_it_was_cut(tmp_path: Path) -> None:
+def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
     batches = [(0, b"first"), (5, b"second")]
     path = spool(tmp_path, "recorder", "plant_step", *batches)
     whole = path.read_bytes()
@@ -67,7 +67,7 @@ def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
 
 
 @given(st.lists(st.integers(0, 20), max_size=4), st.lists(st.integers(0, 20), max_size=4))
-def test_what_was_spooled_twice_is_merged(
+def test_rows_spooled_twice_are_merged(
     tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
 ) -> None:
     """The recorder kept the first rows, the process all of them, cut into other batches."""
@@ -87,7 +87,7 @@ def test_a_folder_that_cannot_be_written_is_the_machines_error(tmp_path: Path) -
         writer.append("step", 0, b"a")
 
 
-def test_a_disk_that_fills_up_is_told_by_the_batch_it_cuts_short(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) -> None:
     """Not by the next one: there may be none, and what follows would be read as rows."""
     resource = pytest.importorskip("resource")
     writer = SpoolWriter(tmp_path, "recorder")
@@ -117,7 +117,7 @@ def test_a_spool_is_read_while_it_is_written(tmp_path: Path) -> None:
     tail.close()
 
 
-def test_what_was_written_is_read_though_the_spool_is_gone(tmp_path: Path) -> None:
+def test_a_deleted_spool_is_read_to_its_end(tmp_path: Path) -> None:
     path = spool(tmp_path, "recorder", "plant_step", (0, b"abc"))
     tail = SpoolTail(tmp_path)
     next(tail.read())
@@ -150,7 +150,7 @@ def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str)
     writer.close()
 
 
-def test_no_spool_is_made_where_the_run_directory_is_gone(tmp_path: Path) -> None:
+def test_a_deleted_run_directory_is_not_created_again(tmp_path: Path) -> None:
     with pytest.raises(MachineError, match=r"/gone/spool: the record cannot be written"):
         SpoolWriter(tmp_path / "gone" / "spool", "recorder")
     assert not (tmp_path / "gone").exists()

@@ -128,7 +128,7 @@ def test_missing_batches_are_sent_again(count: int, data: st.DataObject) -> None
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(1, 8))), st.integers(0, 45))
-def test_what_was_received_is_known_in_as_few_ranges_as_can_be(
+def test_received_rows_are_stored_as_disjoint_ranges(
     parts: list[tuple[int, int]], total: int
 ) -> None:
     received, numbers = ReceivedRows(), set[int]()

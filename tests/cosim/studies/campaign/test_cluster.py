@@ -109,7 +109,7 @@ def test_a_worker_that_computes_otherwise_is_refused_and_named(
         run_campaign(store, runner)
     text = str(found.value)
     assert text.startswith(f"{dask.address}: a worker on ")
-    assert f"would give other results: numpy is {np.__version__} there, 1.0 here; 0 of" in text
+    assert f"would compute other results: numpy is {np.__version__} there, 1.0 here; 0 of" in text
     assert files(store.folder) == {}
 
 
@@ -185,7 +185,7 @@ def test_a_scheduler_that_dies_is_one_line_and_no_hang(
 
     try:
         with (
-            pytest.raises(PeerError, match=r"the scheduler is gone; \d+ of 240 runs are in"),
+            pytest.raises(PeerError, match=r"the scheduler has ended; \d+ of 240 runs are in"),
             cluster(own.address) as runner,
         ):
             run_campaign(store, runner, progress)

@@ -77,10 +77,10 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("name", "two words", 'name = "two words": use letters'),
     ("axes", [], "axes = []: needs at least one entry"),
     ("axes.0.name", "cost", 'axes.0.name = "cost": cost is a column already'),
-    ("axes.0.name", "beta", 'axes.1.name = "beta": there is such an axis already'),
-    ("axes.1.key", None, "key: missing; key and values go together"),
+    ("axes.0.name", "beta", 'axes.1.name = "beta": another axis has this name'),
+    ("axes.1.key", None, "key: missing; an axis needs both key and values"),
     ("axes.0.name", "Axis", "use small letters, digits and _, beginning with a letter"),
-    ("axes.1.values", [1, 1.0], "1 is there twice"),
+    ("axes.1.values", [1, 1.0], "1 is given twice"),
     ("axes.1.values", [[[1.0]], [[2.0]]], "axes.1.values: should be numbers, texts, true or false"),
     ("compare.reference", [1], "compare.reference: should be a number, a text, true or false"),
     (
@@ -94,7 +94,11 @@ MISTAKES: list[tuple[str, Any, str]] = [
         {"name": "beta", "variants": {"a": {"trigger.beta": 0.1, "trigger": {}}}},
         "axes.1.variants.a = {",
     ),
-    ("settings", {"plant.draw": "nominal", "plant": {}}, "plant replaces plant.draw, which stands"),
+    (
+        "settings",
+        {"plant.draw": "nominal", "plant": {}},
+        "plant replaces plant.draw, which is given",
+    ),
     ("axes.1.values", list(range(1, 6000)), "the grid has 11998 points; at most 10000"),
     (
         "axes.1.variants",
@@ -148,7 +152,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(
         ({"settings": {"horizon_s.x": 1.0}}, "settings.horizon_s.x: horizon_s is not a table"),
         (
             {"axes": [{"name": "r", "key": "plant.rate_hz", "values": [100.0, 200.0]}]},
-            "axes.0: r = 100 and r = 200 are the same runs: what plant.rate_hz says there makes no",
+            "axes.0: r = 100 and r = 200 are the same runs: plant.rate_hz has no effect on them",
         ),
         (
             {"settings": {"network.impairments": [{"kind": "delay", "delay_s": 0.1}]}},
@@ -156,7 +160,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(
         ),
         (
             {"settings": {"network.protocol": "ack"}},
-            "at policy = MB, beta = 0.1: network.protocol: continuous time is for the loop",
+            "at policy = MB, beta = 0.1: network.protocol: continuous time needs the loop",
         ),
         ({"scenario": "none.toml"}, 'scenario = "none.toml": no such file'),
         ({"metrics": {"Q": [[1.0, 2.0], [0.0, 1.0]]}}, "metrics.Q: must be symmetric"),
@@ -179,7 +183,7 @@ def test_too_many_curves_for_one_figure_are_refused_with_the_way_out(
 ) -> None:
     plan["axes"][1]["values"] = [i / 10 for i in range(1, 8)]
     figure = {"kind": "distribution", "metric": "cost"}
-    with pytest.raises(CallerError, match=r"14 series are too many .* where = "):
+    with pytest.raises(CallerError, match=r"14 series are too many.* where = "):
         load(write(plan, figures=[figure]))
     load(write(plan, figures=[figure | {"where": {"policy": "MB"}}]))
 

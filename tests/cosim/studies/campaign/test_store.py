@@ -104,7 +104,7 @@ def test_a_full_disk_is_one_line_and_leaves_whole_files_only(
         run_campaign(store, alone)
     assert str(found.value) == (
         f"{store.folder}: cannot be written: No space left on device; 12 of 28 runs are in "
-        f"{store.folder}, the same command goes on from there"
+        f"{store.folder}; the same command continues the campaign"
     )
     assert sum(path.is_file() for path in (store.folder / "runs").rglob("*")) == 4
     monkeypatch.undo()
@@ -246,7 +246,7 @@ def test_a_manifest_that_is_none_is_one_line(
 ) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "campaign.json").write_text(text)
-    with pytest.raises(CallerError, match=r"campaign\.json: not a campaign's; give another --out"):
+    with pytest.raises(CallerError, match=r"campaign\.json: not a manifest of a campaign; give"):
         changed_folder(write, tmp_path / "out", plan)
 
 

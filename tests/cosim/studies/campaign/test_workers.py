@@ -114,8 +114,8 @@ def test_ctrl_c_ends_it_with_one_line_that_says_how_to_go_on(start: Start, tmp_p
     line = err.strip()
     done = len(files(tmp_path / "out"))
     assert line == (
-        f"noack: interrupted; {done} of 320 runs are in {tmp_path / 'out'}, "
-        "the same command goes on from there"
+        f"noack: interrupted; {done} of 320 runs are in {tmp_path / 'out'}; "
+        "the same command continues the campaign"
     )
     assert psutil.wait_procs(children, timeout=60)[1] == []
 
@@ -134,7 +134,7 @@ def test_a_signal_to_all_ends_it_with_one_line(
     assert lines[0].startswith(f"noack: ended by {number.name}; ") or lines[0].startswith(
         "noack: a worker process was killed"  # it may be the first to hear of it
     )
-    assert lines[0].endswith("the same command goes on from there")
+    assert lines[0].endswith("the same command continues the campaign")
     assert "Traceback" not in err
     assert psutil.wait_procs(children, timeout=60)[1] == []
 
@@ -149,7 +149,7 @@ def test_a_killed_worker_is_one_line_and_no_hang(start: Start, tmp_path: Path) -
     assert process.returncode == 1
     assert err.count("\n") == 1, err
     line = err.strip()
-    assert line.startswith("noack: a worker process was killed (was there not enough memory?); ")
-    assert line.endswith("the same command goes on from there")
+    assert line.startswith("noack: a worker process was killed (out of memory?); ")
+    assert line.endswith("the same command continues the campaign")
     assert psutil.wait_procs(workers, timeout=60)[1] == []
     assert not list((tmp_path / "out").rglob(".*.partial"))
