@@ -1,4 +1,4 @@
-"""What ``noack adversary`` says."""
+"""The output of ``noack adversary``."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -32,7 +32,7 @@ def print_worst(
     """Print the results, and the patterns that led to them."""
     table = Table(
         title=f"{resolved.name}: the worst losses, at most M − 1 = {resolved.network.mansd} "
-        f"in a row, {resolved.horizon_s:g} s"
+        f"consecutive, {resolved.horizon_s:g} s"
     )
     for heading in ("", "no loss", "as seeded", "worst", "certified", "tightness"):
         table.add_column(heading, justify="right" if heading else "left")
@@ -50,7 +50,7 @@ def print_worst(
         speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
-    console.print("[dim]D delivered, · lost; --json tells the times of the events[/]")
+    console.print("[dim]D delivered, · lost; --json has the times of the events[/]")
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
