@@ -239,10 +239,10 @@ def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
         horizon_ns=resolved.timing.horizon_ns,
         mansd=resolved.network.mansd,
         x0=loop.x0 if known else None,
-        acknowledges=resolved.is_acknowledged,
+        acknowledges=resolved.protocol.acknowledges,
         start=start,
         safe_input=None if safe_input is None else np.array(safe_input),
         predictive=resolved.message_sizes.is_predictive,
         setpoint=setpoint_of(resolved),
-        schedule=None if resolved.is_acknowledged else ChangeSchedule(resolved, setpoint_of),
+        schedule=None if resolved.protocol.acknowledges else ChangeSchedule(resolved, setpoint_of),
     )

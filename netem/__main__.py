@@ -47,7 +47,7 @@ def _in_a_run(node: RunProcess) -> None:
             endpoint,
             addresses["controller"],
             addresses["sensor"],
-            duplex=node.scenario.is_acknowledged,
+            duplex=node.scenario.protocol.acknowledges,
         ),
     )
 

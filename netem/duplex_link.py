@@ -70,7 +70,7 @@ def network_of(
         forward: takes the place of the link from sensor to controller.
     """
     forward = update_link_of(resolved, start) if forward is None else forward
-    if not resolved.is_acknowledged:
+    if not resolved.protocol.acknowledges:
         return forward
     back = link_of(resolved.network.reverse.link, resolved.seeds.loss, ACKNOWLEDGEMENT_LINK, start)
     return Duplex(forward, back, first_number=start.first_number)

@@ -138,7 +138,7 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     x0 = loop.x0 if known else None
     period_ns, first = resolved.timing.measurement_period_ns, start.first_number
-    if resolved.is_acknowledged:
+    if resolved.protocol.acknowledges:
         timeout_ns = resolved.timing.acknowledgement_timeout_ns
         return AcknowledgedSensor(
             loop.H, policy, x0, timeout_ns=timeout_ns, period_ns=period_ns, first_number=first

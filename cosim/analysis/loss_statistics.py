@@ -62,7 +62,7 @@ def unintended_losses(record: RunRecord) -> dict[str, int]:
         "update to controller": (outcomes.sequence[outcomes.left], received),
         "actuation": (record[CONTROLLER_STEP]["sequence"], record[PLANT_ACTUATION]["sequence"]),
     }
-    if record.scenario.is_acknowledged:
+    if record.scenario.protocol.acknowledges:
         answers = packet_outcomes(record, Flow.ACKNOWLEDGEMENT)
         arrived = record[SENSOR_ACKNOWLEDGEMENT]["sequence"]
         legs["acknowledgement to netem"] = (received, answers.sequence)

@@ -124,7 +124,7 @@ def _transmissions(record: RunRecord) -> dict[str, Any]:
         "drops_by_cause": drops_by_cause(outcomes),
         "forced_deliveries": int((outcomes.rows["fate"] == Fate.FORCED).sum()),
         "longest_loss_burst": max(outcomes.longest_loss_burst(), longest),
-        "acknowledgements": acknowledgements(record) if scenario.is_acknowledged else None,
+        "acknowledgements": acknowledgements(record) if scenario.protocol.acknowledges else None,
         "inter_event_min_s": _or_none(np.min, intervals_s),
         "inter_event_median_s": _or_none(np.median, intervals_s),
         "inter_delivery_median_s": _or_none(np.median, np.diff(deliveries["t_ns"]) * 1e-9),

@@ -213,7 +213,7 @@ def join_all(record: RunRecord) -> AlignedRun:
     steps = record[CONTROLLER_STEP]
     track = controller_track(initial_track(record.scenario), steps, record[CONTROLLER_DELIVERY])
     reach_ns = int(track.model_ns[-1]) + record.scenario.timing.controller_period_ns
-    acknowledged = record.scenario.is_acknowledged
+    acknowledged = record.scenario.protocol.acknowledges
     return join(
         record.loop, record[SENSOR_MEASUREMENT], track, reach_ns,
         flow=model_flow_of(record), acknowledged=acknowledged,
@@ -259,6 +259,6 @@ def identity_residual(record: RunRecord, joined: AlignedRun) -> Reals:
     sensor and controller have nothing in common: before the first delivery, unless x(0) is known.
     NaN throughout where updates are acknowledged.
     """
-    if record.scenario.is_acknowledged:
+    if record.scenario.protocol.acknowledges:
         return np.full(len(joined.t_ns), np.nan)
     return IdentityResidual(record.scenario).of(record[SENSOR_MEASUREMENT], joined)

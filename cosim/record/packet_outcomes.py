@@ -46,7 +46,7 @@ def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcom
     """The outcomes of the updates, or acknowledgements, that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
-    if record.scenario.is_acknowledged:
+    if "flow" in (releases.dtype.names or ()):
         way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
         releases = releases[releases["flow"] == way]
     # The first intact one of a datagram and its copy is what counts: the copy, if that is it.

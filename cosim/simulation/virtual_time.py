@@ -25,6 +25,7 @@ from noack.config.parameter_changes import (
 )
 from noack.config.resolution import tables_of
 from noack.config.scenario import Scenario
+from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.protocol.machine_interface import Machine, Notice, Record
 from noack.protocol.record_tables import (
     ACKNOWLEDGEMENTS,
@@ -35,7 +36,7 @@ from noack.protocol.record_tables import (
     UPDATES,
     Fate,
 )
-from noack.protocol.topology import ACKNOWLEDGES_TO, CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
+from noack.protocol.topology import CHANGEABLE, LOOP_ROLES, RECORDER, ROUTES
 from noack.protocol.wire_format import KEY_BYTES, Decoder, Encoder, Flow, Message
 from noack.runtime.life_cycle import HORIZON
 from plant_server.plant import plant_of
@@ -120,7 +121,7 @@ class Shuttle:
         machines: the machine of each role.
         entries: how many numbers a message of a flow carries.
         take: takes each row and notice, with the role that emitted it.
-        acknowledged: whether updates are acknowledged.
+        protocol: whether updates are acknowledged.
     """
 
     def __init__(
@@ -129,7 +130,7 @@ class Shuttle:
         entries: Callable[[Flow], int],
         take: Callable[[str, Record | Notice], None],
         *,
-        acknowledged: bool = False,
+        protocol: LoopProtocol = PROTOCOLS["none"],
     ) -> None:
         self.machines = machines
         self._take = take
@@ -140,7 +141,7 @@ class Shuttle:
             if role != "netem"  # which reads no payload
         }
         self.acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, RUN_ID, _KEY)
-        self._acknowledged = acknowledged
+        self._acknowledgement_routes = protocol.acknowledgement_routes
         self._timers = [
             (machines[role].next_deadline_ns, rank, role) for role, rank in _TIMER_RANKS.items()
         ]
@@ -195,7 +196,8 @@ class Shuttle:
                 forwarded = isinstance(output, Datagram)
                 data = output.data if forwarded else self._encoder.encode(output)
                 answers = output.flow == (ACKNOWLEDGEMENTS if forwarded else Flow.ACKNOWLEDGEMENT)
-                to = ACKNOWLEDGES_TO[role] if answers and self._acknowledged else ROUTES[role].to
+                routes = self._acknowledgement_routes if answers else {}
+                to = routes.get(role, ROUTES[role].to)
                 self._sent.append((role, to, data))
 
 
@@ -241,7 +243,6 @@ def simulate(
     Returns:
         The record of the run; reports hold what applies: no sockets, no real-time settings.
     """
-    acknowledged = resolved.is_acknowledged
     if network is not None:
         resolved.coverage.require_unchanging()
     gathered = _Gathered(tables_of(resolved))
@@ -252,7 +253,7 @@ def simulate(
         "controller": controller_of(resolved),
     }
     shuttle = Shuttle(
-        machines, resolved.message_sizes.entries, gathered.take, acknowledged=acknowledged
+        machines, resolved.message_sizes.entries, gathered.take, protocol=resolved.protocol
     )
     changes = scheduled(resolved)
     shuttle.announce(changes)
@@ -264,7 +265,7 @@ def simulate(
                 progress(now_ns)
     rows = gathered.rows()
     reports = {role: _report(role, rows, shuttle.decoders.get(role)) for role in LOOP_ROLES}
-    if acknowledged:
+    if resolved.protocol.acknowledges:
         reports["sensor"]["channel"]["acknowledgements"] = shuttle.acknowledgements.report()
     notices = sorted(gathered.notices, key=lambda notice: int(notice["t_ns"]))
     return RunRecord(resolved, rows, notices, reports, "simulated")

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 from netem.engine.histogram import bucket_of, empty
@@ -102,7 +103,7 @@ class PlainDirection:
             self.losses.not_sent(error, datagrams)
         return DirectionReport(
             settings=self.settings,
-            counters=self.link.counters,
+            counters=replace(self.link.counters),
             unintended=self.losses.counts(),
             in_flight=self.link.in_flight,
             flows=flows,

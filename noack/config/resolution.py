@@ -147,7 +147,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
     """The row types of the tables that runs of a resolved scenario have."""
     n, m = resolved.model.dimensions
-    acknowledged, predictive = resolved.is_acknowledged, resolved.message_sizes.is_predictive
+    acknowledged, predictive = resolved.protocol.acknowledges, resolved.message_sizes.is_predictive
     internal = len(resolved.plant.system.internal_names)
     disturbed = {one.at for one in resolved.plant.disturbances}
     return tables(

@@ -30,6 +30,7 @@ from noack.config.timing import Timing
 from noack.config.triggers import AnyTrigger
 from noack.controllers.linear_feedback import LinearFeedbackSettings
 from noack.core.errors import CallerError
+from noack.protocol.loop_protocol import PROTOCOLS, LoopProtocol
 from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
 
@@ -117,9 +118,9 @@ class Scenario(ScenarioSection):
         return self.trigger
 
     @property
-    def is_acknowledged(self) -> bool:
-        """Whether this is the acknowledgement baseline, and not the paper's loop."""
-        return self.network.protocol == "ack"
+    def protocol(self) -> LoopProtocol:
+        """What depends on whether updates are acknowledged."""
+        return PROTOCOLS[self.network.protocol]
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -40,7 +40,7 @@ def with_settings(scenario: "Scenario", settings: Mapping[str, Any]) -> "Scenari
     Raises:
         ValueError: a key is not a runtime parameter, or the scenario would be invalid.
     """
-    if scenario.is_acknowledged:
+    if scenario.protocol.acknowledges:
         raise ValueError('network.protocol: with "ack", nothing can be changed during a run')
     require_runtime_parameters(settings, scenario.trigger)
     sections = {key.split(".")[0] for key in settings} - {"network"}

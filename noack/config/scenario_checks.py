@@ -54,7 +54,7 @@ def check_setpoint(scenario: "Scenario") -> None:
     require_length(setpoint, key, scenario.model.dimensions[0], "one per state")
     if setpoint is None:
         return
-    if scenario.is_acknowledged:
+    if scenario.protocol.acknowledges:
         raise ValueError(f'{key}: not with network.protocol = "ack"')
     if not scenario.controller.is_linear:
         raise ValueError(f'{key}: not with controller.kind = "{scenario.controller.kind}"')

@@ -41,7 +41,7 @@ class TheoryCoverage:
     def beyond_theory(self) -> str | None:
         """The first setting that the theorems and certificates do not cover; None if all are."""
         scenario = self.scenario
-        if scenario.is_acknowledged:
+        if scenario.protocol.acknowledges:
             return 'network.protocol = "ack": updates are acknowledged'
         if not self.is_linear:
             return f'plant.system.kind = "{scenario.plant.system.kind}": the plant is not linear'
@@ -64,7 +64,7 @@ class TheoryCoverage:
         Raises:
             CallerError: this is the acknowledgement baseline.
         """
-        if self.scenario.is_acknowledged:
+        if self.scenario.protocol.acknowledges:
             raise CallerError(
                 'network.protocol: needs the loop without acknowledgements, "none"; '
                 'this scenario has "ack"'

@@ -34,12 +34,6 @@ ROUTES: Mapping[str, MessageRoute] = {
 SENDER: Mapping[str, str] = {leg.to: role for role, leg in ROUTES.items()}
 """The peer from which each process receives."""
 
-ACKNOWLEDGES_TO: Mapping[str, str] = {"controller": "netem", "netem": "sensor"}
-"""Receiver of each process's acknowledgements, in the acknowledgement baseline only."""
-
-ACKNOWLEDGED_BY: Mapping[str, str] = {to: role for role, to in ACKNOWLEDGES_TO.items()}
-"""Sender of the acknowledgements that each process receives."""
-
 LOOP_ROLES = tuple(ROUTES)
 PLANT = "plant"
 CHANGEABLE = ("sensor", "netem", "controller")

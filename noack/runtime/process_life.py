@@ -22,8 +22,6 @@ from noack.core.errors import CallerError, NoackError, PeerError, one_line
 from noack.protocol.machine_interface import BEGINNING, RESTART, Machine, Notice, Record, Start
 from noack.protocol.record_tables import OWNER
 from noack.protocol.topology import (
-    ACKNOWLEDGED_BY,
-    ACKNOWLEDGES_TO,
     CHANGEABLE,
     LOOP_ROLES,
     RECORDER,
@@ -161,9 +159,9 @@ class RunProcess:
             not_before_ns=self._admitted_ns,
         )
         encoder = Encoder(ticket.run_id, ticket.key)
-        acknowledged = self.scenario.is_acknowledged
-        acknowledged_by = ACKNOWLEDGED_BY.get(self.role) if acknowledged else None
-        acknowledges_to = ACKNOWLEDGES_TO.get(self.role) if acknowledged else None
+        protocol = self.scenario.protocol
+        acknowledged_by = protocol.acknowledged_by(self.role)
+        acknowledges_to = protocol.acknowledgement_routes.get(self.role)
         acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, ticket.run_id, ticket.key)
 
         def channel(endpoint: socket.socket, addresses: Mapping[str, Address]) -> MessageSocket:

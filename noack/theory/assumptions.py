@@ -166,7 +166,7 @@ def _control_law(resolved: Scenario) -> list[Assumption]:
 
 
 def _protocol(resolved: Scenario) -> list[Assumption]:
-    if not resolved.is_acknowledged:
+    if not resolved.protocol.acknowledges:
         return []
     return [
         Assumption(

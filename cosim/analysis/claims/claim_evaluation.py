@@ -25,7 +25,7 @@ class ClaimEvaluation(RunEvidence):
         """Every claim with its verdict."""
         if not len(self.joined.t_ns) or not self.in_common.any():
             return []
-        if self.record.scenario.is_acknowledged:
+        if self.record.scenario.protocol.acknowledges:
             return [_NO_CLAIM]
         found: list[Claim] = []
         for claim in run_claims():
@@ -52,7 +52,7 @@ class ClaimEvaluation(RunEvidence):
 
     def envelopes(self) -> list[Envelope]:
         """The curves of all bounds."""
-        if self.record.scenario.is_acknowledged:
+        if self.record.scenario.protocol.acknowledges:
             return []
         found = [
             claim.envelope(self, certificate)

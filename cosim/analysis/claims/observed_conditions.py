@@ -165,6 +165,6 @@ def causes_of(scenario: Scenario) -> Collection[str]:
     Certificates need all; (I1) needs the measurements only; nothing is claimed of the
     acknowledgement baseline.
     """
-    if scenario.is_acknowledged:
+    if scenario.protocol.acknowledges:
         return ()
     return tuple(CAUSES) if scenario.coverage.is_certifiable else ("sampling",)

@@ -45,7 +45,7 @@ def check_messages(
     updates.compare_vectors()
     updates.compare_with_survivors(replayed["netem"])
     actuations.compare_vectors()
-    if record.scenario.is_acknowledged:
+    if SENSOR_ACKNOWLEDGEMENT in record.tables:
         flow = Flow.ACKNOWLEDGEMENT
         answers = _Received("controller → netem", NETEM_PACKET, record, controller, flow)
         returned = _Received("netem → sensor", SENSOR_ACKNOWLEDGEMENT, record, controller, flow)
@@ -88,7 +88,7 @@ class _Received:
         self._rows: Rows = record[table]
         self._at = np.arange(len(self._rows))
         self._way = ACKNOWLEDGEMENTS if flow is Flow.ACKNOWLEDGEMENT else UPDATES
-        if table == NETEM_PACKET and record.scenario.is_acknowledged:
+        if table == NETEM_PACKET and "flow" in (self._rows.dtype.names or ()):
             self._at = np.flatnonzero(self._rows["flow"] == self._way)
             self._rows = self._rows[self._at]
         self._sent: dict[int, Message] = {

@@ -120,7 +120,7 @@ def _parameters(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield "norm of errors", "‖e‖₂" if trigger.weight is None else "‖W e‖₂, W from the scenario"
     yield "M − 1", f"{network.mansd}" + ("" if network.enforce_mansd else ", not enforced")
     yield "loss", f"{model} ({details})" if details else model
-    if scenario.is_acknowledged:
+    if scenario.protocol.acknowledges:
         timeout_ms = 1e-6 * scenario.timing.acknowledgement_timeout_ns
         reverse = network.reverse.loss.model_dump()
         lost = ", ".join(f"{_words(key)} {_shown(value)}" for key, value in reverse.items())

@@ -116,11 +116,7 @@ def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
         "states",
         figure,
         "States, and the times between transmissions and between deliveries. "
-        + (
-            f"x_c jumps to {known} when an update arrives, x_s when its acknowledgement arrives. "
-            if scenario.is_acknowledged
-            else f"At every event x_s jumps to {known}; x_c does so only when the update arrives. "
-        )
+        + scenario.protocol.states_caption.format(known=known)
         + _known(scenario)
         + "Cross: a lost packet. Diamond: a delivery that was forced by the guarantee.",
         f"Above, the states {', '.join(names)} over time, each as x, x_s and x_c. Below, stems for "
@@ -150,14 +146,7 @@ def _errors(record: RunRecord, joined: AlignedRun, bounds: list[Bound]) -> RunFi
         signal_figures.error_figure(
             t_s, joined.e_s_norm, joined.threshold, joined.e_c_norm, bounds
         ),
-        (
-            "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset by acknowledgements; without one, the "
-            "sensor transmits repeatedly. The controller's error is ‖e_c‖ = ‖x_c − x‖."
-            if record.scenario.is_acknowledged
-            else "The sensor's error ‖e_s‖ = ‖x_s − x‖ is reset when it exceeds the threshold. The "
-            "controller's error ‖e_c‖ = ‖x_c − x‖ may exceed the threshold while packets are lost; "
-            "no process of the loop can measure it."
-        )
+        record.scenario.protocol.error_caption
         + (
             ""
             if record.scenario.coverage.knows_state

@@ -39,7 +39,7 @@ def open_view(
         processes=LOOP_ROLES if kind == "live" else (),
         horizon_s=scenario.horizon_s,
         picture=picture_of(scenario),
-        diagram=NetworkDiagram(acknowledged=scenario.is_acknowledged),
+        diagram=NetworkDiagram(acknowledged=scenario.protocol.acknowledges),
         live=live,
         indexed=at_once or scenario.horizon_s <= _INDEXED_S * scenario.speed,
     )
@@ -63,9 +63,6 @@ def about(scenario: Scenario, kind: Kind = "live") -> str:
         "live": "* **Lateness**: wall time between a deadline and the process's action.",
         "simulated": "* The run was **simulated** in virtual time: no deadline was missed.",
     }[kind]
-    protocol, x_s_is_reset = "Nothing is acknowledged.", "at every event"
-    if scenario.is_acknowledged:
-        protocol, x_s_is_reset = "**Updates are acknowledged.**", "when an update is acknowledged"
     hold = "a model of the plant" if scenario.mode == "model" else "a zero-order hold"
     return f"""# {scenario.name}
 
@@ -74,15 +71,16 @@ def about(scenario: Scenario, kind: Kind = "live") -> str:
 Sensor and controller run **{hold}** between updates. The sensor transmits when
 {scenario.trigger.description}.
 The network ({network.loss.model.replace("_", "-")} loss) loses at most
-M − 1 = {network.mansd} consecutive packets. {protocol}
+M − 1 = {network.mansd} consecutive packets. {scenario.protocol.summary}
 
 * A finished run opens at its largest ‖e_c‖. **Colours** explains the colours.
 * **Picture**: the plant (solid), the sensor's model (outline) and the controller's model (dashed
   outline). Play the run to animate it.
 * **Packets**: each update in flight. A lost one falls; a forced delivery is a diamond. A flight
   takes microseconds but is animated as {LEG_S:g} s per hop, so x_c jumps before the dot arrives.
-* **States**: the plant's x, the sensor's model x_s (reset {x_s_is_reset}), the controller's model
-  x_c (reset by each delivery). Where x_c differs from the other two, packets were lost.
+* **States**: the plant's x, the sensor's model x_s (reset {scenario.protocol.reset}), the
+  controller's model x_c (reset by each delivery). Where x_c differs from the other two, packets
+  were lost.
 * **Intervals**: time since the previous transmission, and since the previous delivery.
 * **Errors**: e_s = x_s − x with its threshold; e_c = x_c − x with two bounds, one from identity
   (I1) and the certified one. No process of the loop can measure e_c. The certified bound holds

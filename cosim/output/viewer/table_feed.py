@@ -161,7 +161,7 @@ class ViewFeed:
     def _measurements(self, rows: Rows, reach_ns: int) -> None:
         if not len(rows):
             return
-        acknowledged = self._scenario.is_acknowledged
+        acknowledged = self._scenario.protocol.acknowledges
         joined = join(
             self._loop, rows, self._track, reach_ns, flow=self._flow, acknowledged=acknowledged
         )
@@ -172,7 +172,7 @@ class ViewFeed:
         bounds = np.column_stack(
             [self._bounds(rows, joined), self._certified(t_s, "controller_error")]
         )
-        if not self._scenario.is_acknowledged:
+        if not self._scenario.protocol.acknowledges:
             bounds[~in_common(self._scenario, joined)] = np.nan
         self._view.samples(joined, bounds, self._certified(t_s, "state"))
         z = self._own_at(joined.t_ns)
@@ -207,7 +207,7 @@ class ViewFeed:
 
     def _bounds(self, rows: Rows, joined: AlignedRun) -> NDArray[np.float64]:
         """Return the bound of ‖e_c‖ from (I1), (k,); NaN if updates are acknowledged."""
-        if self._scenario.is_acknowledged:
+        if self._scenario.protocol.acknowledges:
             return np.full(len(rows), np.nan)
         samples = zip(
             rows["t_ns"].tolist(), rows["x_s"] - rows["x"], rows["event"].tolist(),
@@ -233,7 +233,7 @@ class ViewFeed:
     def _packets(self, rows: Rows) -> None:
         if not len(rows):
             return
-        if self._scenario.is_acknowledged:
+        if "flow" in (rows.dtype.names or ()):
             reverse = updates_in(rows, Flow.ACKNOWLEDGEMENT)[0]
             self._view.packets(
                 reverse["t_ns"], reverse["release_ns"], reverse["fate"], reverse=True

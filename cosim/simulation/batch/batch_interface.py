@@ -200,10 +200,11 @@ def _run(setting: Setting, population: Population, room: int) -> tuple[NDArray[n
     )
     rows = np.zeros(len(population.A), ROW)
     log = batch_run.EventLog(np.empty(room), np.empty(room, np.bool_))
-    _compiled()(
+    batch = batch_run.Batch(
         vector_lanes.width(n), vector_lanes.width(m), system, draws, _network(setting.link), space,
-        squares_of(setting.trigger, n), rows, log,
+        log,
     )  # fmt: skip
+    _compiled()(batch, squares_of(setting.trigger, n), rows)
     return rows, log
 
 

@@ -111,26 +111,58 @@ class LossTable(NamedTuple):
 
 
 class EventLog(NamedTuple):
-    """Where events go, as far as there is room."""
+    """The events of a run, as many as there is room for."""
 
     event_s: Array
     delivered: Any
 
 
-def run_many(
-    n: Width, m: Width, system: BatchSystem, draws: Draws, network: LossTable, space: BatchMemory,
-    squares: QuadraticCurves | None, rows: Any, log: EventLog,
-) -> None:  # fmt: skip
+class Batch(NamedTuple):
+    """All that the runs of a batch use."""
+
+    n: Width
+    """As many entries as there are states."""
+    m: Width
+    """As many entries as there are inputs."""
+    system: BatchSystem
+    draws: Draws
+    network: LossTable
+    space: BatchMemory
+    log: EventLog
+
+
+class Models(NamedTuple):
+    """The state of a run in the coordinates of :mod:`cosim.simulation.batch.taylor`."""
+
+    x_c: Lanes
+    e_c: Lanes
+    d: Lanes
+
+
+class Piece(NamedTuple):
+    """A piece of a run: a time on which one polynomial holds."""
+
+    t_s: float
+    """Its start."""
+    length_s: float
+    settled: float
+    """‖x‖ at or below which the run has settled."""
+    ceiling: float
+    """A bound on ‖W e_c‖ e^{αt}, or infinity."""
+
+
+def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
     """Run k draws; each fills a row.
 
-    Without ``squares`` the rule compares ‖W e_s‖ with its threshold, or nothing. The two are
-    compiled apart, each when it is first wanted.
+    Without ``squares`` the rule compares ‖W e_s‖ with its threshold, or nothing. The two cases are
+    compiled separately, each when first used; a compiler leaves out a branch only for an argument
+    that is None, so ``squares`` is no part of the batch.
     """
-    powers(system.H, 0, system.H_k, n)
+    powers(batch.system.H, 0, batch.system.H_k, batch.n)
     for run in range(len(rows)):
-        renew(network, draws.keys, run, system.first_delivered)
-        prepare(n, m, system, draws, space, run)
-        follow(n, m, system, draws, network, space, squares, run, rows[run], log)
+        renew(batch.network, batch.draws.keys, run, batch.system.first_delivered)
+        prepare(batch, run)
+        follow(batch, squares, run, rows[run])
 
 
 def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> None:
@@ -158,19 +190,15 @@ def arrives(network: LossTable) -> bool:
     return fate in (DELIVERED, FORCED)
 
 
-def prepare(
-    n: Width, m: Width, system: BatchSystem, draws: Draws, space: BatchMemory, run: int
-) -> None:
-    """Make a plant's tables."""
+def prepare(batch: Batch, run: int) -> None:
+    """Compute a plant's tables."""
+    n, m, system, draws, space = batch.n, batch.m, batch.system, batch.draws, batch.space
     size, inputs = len(n), len(m)
     A, B = run * size * size, run * size * inputs
     for j in range(size):
         BK = times(draws.B, B, load(system.K, j * inputs, m), n)
-        store(
-            space.E,
-            j * size,
-            load(draws.A, A + j * size, n) + BK - load(system.H, j * size, n),
-        )
+        column = load(draws.A, A + j * size, n) + BK - load(system.H, j * size, n)
+        store(space.E, j * size, column)
     powers(draws.A, A, space.A_k, n)
     driven(draws.A, A, space.E, system.H_k, space.X_k, n)
     reaches(
@@ -179,124 +207,89 @@ def prepare(
 
 
 def expand(
-    n: Width, m: Width, system: BatchSystem, space: BatchMemory,
-    squares: QuadraticCurves | None, factor: float,
-    x_c: Lanes, e_c: Lanes, d: Lanes, begin: int, end: int,
+    batch: Batch, squares: QuadraticCurves | None, state: Models, factor: float, begin: int,
+    end: int,
 ) -> None:  # fmt: skip
-    """Write the coefficients of degree ``begin`` to ``end``; ``squares``' are times a factor."""
+    """Write the coefficients of degree ``begin`` to ``end``; ``squares``' times a factor."""
+    n, m, system, space = batch.n, batch.m, batch.system, batch.space
     size, inputs = len(n), len(m)
     for k in range(begin, end + 1):
         table, place = k * size * size, k * size
-        model = times(system.H_k, table, x_c, n)
-        error = times(space.A_k, table, e_c, n) + times(space.X_k, table, x_c, n)
-        apart = times(system.H_k, table, d, n)
+        model = times(system.H_k, table, state.x_c, n)
+        error = times(space.A_k, table, state.e_c, n) + times(space.X_k, table, state.x_c, n)
+        apart = times(system.H_k, table, state.d, n)
         store(space.x_c, place, model)
         store(space.e_c, place, error)
         store(space.d, place, apart)
         store(space.x, place, model - error)
         store(space.u, k * inputs, times(system.K, 0, model, m))
-        if len(system.weight) == 0:
-            store(space.weighted, place, error)
-        else:
-            store(space.weighted, place, times(system.weight, 0, error, n))
+        store(space.weighted, place, weighted(batch, error))
         if squares is not None:
             put(squares, k, model - error, error + apart, factor)
-        elif len(system.weight) == 0:
-            store(space.error, place, error + apart)
         else:
-            store(space.error, place, times(system.weight, 0, error + apart, n))
+            store(space.error, place, weighted(batch, error + apart))
 
 
-def follow(
-    n: Width, m: Width, system: BatchSystem, draws: Draws, network: LossTable, space: BatchMemory,
-    squares: QuadraticCurves | None, run: int, row: Any, log: EventLog,
-) -> None:  # fmt: skip
+def weighted(batch: Batch, v: Lanes) -> Lanes:
+    """W v."""
+    if len(batch.system.weight) == 0:
+        return v
+    return times(batch.system.weight, 0, v, batch.n)
+
+
+def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) -> None:
     """Follow one run to its end."""
-    size, rule = len(n), system.rule
-    x_c = load(draws.x0, run * size, n)
+    n, system, space = batch.n, batch.system, batch.space
+    rule = system.rule
     nothing = filled(0.0, n)
-    e_c, d = nothing, nothing
-    start = math.sqrt(dot(x_c, x_c))
-    settled = system.settle * start
+    x0 = load(batch.draws.x0, run * len(n), n)
+    settled = system.settle * math.sqrt(dot(x0, x0))
     farthest_s = space.reach_s[len(space.reach_s) - 1]
-    t_s, last_s, above_s = 0.0, -1.0, 0.0
-    shortest_s, first_s = math.inf, 0.0
-    events, deliveries, status = 0, 0, OK
-    cost, best, above = 0.0, 0.0, start > settled
-    fresh, looked, agree = True, False, True
-    span, point = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0
-    auxiliary, scale, level, degree, first_degree = 0.0, 1.0, 0.0, 0, 1
+    auxiliary, first_degree = 0.0, 1
     if squares is not None:
         auxiliary, first_degree = squares.initial_dynamic_variable, 2
         if squares.decay_per_s > 0.0:
             farthest_s = min(farthest_s, SLOWEST / squares.decay_per_s)
-    if not system.known_start:
-        e_c = nothing - x_c
-        x_c = nothing
-        event = True
-    else:
-        event = False
+    event = not system.known_start
+    state = Models(nothing, nothing - x0, nothing) if event else Models(x0, nothing, nothing)
+    t_s, last_s, first_s, status = 0.0, -1.0, 0.0, OK
+    above, fresh, looked, agree = math.sqrt(dot(x0, x0)) > settled, True, False, True
+    span, point, scale, level = Span(0.0, 0.0, 0.0, 0.0, 0.0, 0), 0, 1.0, 0.0
+    begin_row(row)
     for _ in range(_MOST_PIECES if farthest_s > 0.0 else 0):
         if event:
-            if events >= system.most_events or t_s <= last_s:
+            if row.transmissions >= system.most_events or t_s <= last_s:
                 status = TOO_MANY_EVENTS
                 break
-            delivered = arrives(network)
-            if events < len(log.event_s):
-                log.event_s[events] = t_s
-                log.delivered[events] = delivered
-            if events == 0:
+            agree = count_event(batch, row, t_s, last_s)
+            if row.transmissions == 1:
                 first_s = t_s
-            else:
-                shortest_s = min(shortest_s, t_s - last_s)
-            last_s = t_s
-            events += 1
-            if delivered:
-                deliveries += 1
-                x_c = x_c - e_c
-                e_c, d, agree = nothing, nothing, True
-            else:
-                agree = False
-                d = nothing - e_c
-                if events == 1 and t_s == 0.0:
-                    w = e_c if len(system.weight) == 0 else times(system.weight, 0, e_c, n)
-                    best = max(best, math.sqrt(dot(w, w)))
-            fresh = True
+                if t_s == 0.0 and not agree:
+                    row.sup_e_c_scaled = size_of(weighted(batch, state.e_c))
+            last_s, fresh = t_s, True
+            state = updated(state, agree, nothing)
         if t_s >= system.horizon_s:
             break
         if fresh:
-            x, left, length = x_c - e_c, 0.0, 0.0
-            if squares is not None:
-                left = left_side(squares, x)
-            if rule.forecasts:
-                w = x if len(system.weight) == 0 else times(system.weight, 0, x, n)
-                length = math.sqrt(dot(w, w))
-            span = span_after(rule, t_s, left, length)
+            span = next_span(batch, squares, state, t_s)
             point, fresh, looked = span.point, False, False
             if rule.integrates:
                 auxiliary = 0.0
         phase = phase_at(rule, span, t_s)
         until_s = min(phase.until_s, system.horizon_s)
         threshold, rate = phase.threshold, phase.rate_per_s
-        # How far to look, and at which degree.
+        # The degree, and the length of the first search after an event.
         window_s = farthest_s
         if squares is not None:
-            size_now = dot(x_c, x_c) + dot(e_c, e_c) + dot(d, d)
-            scale = scale_of(math.sqrt(size_now), threshold, auxiliary)
+            scale = scale_of(size_of_state(state), threshold, auxiliary)
             level = (threshold / scale) * (threshold / scale)
-        expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, 0, first_degree)
+        expand(batch, squares, state, 1.0 / scale, 0, first_degree)
         if phase.compares and not looked:
-            if not is_within(x_c, e_c, d, _LARGEST, threshold):
+            if not is_within(state.x_c, state.e_c, state.d, _LARGEST, threshold):
                 status = DIVERGED
                 break
             if squares is None:
-                first = load(space.error, size, n)
-                speed = math.sqrt(dot(first, first))
-                if rule.integrates:  # an error of constant speed: its integral is ½ speed s²
-                    left_s = math.sqrt(2.0 * max(threshold - auxiliary, 0.0) / max(speed, 1e-300))
-                    window_s = min(window_s, _AHEAD * left_s)
-                elif speed * window_s > _AHEAD * threshold:
-                    window_s = _AHEAD * threshold / speed
+                window_s = min(window_s, first_window(batch, threshold, auxiliary))
             else:
                 soon_s = first_look(squares, level, 2.0 * rate, auxiliary / (scale * scale))
                 window_s = min(window_s, max(_AHEAD * soon_s, point * rule.grid_s - t_s))
@@ -305,24 +298,23 @@ def follow(
         if closes:
             window_s = until_s - t_s
         p = degree_for(space.reach_s, window_s)
-        expand(n, m, system, space, squares, 1.0 / scale, x_c, e_c, d, first_degree + 1, p)
+        expand(batch, squares, state, 1.0 / scale, first_degree + 1, p)
+        # The event.
         found_s = NONE
-        if squares is not None and (phase.compares or len(squares.gain) > 0):
-            degree = compare(squares, p, auxiliary / (scale * scale))
-        if rule.integrates:
+        if squares is not None:
+            if phase.compares or len(squares.gain) > 0:
+                degree = compare(squares, p, auxiliary / (scale * scale))
+                if phase.compares:
+                    found_s, point = first_event(
+                        squares, rule, degree, level, 2.0 * rate, point, t_s, window_s
+                    )
+        elif rule.integrates:
             found_s, auxiliary = first_excess(
                 space.error, p, auxiliary, threshold if phase.compares else math.inf, rate,
                 window_s, n,
             )  # fmt: skip
         elif phase.compares:
-            if squares is None:
-                found_s = first_exit(
-                    space.error, p, threshold, rate, window_s, False, MOST_STEPS, n
-                )
-            else:
-                found_s, point = first_event(
-                    squares, rule, degree, level, 2.0 * rate, point, t_s, window_s
-                )
+            found_s = first_exit(space.error, p, threshold, rate, window_s, False, MOST_STEPS, n)
         if found_s == UNRESOLVED:
             status = UNDECIDED
             break
@@ -332,55 +324,147 @@ def follow(
             auxiliary = reserve_at(squares, p, spent_s) * (scale * scale)
         p = degree_for(space.reach_s, spent_s)
         x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
-        d = value(space.d, p, spent_s, n)
-        growth, rise = math.exp(system.fading_per_s * t_s), math.exp(system.fading_per_s * spent_s)
-        faded = threshold
-        if rate > 0.0:
-            # Where it fades as the supremum is scaled, an exponential is saved.
-            faded *= 1.0 / rise if rate == system.fading_per_s else math.exp(-rate * spent_s)
-        if not is_within(x_c, e_c, d, _LARGEST, faded):
+        state = Models(x_c, e_c, value(space.d, p, spent_s, n))
+        # The end of a run that diverges.
+        decayed = threshold * math.exp(-rate * spent_s) if rate > 0.0 else threshold
+        if not is_within(state.x_c, state.e_c, state.d, _LARGEST, decayed):
             status = DIVERGED
             t_s += passed_at(
                 space.x_c, space.e_c, space.d, p, spent_s, _LARGEST, threshold, rate, n
             )
             break
-        # What the piece is worth.
-        q = degree_for(space.measured_s, spent_s)
-        cost += square_integrals(
-            space.x, space.u, q, spent_s, system.Q, system.R, system.inverse,
-            space.x_scaled, space.u_scaled, n, m,
-        )  # fmt: skip
-        weighted = e_c if len(system.weight) == 0 else times(system.weight, 0, e_c, n)
-        grown = growth * rise
-        best = max(best, math.sqrt(dot(weighted, weighted)) * grown)
         # While both models agree, e_c is e_s, which is below a threshold that meets it at an event.
         ceiling = math.inf
         if agree and phase.compares and squares is None and not rule.integrates:
-            ceiling = threshold * (grown if rate == 0.0 else growth)
-        if not ceiling <= best * (1.0 + CERTAINTY):
-            best = raised(
-                best, space.weighted, q, spent_s, system.fading_per_s, growth, space.squares, n
-            )
-        within_s = last_above(space.x, q, spent_s, settled, x_c - e_c, n)
-        if best == UNRESOLVED or within_s == UNRESOLVED:
+            until = t_s + (spent_s if rate == 0.0 else 0.0)
+            ceiling = threshold * math.exp(system.fading_per_s * until)
+        within_s = measure_piece(batch, row, state, Piece(t_s, spent_s, settled, ceiling))
+        if within_s == UNRESOLVED:
             status = UNDECIDED
             break
-        if within_s != NONE:
-            above_s = t_s + within_s
         above = within_s == spent_s
         t_s = until_s if closes and not event else t_s + spent_s
         event = event or t_s >= span.due_s
     else:
         status = UNDECIDED
-    x = x_c - e_c
-    row.transmissions = events
-    row.deliveries = deliveries
-    row.inter_event_min_s = shortest_s if events > 1 else math.nan
-    row.inter_event_mean_s = (last_s - first_s) / (events - 1) if events > 1 else math.nan
-    finished = status == OK
-    row.settling_s = above_s if finished and not above else math.nan
-    row.cost = cost if finished else math.nan
-    row.sup_e_c_scaled = best if finished else math.nan
-    row.final_norm = math.sqrt(dot(x, x)) if finished else math.nan
+    finish_row(row, status, t_s, last_s - first_s, above, size_of(state.x_c - state.e_c))
+
+
+def begin_row(row: Any) -> None:
+    """Set a row to what holds before the first event."""
+    row.transmissions = 0
+    row.deliveries = 0
+    row.inter_event_min_s = math.inf
+    row.cost = 0.0
+    row.sup_e_c_scaled = 0.0
+    row.settling_s = 0.0
+
+
+def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, norm: float) -> None:
+    """Complete a row.
+
+    Args:
+        row: with sums and extremes so far.
+        status: how the run ended.
+        t_s: its end.
+        span_s: time from its first event to its last.
+        above: whether ‖x‖ is above the settling level at the end.
+        norm: ‖x‖ at the end.
+    """
+    gaps, finished = row.transmissions - 1, status == OK
+    row.inter_event_min_s = row.inter_event_min_s if gaps > 0 else math.nan
+    row.inter_event_mean_s = span_s / gaps if gaps > 0 else math.nan
+    row.settling_s = row.settling_s if finished and not above else math.nan
+    row.cost = row.cost if finished else math.nan
+    row.sup_e_c_scaled = row.sup_e_c_scaled if finished else math.nan
+    row.final_norm = norm if finished else math.nan
     row.diverged_at_s = t_s if status == DIVERGED else math.nan
     row.status = status
+
+
+def count_event(batch: Batch, row: Any, t_s: float, last_s: float) -> bool:
+    """Count an event; return whether its update arrives."""
+    delivered, log = arrives(batch.network), batch.log
+    if row.transmissions < len(log.event_s):
+        log.event_s[row.transmissions] = t_s
+        log.delivered[row.transmissions] = delivered
+    if row.transmissions > 0:
+        row.inter_event_min_s = min(row.inter_event_min_s, t_s - last_s)
+    row.transmissions += 1
+    if delivered:
+        row.deliveries += 1
+    return delivered
+
+
+def updated(state: Models, delivered: bool, nothing: Lanes) -> Models:
+    """The models after an event: x_s = x, and x_c = x if the update arrives."""
+    if delivered:
+        return Models(state.x_c - state.e_c, nothing, nothing)
+    return Models(state.x_c, state.e_c, nothing - state.e_c)
+
+
+def next_span(
+    batch: Batch, squares: QuadraticCurves | None, state: Models, t_s: float
+) -> Span:  # fmt: skip
+    """The rule after an event, or from the start on."""
+    x, left, length = state.x_c - state.e_c, 0.0, 0.0
+    if squares is not None:
+        left = left_side(squares, x)
+    if batch.system.rule.forecasts:
+        length = size_of(weighted(batch, x))
+    return span_after(batch.system.rule, t_s, left, length)
+
+
+def first_window(batch: Batch, threshold: float, auxiliary: float) -> float:
+    """The length of the first search after an event, if the error keeps its first speed."""
+    speed = size_of(load(batch.space.error, len(batch.n), batch.n))
+    if speed == 0.0:
+        return math.inf
+    if batch.system.rule.integrates:  # of an error that grows in proportion to time: ½ speed s²
+        return _AHEAD * math.sqrt(2.0 * max(threshold - auxiliary, 0.0) / speed)
+    return _AHEAD * threshold / speed
+
+
+def measure_piece(batch: Batch, row: Any, end: Models, piece: Piece) -> float:
+    """Add what a piece contributes to a row.
+
+    Args:
+        batch: with the coefficients of the piece.
+        row: with sums and extremes so far.
+        end: the state at its end.
+        piece: the piece.
+
+    Returns:
+        The last time on the piece at which ‖x‖ is above the settling level; NONE; or UNRESOLVED.
+    """
+    n, system, space = batch.n, batch.system, batch.space
+    q = degree_for(space.measured_s, piece.length_s)
+    row.cost += square_integrals(
+        space.x, space.u, q, piece.length_s, system.Q, system.R, system.inverse,
+        space.x_scaled, space.u_scaled, n, batch.m,
+    )  # fmt: skip
+    growth = math.exp(system.fading_per_s * piece.t_s)
+    rise = math.exp(system.fading_per_s * piece.length_s)
+    best = max(row.sup_e_c_scaled, size_of(weighted(batch, end.e_c)) * growth * rise)
+    if not piece.ceiling <= best * (1.0 + CERTAINTY):
+        best = raised(
+            best, space.weighted, q, piece.length_s, system.fading_per_s, growth, space.squares, n
+        )
+    if best == UNRESOLVED:
+        return UNRESOLVED
+    row.sup_e_c_scaled = best
+    within_s = last_above(space.x, q, piece.length_s, piece.settled, end.x_c - end.e_c, n)
+    if within_s >= 0.0:
+        row.settling_s = piece.t_s + within_s
+    return within_s
+
+
+def size_of(v: Lanes) -> float:
+    """‖v‖."""
+    return math.sqrt(dot(v, v))
+
+
+def size_of_state(state: Models) -> float:
+    """The norm of (x_c, e_c, d)."""
+    x_c, e_c, d = state.x_c, state.e_c, state.d
+    return math.sqrt(dot(x_c, x_c) + dot(e_c, e_c) + dot(d, d))

@@ -162,7 +162,7 @@ def _work(
     if campaign.time == "sampled":
         alone = in_virtual_time(scenario)
         return SampledWork(alone, campaign.seed, Q, R, settle, most_events), None
-    if resolved.is_acknowledged:
+    if resolved.protocol.acknowledges:
         raise CallerError(
             'network.protocol: continuous time needs the loop without acknowledgements, "none"; '
             'time = "sampled" takes both'

@@ -217,7 +217,7 @@ def test_the_summary_counts_acknowledgements() -> None:
     assert summarise(MESS, 0, "horizon").to_json()["rejected_datagrams"]["sensor"].keys() <= {
         "length", "version", "run", "flow", "tag", "stale",
     }  # fmt: skip
-    assert "acknowledgements" not in summarise(simulate(plain()), 0, "horizon").to_json()
+    assert summarise(simulate(plain()), 0, "horizon").acknowledgements is None
 
 
 def test_a_run_is_replayed_bit_for_bit() -> None:
@@ -324,4 +324,4 @@ def test_settings_of_a_way_back_that_there_is_not_are_a_mistake() -> None:
 
 def test_a_way_back_is_of_no_effect_where_there_is_said_to_be_none() -> None:
     back = ("network.protocol=none", "network.acknowledgements.timeout_s=0.1")
-    assert not plain(*back).is_acknowledged
+    assert not plain(*back).protocol.acknowledges

@@ -193,9 +193,9 @@ def test_a_law_that_fails_sends_the_safe_input_from_then_on(
     assert message in notice["text"]
     assert set(record[CONTROLLER_STEP]["u"][:, 0]) <= {0.0, 0.25}
     assert record[CONTROLLER_STEP]["u"][-1] == 0.25
-    end = summarise(record, ExitStatus.OK, "")["exit"]
-    assert end["status"] == ExitStatus.FAILED
-    assert message in end["reason"]
+    end = summarise(record, ExitStatus.OK, "").exit
+    assert end.status == ExitStatus.FAILED
+    assert message in end.reason
 
 
 def test_the_law_receives_each_update_at_its_own_time(tmp_path: Path) -> None:

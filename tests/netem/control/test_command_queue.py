@@ -3,10 +3,12 @@ import threading
 import pytest
 
 from netem.control.command_queue import CommandQueue
+from netem.engine.plain_direction import PlainDirection
+from netem.link_machine import Datagram
 from netem.words.words_to_settings import settings_of
 from noack.core.errors import CallerError, PeerError
 from noack.impairments.link_records import Counters
-from tests.netem.control.relays import FakeRelay
+from tests.netem.control.relays import SETTINGS, FakeRelay, spec_of
 
 
 def test_the_relay_is_touched_in_its_own_thread_only(
@@ -70,3 +72,11 @@ def test_a_relay_that_is_stuck_is_not_waited_for_forever(
         commands.snapshot()
     commands.run_pending()  # what nobody waits for any more is not done
     assert relay.threads == set()
+
+
+def test_a_report_of_the_plain_engine_does_not_change_afterwards() -> None:
+    """Rates are differences of two reports."""
+    direction = PlainDirection(spec_of("up"), "forward", SETTINGS)
+    before = direction.report(()).counters
+    direction.link.handle(Datagram(0, b"x"), 0)
+    assert (before.arrived, direction.report(()).counters.arrived) == (0, 1)

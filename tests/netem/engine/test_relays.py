@@ -29,7 +29,7 @@ from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_records import RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate
 from tests.netem.engine.relays import HOSTS, KeepAll, drain, endpoints, link, name_of, running

@@ -10,7 +10,7 @@ from netem.link_machine import Link
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.link_settings import LinkSettings
 from noack.impairments.loss_models import Loss
-from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 

@@ -18,7 +18,7 @@ from noack.impairments.loss_models.bernoulli import BernoulliLoss
 from noack.impairments.loss_models.four_state import FourStateLoss
 from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
 from noack.impairments.loss_models.lossless import NoLoss
-from noack.impairments.loss_models.periodic import PeriodicLoss
+from noack.impairments.loss_models.periodic_loss import PeriodicLoss
 from noack.impairments.loss_models.scripted import ScriptedLoss
 from noack.impairments.loss_models.worst_case import WorstCaseLoss
 from noack.protocol.record_tables import Fate

@@ -23,7 +23,7 @@ from noack.trigger.dwell import DwellTrigger
 from noack.trigger.dynamic import DynamicTrigger
 from noack.trigger.lyapunov import LyapunovTrigger
 from noack.trigger.mixed import MixedTrigger
-from noack.trigger.periodic import PeriodicTrigger
+from noack.trigger.periodic_trigger import PeriodicTrigger
 from noack.trigger.quadratic import QuadraticTrigger
 from noack.trigger.relative import relative_trigger
 from noack.trigger.self_triggered import SelfTrigger

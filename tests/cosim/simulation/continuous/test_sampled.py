@@ -181,7 +181,7 @@ def policies(n: int) -> list[dict[str, Any]]:
             "sigma": 0.3,
             "theta_s": 0.1,
             "decay_per_s": 0.5,
-            "dynamic_variable": 0.01,
+            "eta_0": 0.01,
         },
     ]
     timed = [
