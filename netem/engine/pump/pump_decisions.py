@@ -84,7 +84,16 @@ def decide(
     number = 2 * link + reverse
     direction = memory.directions[number]
     program = _program_at(program_like, direction)
-    state = _state_at(memory, state_like, number)
+    # Compiled code cannot return records, so that no function makes this.
+    state = LinkMemory(
+        array_at(state_like.flows, direction.flows, direction.rows, 0),
+        array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
+        array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
+        array_at(state_like.queues, direction.queues, direction.stages_rows, 0),
+        array_at(state_like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
+        memory.link_states[number],
+        memory.counters[number],
+    )
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
@@ -140,20 +149,6 @@ def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
         direction.mansd,
         direction.limit,
         direction.tracks != 0,
-    )
-
-
-def _state_at(memory: Memory, like: LinkMemory, number: int) -> LinkMemory:
-    """Return the state of direction ``number``."""
-    direction = memory.directions[number]
-    return LinkMemory(
-        array_at(like.flows, direction.flows, direction.rows, 0),
-        array_at(like.memory, direction.memory, direction.rows, direction.stages_rows),
-        array_at(like.recent_ns, direction.recent_ns, direction.rows, direction.width),
-        array_at(like.queues, direction.queues, direction.stages_rows, 0),
-        array_at(like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
-        memory.link_states[number],
-        memory.counters[number],
     )
 
 
@@ -243,8 +238,18 @@ def _line_up(memory: Memory, state_like: LinkMemory) -> None:
     pump = memory.pump[0]
     leaving = memory.leaving[pump.leaving]
     number = leaving.direction
+    direction = memory.directions[number]
+    state = LinkMemory(
+        array_at(state_like.flows, direction.flows, direction.rows, 0),
+        array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
+        array_at(state_like.recent_ns, direction.recent_ns, direction.rows, direction.width),
+        array_at(state_like.queues, direction.queues, direction.stages_rows, 0),
+        array_at(state_like.departures_ns, direction.departures_ns, direction.departure_rows, 0),
+        memory.link_states[number],
+        memory.counters[number],
+    )
     leaving.stale = leave(
-        _state_at(memory, state_like, number),
+        state,
         memory.clients[leaving.client].place,
         leaving.packet,
         leaving.size_bytes,
