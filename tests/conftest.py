@@ -1,7 +1,7 @@
-"""What all tests share: one thread, Hypothesis without wall time or chance, a small scenario.
+"""Shared by all tests: one thread, Hypothesis without wall time or randomness, a small scenario.
 
-Without chance the same examples are tried every time: a few will do. A thousand new ones of each
-are tried with ``--hypothesis-profile search``.
+The same few examples are tried every time; ``--hypothesis-profile search`` tries a thousand new
+ones of each.
 """
 
 import os
@@ -9,7 +9,7 @@ import signal
 from collections.abc import Iterator
 from typing import Any
 
-# Before numpy is imported: threads only get into each other's way with small matrices.
+# Before numpy is imported: threads slow small matrices down.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import pytest
@@ -38,8 +38,8 @@ settings.load_profile("noack")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = in_order(items)
     if settings().derandomize:
-        # Hypothesis would try numbers of the modules that are loaded, and these depend on which
-        # tests this worker has run before.
+        # Hypothesis would also try constants of the loaded modules, which depend on the tests that
+        # this worker has run before.
         providers._get_local_constants = providers.Constants
 
 
@@ -50,20 +50,20 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LongestFirst
 
 @pytest.fixture(scope="session", autouse=True)
 def no_signal_is_ignored_by_children() -> Iterator[None]:
-    """Let processes that tests start hear signals, although this one was told to ignore some.
+    """Let processes that tests start receive signals that this process ignores.
 
-    What a shell starts in the background ignores SIGINT, what nohup starts SIGHUP, and their
-    children inherit it. A handler that does nothing is as good here, and is not inherited.
+    A shell's background process ignores SIGINT, a process under nohup SIGHUP, and their children
+    inherit that. A handler that does nothing is not inherited.
     """
-    deaf = [
+    ignored = [
         number
         for name in ("SIGINT", "SIGHUP", "SIGTERM", "SIGQUIT")
         if (number := getattr(signal, name, None)) and signal.getsignal(number) is signal.SIG_IGN
     ]
-    for number in deaf:
+    for number in ignored:
         signal.signal(number, lambda *_: None)
     yield
-    for number in deaf:
+    for number in ignored:
         signal.signal(number, signal.SIG_IGN)
 
 

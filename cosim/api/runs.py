@@ -208,7 +208,7 @@ class Run:
         yield (
             "events",
             f"{found['events']}; {found['deliveries']} received, {found['drops']} lost, "
-            f"at most {found['longest_loss_burst']} in a row",
+            f"longest loss burst {found['longest_loss_burst']}",
         )
         norms = (found["initial_state_norm"], found["final_state_norm"])
         yield "‖x‖", " → ".join("unknown" if norm is None else f"{norm:.3g}" for norm in norms)

@@ -1,7 +1,7 @@
-"""Where compiled code is kept from one run to the next: in the user's cache, or nowhere.
+"""The cache of compiled code, in the user's cache folder.
 
-Whoever can write there runs code as the user: numba unpickles what it finds. Nothing is kept, or
-read, where that may be another user.
+numba unpickles cached files, so that another user who can write there could run code as this user.
+A folder that another user can change is neither read nor written.
 """
 
 import hashlib
@@ -26,10 +26,10 @@ _KEPT_S = 30 * 24 * 3600
 
 
 def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
-    """Return where code of these sources is kept; None if it cannot be kept.
+    """Return the cache folder for code of these sources; None if there can be none.
 
-    The folder's name depends on what all the sources say: numba itself looks at the file of the
-    outermost function only. It and all above it can be changed by the user and root alone.
+    The folder's name depends on the content of all sources: numba itself checks the file of the
+    outermost function only. Only the user and root can change it and the folders above it.
     """
     digest = hashlib.blake2b(version("numba").encode(), digest_size=8)
     for source in sources:
@@ -44,7 +44,7 @@ def cache_folder(name: str, sources: Iterable[Path]) -> Path | None:
         with tempfile.TemporaryFile(dir=folder) as probe:
             if next(folder.rglob("*.nbi"), None) is None:
                 os.posix_fallocate(probe.fileno(), 0, _ROOM_BYTES)
-    except (OSError, RuntimeError):  # not writable, another user's, full, or there is no home
+    except (OSError, RuntimeError):  # not writable, another user's, full, or no home
         return None
     return folder
 
@@ -69,16 +69,16 @@ def _make_own(folder: Path) -> None:
 
 
 def _examine(file: Path) -> None:
-    """Require that a file is the user's; remove it if it is useless."""
+    """Require that a file is the user's; remove it if it is empty."""
     with suppress(FileNotFoundError):  # another process renames what it has written
         status = file.lstat()
         _require_own(file, status)
         if file.suffix in (".nbi", ".nbc") and status.st_size == 0:
-            file.unlink()  # what a power failure leaves; numba fails on it for ever
+            file.unlink()  # left by a power failure; numba would fail on it
 
 
 def _others_may_write(status: os.stat_result) -> bool:
-    """Whether others may replace what is the user's; in a sticky folder they may not."""
+    """Whether others may replace the user's files; in a sticky folder they may not."""
     return bool(status.st_mode & 0o022) and not status.st_mode & stat.S_ISVTX
 
 
@@ -93,14 +93,14 @@ def is_kept(folder: Path | None, function: Callable[..., Any]) -> bool:
 
 
 def while_compiling(what: str, kept: bool, about_s: float | None = None) -> str:
-    """What a waiting person should know about what takes so long."""
+    """Line that explains the wait for a compilation."""
     once = "once" if kept else "as the user's cache (XDG_CACHE_HOME) cannot be used"
     time = " ..." if about_s is None else f"; this takes about {about_s:.0f} s"
     return f"compiling {what} for this machine, {once}{time}"
 
 
 def _forget_old(folder: Path, name: str) -> None:
-    """Delete what was compiled from other sources, and has not been used for long."""
+    """Delete code of other sources that has not been used for 30 days."""
     os.utime(folder)
     for other in folder.parent.glob(f"{name}-*"):
         if other.stat().st_mtime < time.time() - _KEPT_S:
@@ -108,9 +108,9 @@ def _forget_old(folder: Path, name: str) -> None:
 
 
 def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return what compiles a function, and keeps it in a folder if there is one.
+    """Return a compiler of functions that caches in a folder, if there is one.
 
-    Without one numba must not keep anything: it would find code elsewhere that is of other rules.
+    Without a folder numba must not cache at all: it could find code of other sources elsewhere.
     """
     if folder is None:
         compiling: Callable[[Callable[..., Any]], Any] = _numba().njit(**options)
@@ -126,11 +126,11 @@ def compiler(folder: Path | None, **options: Any) -> Callable[[Callable[..., Any
 
 
 def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any], Any]:
-    """Let one process at a time compile; the others find what it kept."""
+    """Let one process compile at a time; the others then read the cache."""
 
     def compile_alone(signature: Any) -> Any:
         with ExitStack() as stack:
-            with suppress(OSError):  # where files cannot be locked all of them compile
+            with suppress(OSError):  # without file locks all of them compile
                 stack.enter_context(locked(lock, wait=True))
             with _to_the_end():
                 return compiling(signature)
@@ -140,7 +140,7 @@ def _one_at_a_time(compiling: Callable[[Any], Any], lock: Path) -> Callable[[Any
 
 @contextmanager
 def _to_the_end() -> Iterator[None]:
-    """Let Ctrl-C wait: LLVM calls Python back, and does not survive an exception there."""
+    """Delay Ctrl-C: LLVM calls Python back, and does not survive an exception there."""
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield

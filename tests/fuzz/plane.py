@@ -1,4 +1,4 @@
-"""A control plane without zenoh: what arrives on it is what a test puts there."""
+"""A control plane without zenoh: messages are put there by the test."""
 
 import json
 from collections import deque
@@ -31,7 +31,7 @@ class Sample:
 
 @dataclass
 class Query:
-    """A question, and what was answered."""
+    """A request and its answers."""
 
     key_expr: str
     data: bytes | None
@@ -39,7 +39,7 @@ class Query:
     error: str | None = None
     answered: int = 0
     dismissed: bool = False
-    """Whether it was left without an answer, which who asks is told of, to ask again."""
+    """Whether it was dropped unanswered, so that the process sends it again."""
 
     @property
     def payload(self) -> Payload | None:
@@ -63,7 +63,7 @@ class _Channel(deque[Any]):
 
 
 class FakePlane:
-    """What the recorder and the coordinator use of the plane, and of its session."""
+    """What recorder and coordinator use of the control plane and its session."""
 
     def __init__(self) -> None:
         self.is_closed = False

@@ -1,4 +1,4 @@
-"""Runs the real processes on ephemeral loopback ports, faster than the wall."""
+"""Runs real processes on ephemeral loopback ports, faster than real time."""
 
 import json
 import os
@@ -16,7 +16,7 @@ import pytest
 
 EPHEMERAL = ("--set", "ports={}")
 BARE = (*EPHEMERAL, "--no-report")
-"""Nobody looks at most of these runs; what wants a report says ``--report``."""
+"""Without a report; tests that need one add ``--report``."""
 ROLE_MODULES = {
     "recorder": "cosim.live.recorder",
     "netem": "netem",
@@ -48,7 +48,7 @@ def settings(**values: object) -> list[str]:
 
 
 def command_of(process: psutil.Process) -> list[str]:
-    """A process's command line; of one that has ended, or has only just been forked, nothing."""
+    """Command line of a process; empty if it has ended or was just forked."""
     try:
         return process.cmdline()
     except psutil.NoSuchProcess:  # a zombie, too
@@ -56,7 +56,7 @@ def command_of(process: psutil.Process) -> list[str]:
 
 
 def is_over(process: psutil.Process) -> bool:
-    """Whether a process has ended; its parent need not have noticed."""
+    """Whether a process has ended, or is a zombie."""
     try:
         return process.status() == psutil.STATUS_ZOMBIE
     except psutil.NoSuchProcess:
@@ -64,7 +64,7 @@ def is_over(process: psutil.Process) -> bool:
 
 
 def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
-    """The process of a role that a launcher has started; None if there is none at the moment."""
+    """The launched process of a role; None if there is none at the moment."""
     for child in psutil.Process(parent.pid).children():
         if ROLE_MODULES[role] in command_of(child):
             return child
@@ -73,11 +73,11 @@ def child_of(parent: subprocess.Popen[str], role: str) -> psutil.Process | None:
 
 RATE_HZ = 100.0
 AT_RATE = settings(plant__rate_hz=RATE_HZ, controller__rate_hz=RATE_HZ)
-"""A fifth of the scenario's: where the rate is not the point, five processes need less of a CPU."""
+"""A fifth of the scenario's rate, to need less CPU time."""
 
 
 def private_files(folder: Path) -> list[Path]:
-    """What is kept for the user alone, whose runtime directory a folder is."""
+    """The private files below a runtime directory."""
     return [path for path in (folder / f"noack-{os.getuid()}").rglob("*") if path.is_file()]
 
 
@@ -94,7 +94,7 @@ def run_scenario(runs: Path, *arguments: str) -> Finished:
 
 
 class Running:
-    """A run under way."""
+    """A running run."""
 
     def __init__(self, runs: Path, process: subprocess.Popen[str]) -> None:
         self.runs = runs
@@ -113,7 +113,7 @@ class Running:
         raise AssertionError(f"no process of {role}")
 
     def udp_port(self, role: str) -> int:
-        """Where a process of the loop hears whoever sends to it."""
+        """The receiving port of a process of the loop."""
         connections = self.child(role).net_connections("udp4")
         (port,) = {one.laddr.port for one in connections if not one.raddr}
         return int(port)
@@ -124,7 +124,7 @@ class Running:
         return Finished(self.process.returncode, summary, stderr, (self.runs / "latest").resolve())
 
     def finish_unstarted(self) -> str:
-        """The error of a run that never began."""
+        """The error of a run that never started."""
         stdout, _ = self.process.communicate(timeout=PATIENCE_S)
         assert self.process.returncode == 1
         error: str = json.loads(stdout)["error"]
@@ -138,20 +138,20 @@ class Running:
 def wait_for(condition: Callable[[], bool]) -> None:
     deadline_s = time.monotonic() + PATIENCE_S
     while not condition():
-        assert time.monotonic() < deadline_s, "waited in vain"
+        assert time.monotonic() < deadline_s, "timed out"
         time.sleep(0.02)
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Running]]:
-    """Start ``noack run`` in the background; whatever is left is killed at the end."""
+    """Start ``noack run`` in the background; remaining processes are killed at the end."""
     with begun(tmp_path) as begin:
         yield begin
 
 
 @contextmanager
 def begun(folder: Path) -> Iterator[Callable[..., Running]]:
-    """What ``start`` is, for fixtures of a module."""
+    """As ``start``, for fixtures of a module."""
     started: list[Running] = []
 
     def begin(*arguments: str, command: tuple[str, ...] = ("run", "lane_following")) -> Running:
@@ -179,7 +179,7 @@ def begun(folder: Path) -> Iterator[Callable[..., Running]]:
 
 @pytest.fixture
 def by_hand(tmp_path: Path) -> Iterator[Callable[[str], subprocess.Popen[str]]]:
-    """Start one process as a person would; whatever is left is killed at the end."""
+    """Start one process by hand; remaining processes are killed at the end."""
     started: list[subprocess.Popen[str]] = []
 
     def begin(role: str) -> subprocess.Popen[str]:

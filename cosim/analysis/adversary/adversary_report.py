@@ -1,4 +1,4 @@
-"""What ``noack adversary`` says."""
+"""The results of ``noack adversary``, as a table and as JSON."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +9,7 @@ from rich.table import Table
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.tightness import Worst
 from noack.config.scenario import Scenario
+from noack.core.number_format import number
 from noack.theory.scenario_certificates import ScenarioCertificate
 
 
@@ -31,26 +32,26 @@ def print_worst(
 ) -> None:
     """Print the results, and the patterns that led to them."""
     table = Table(
-        title=f"{resolved.name}: the worst losses, at most M − 1 = {resolved.network.mansd} "
-        f"in a row, {resolved.horizon_s:g} s"
+        title=f"{resolved.name}: worst losses found, at most M − 1 = {resolved.network.mansd} "
+        f"consecutive, {resolved.horizon_s:g} s"
     )
-    for heading in ("", "no loss", "as seeded", "worst", "certified", "tightness"):
+    for heading in ("", "no loss", "own seed", "worst", "certified", "worst / certified"):
         table.add_column(heading, justify="right" if heading else "left")
     for worst in found:
         values = (worst.lossless, worst.own, worst.value, worst.certified)
         table.add_row(
             _quantity(worst.objective, certificate),
-            *map(_number, values),
-            "[bold red]breached[/]" if worst.breaches else _number(worst.tightness),
+            *(number(value, 4) for value in values),
+            "[bold red]exceeded[/]" if worst.breaches else number(worst.tightness, 4),
         )
     console.print(table)
     for worst in found:
         at = "" if worst.at_s is None else f"at {worst.at_s:.6f} s; "
-        how = "no pattern is worse" if worst.exact else "not all patterns were tried"
+        how = "all patterns searched" if worst.exact else "not all patterns searched"
         speed = f"{worst.nodes:,} segments, {worst.nodes / worst.elapsed_s:,.0f}/s"
         console.print(f"{worst.objective.value}: {at}{how} ({speed})")
         console.print(f"  {worst.text}", soft_wrap=True, highlight=False)
-    console.print("[dim]D delivered, · lost; --json tells the times of the events[/]")
+    console.print("[dim]D delivered, · lost; --json prints the times of the events[/]")
 
 
 def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
@@ -65,7 +66,3 @@ def _quantity(objective: Objective, certificate: ScenarioCertificate) -> str:
         Objective.COST: "∫ ‖x‖² dt",
         Objective.INTER_EVENT: "inter-event time, s",
     }[objective]
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"

@@ -36,7 +36,7 @@ def one_input(data: bytes) -> None:
         choices = Choices(data[1:])
         content = edited(choices, choices.one([TICKET, SESSION]), KNOWN)
         data = json.dumps(content).encode()
-    with refusal("not a ticket"):
+    with refusal("not a valid ticket"):
         found = join_ticket.loads(data.decode("utf-8", "replace"))
         assert join_ticket.loads(found.dumps()) == found
         assert len(found.key) == 32

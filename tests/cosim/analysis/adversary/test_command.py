@@ -39,7 +39,7 @@ def test_json_tells_everything() -> None:
 def test_a_person_sees_the_patterns_of_one_objective() -> None:
     status, stdout, _ = run("--objective", "error", "--nodes", "0", "--beam", "8", *SHORT)
     assert status == ExitStatus.OK
-    assert "not all patterns were tried" in stdout
+    assert "not all patterns searched" in stdout
     assert "D····" in stdout
     assert "cost" not in stdout
 

@@ -222,15 +222,6 @@ def test_every_sample_is_in_the_file_exactly(tmp_path: Path, indexed: bool) -> N
     np.testing.assert_array_equal(values, np.stack((np.arange(K), -np.arange(K)), axis=1))
 
 
-def test_what_was_flushed_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    with new_view(path, indexed=False) as view:
-        add_samples(view, 2)
-        view.flush()
-        t_ns, _ = series(read(path), "state/V")
-        np.testing.assert_array_equal(t_ns, times(0, 2 * K))
-
-
 def test_series_have_names_and_one_colour_for_one_meaning(tmp_path: Path) -> None:
     path = tmp_path / "recording.rrd"
     new_view(path).close()
@@ -313,7 +304,7 @@ def test_the_plots_show_the_whole_run_and_room_for_marks_and_tick_labels(
     assert 1.05 * 20 * S < whole["end"] < 1.1 * 20 * S
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 4, 5, 16, 17, 64])
+@pytest.mark.parametrize("n", [1, 4, 5, 17])
 def test_every_coordinate_has_a_panel(tmp_path: Path, n: int) -> None:
     path = tmp_path / "recording.rrd"
     states = [f"x{i}" for i in range(n)]
@@ -416,29 +407,9 @@ def test_a_wrong_shape_is_named(tmp_path: Path) -> None:
             view.inputs(times(0, 2), x)
 
 
-def test_closing_twice_is_closing_once(tmp_path: Path) -> None:
-    view = new_view(tmp_path / "recording.rrd")
-    view.close()
-    view.close()
-
-
-def test_a_recording_can_be_written_anew(tmp_path: Path) -> None:
-    path = tmp_path / "recording.rrd"
-    for batches in (3, 2):
-        with new_view(path) as view:
-            add_samples(view, batches)
-    assert rows_of(path) == 2 * K
-
-
 def test_a_file_that_cannot_be_created_is_named(tmp_path: Path) -> None:
     with pytest.raises(ViewError, match=r"nowhere/recording.rrd: cannot create"):
         new_view(tmp_path / "nowhere" / "recording.rrd")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_a_full_disk_is_told() -> None:
-    with pytest.raises(ViewError, match=r"/dev/full: .*No space left"):
-        new_view(Path("/dev/full"))
 
 
 def test_a_disk_that_fills_during_the_run_is_told_at_the_latest_on_closing(tmp_path: Path) -> None:
