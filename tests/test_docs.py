@@ -141,9 +141,7 @@ def test_every_snippet_runs(snippet: str, run_folder: Path) -> None:
 
 def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
     for key, field in section.model_fields.items():
-        kind = field.annotation
-        if key == "controller":  # a table of a kind; each kind has these keys
-            kind = ControllerSettings
+        kind = ControllerSettings if prefix + key == "controller" else field.annotation
         if isinstance(kind, type) and issubclass(kind, BaseModel):
             yield from keys_of(kind, f"{prefix}{key}.")
         else:

@@ -42,10 +42,10 @@ _ROUNDING = 1e-9
 _NUDGE = 1e-13
 """Relative to x(0): about what rounding amounts to. If this changes a run, so does rounding."""
 _PARTED_PERIODS = 10
-"""Events further apart than so many measurements are told: the event sequences have parted."""
+"""The event sequences differ from the first event that is further apart, in measurements."""
 _LARGEST = 1e100
 _STEPS_AT_THE_END, _EVENTS_AT_THE_END = 500_000, 10_000
-"""A longer run is compared only if somebody asks: its end should not take longer than seconds."""
+"""A longer run is compared on request only, so that the end of a run takes seconds."""
 _STAGES = ("sampling", "delay", "held actuation", "residual")
 
 

@@ -27,7 +27,7 @@ _LARGEST = 1e100
 
 
 class IncomparableError(CallerError):
-    """The run's record does not allow the comparison; the message says why."""
+    """The run's record does not allow the comparison; the message has the reason."""
 
 
 class LiveRun(NamedTuple):
@@ -44,7 +44,7 @@ def live_run(record: RunRecord) -> LiveRun:
     """Read what happened in a run.
 
     Raises:
-        IncomparableError: the run diverged, a process was started anew, settings were changed, the
+        IncomparableError: the run diverged, a process was restarted, settings were changed, the
             record is too short or has gaps, or the input was not that of the controller's model
             throughout.
         CallerError: it is of a scenario that exact simulation cannot take.
@@ -59,7 +59,7 @@ def live_run(record: RunRecord) -> LiveRun:
     steps, sensor = record[PLANT_STEP], record[SENSOR_MEASUREMENT]
     if (again := record.restarted()) is not None:
         raise IncomparableError(
-            f"no ideal loop is like it: {again} was started anew during the run"
+            f"the ideal loop has no restarts: {again} was restarted during the run"
         )
     if len(sensor) < _LEAST_MEASUREMENTS:
         raise IncomparableError(

@@ -234,7 +234,7 @@ class ExitPart(SummaryPart):
 
 
 class RunSummary(SummaryPart):
-    """Everything that ``summary.json`` says about a run."""
+    """The content of ``summary.json``."""
 
     kind: Literal["live", "simulated"]
     startup_s: Real

@@ -1,14 +1,13 @@
-"""Joins the tables of a run on the measurements' time grid.
+"""Aligns the tables of a run on the time grid of the measurements.
 
-Nobody in the loop sees x, x_s and x_c together; the record does. At each measurement time t:
+At each measurement time t:
 
-* x(t) and x_s(t) are the sensor's own; at an event x_s is shown after its reset. x is what the
-  sensor takes for the state: where it is measured with noise, or estimated, not quite the plant's,
-  and e_c is the controller's error against that (:mod:`cosim.record.estimation_error` has the
-  rest);
+* x(t) and x_s(t) are the sensor's own; at an event x_s is the value after its reset. x is measured
+  or estimated by the sensor. With noise or an observer it is not the plant's state, and e_c is the
+  controller's error against x (:mod:`cosim.record.estimation_error` has the other part);
 * x_c(t) is the controller's last state whose model time is at most t, propagated by e^{H(t−t')}.
 
-Where a controller has died there is none, until the one that took its place has its first update.
+After a controller's death there is no x_c until the restarted one has its first update.
 """
 
 from typing import NamedTuple
@@ -41,7 +40,7 @@ class AlignedRun(NamedTuple):
     t_ns: Times
     """(k,)"""
     x: Reals
-    """(k, n), as the sensor knows it."""
+    """(k, n), measured or estimated by the sensor."""
     x_s: Reals
     """(k, n), after a reset."""
     x_c: Reals
@@ -81,9 +80,9 @@ class ControllerTrack(NamedTuple):
 
 
 def in_common(scenario: Scenario, joined: AlignedRun) -> NDArray[np.bool_]:
-    """Where x_c is on record, and sensor and controller have something in common, (k,).
+    """Where x_c is on record, and sensor and controller share an update, (k,).
 
-    What that was is lost with the sensor, until an update of the one in its place is delivered.
+    After a restart of the sensor they share none until an update of the new sensor is delivered.
     """
     known = scenario.network.initial_sync == "known_state"
     first = np.where(known & (joined.sensor == 0), NO_SEQUENCE, joined.sensor * GENERATION)
@@ -117,7 +116,7 @@ def _continued(
     track: ControllerTrack, life: int, model_ns: Times, x_c: Reals, newest: NDArray[np.int64]
 ) -> ControllerTrack:
     """Continue a track by states of one controller."""
-    if life != track.generation:  # from where the one before left off, there is none
+    if life != track.generation:  # between two controllers there is no state
         track = ControllerTrack(
             np.append(track.model_ns, track.model_ns[-1] + 1),
             np.vstack([track.x_c, np.full_like(track.x_c[-1:], np.nan)]),
@@ -225,7 +224,7 @@ class IdentityResidual:
     """Evaluates (I1) along a run, batch after batch of its measurements.
 
     Args:
-        scenario: the resolved scenario, without acknowledgements: (I1) presupposes that x_s is
+        scenario: the resolved scenario, without acknowledgements: (I1) assumes that x_s is
             reset at every event.
     """
 

@@ -1,4 +1,4 @@
-"""How the updates of a run crossed the network emulator."""
+"""The outcome of each update in the network emulator."""
 
 from typing import NamedTuple
 
@@ -17,14 +17,14 @@ from noack.protocol.wire_format import Flow
 
 
 class PacketOutcome(NamedTuple):
-    """What became of k updates on their way through the network emulator."""
+    """The outcomes of k updates."""
 
     rows: Rows
     """Their rows of ``netem_packet``, (k,)."""
     sequence: NDArray[np.int64]
     event_ns: NDArray[np.int64]
     lost: NDArray[np.bool_]
-    """Dropped, corrupted, or overtaken by a newer one."""
+    """Dropped, corrupted, or delivered out of order (stale)."""
     in_flight: NDArray[np.bool_]
     """Had not left when the run ended."""
 
@@ -34,16 +34,16 @@ class PacketOutcome(NamedTuple):
         return ~self.lost & ~self.in_flight
 
     def longest_loss_burst(self) -> int:
-        """Most successive updates that were lost."""
-        longest = run = 0
+        """Largest number of consecutive updates that were lost."""
+        longest = count = 0
         for lost in self.lost.tolist():
-            run = run + 1 if lost else 0
-            longest = max(longest, run)
+            count = count + 1 if lost else 0
+            longest = max(longest, count)
         return longest
 
 
 def packet_outcomes(record: RunRecord, flow: Flow = Flow.UPDATE) -> PacketOutcome:
-    """Say what became of the updates, or acknowledgements, that reached the network emulator."""
+    """The outcomes of the updates, or acknowledgements, that reached the network emulator."""
     rows, sequence, event_ns = updates_in(record[NETEM_PACKET], flow)
     releases = record[NETEM_RELEASE]
     if "flow" in (releases.dtype.names or ()):

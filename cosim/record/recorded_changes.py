@@ -1,4 +1,4 @@
-"""What was changed during a run, as its record has it."""
+"""The changes of settings during a run, from its record."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -20,17 +20,17 @@ NEVER_NS = 2**63 - 1
 
 
 class RecordedChange(NamedTuple):
-    """A change of a run, and what became of it."""
+    """A change of settings, and when each process applied it."""
 
     change: ParameterChange
     since_ns: Mapping[str, int]
-    """From when on it was in force, by process; one that never heard of it is not there."""
+    """From when on it was in force, by process; a process that never received it is missing."""
     scenario: Scenario
     """The scenario from then on."""
 
     @property
     def first_ns(self) -> int:
-        """From when on it was in force somewhere, or was to be."""
+        """The planned time, or earlier if a process applied it before."""
         return min(self.change.t_ns, *self.since_ns.values())
 
     @property
@@ -45,19 +45,19 @@ class RecordedChange(NamedTuple):
 
     @property
     def touches_claims(self) -> bool:
-        """Whether anything is claimed of a run that rests on what was changed."""
+        """Whether a claim depends on the changed settings."""
         return not is_of_loss_alone(self.change.settings)
 
 
 def changes_of(record: RunRecord) -> list[RecordedChange]:
     """The changes of a run, in the order in which they came into force.
 
-    What a damaged record says of changes that its scenario could not have is left out.
+    Changes that the scenario does not allow, from a damaged record, are left out.
     """
     since: dict[int, dict[str, int]] = {}
     found: dict[int, ParameterChange] = {}
     for table in SETTINGS:
-        for change, since_ns in _told(record[table]):
+        for change, since_ns in _changes_in(record[table]):
             found.setdefault(change.number, change)
             since.setdefault(change.number, {}).setdefault(OWNER[table], since_ns)
     made: list[RecordedChange] = []
@@ -71,17 +71,17 @@ def changes_of(record: RunRecord) -> list[RecordedChange]:
     return made
 
 
-def model_flow(scenario: Scenario, told: Rows) -> ModelFlow:
-    """What the controller's model followed in a run.
+def model_flow(scenario: Scenario, received: Rows) -> ModelFlow:
+    """The flow of the controller's model in a run, with its set-points.
 
     Args:
         scenario: the resolved scenario.
-        told: rows of ``controller_setting``.
+        received: rows of ``controller_setting``.
     """
     loop, schedule = loop_of(scenario), ChangeSchedule(scenario)
     flow, known = ModelFlow(loop.H, (), loop.setpoint), set()
-    for change, since_ns in _told(told):
-        if change.number not in known:  # one that is started anew is told once more
+    for change, since_ns in _changes_in(received):
+        if change.number not in known:  # a restarted controller receives it again
             known.add(change.number)
             _add(schedule, change, since_ns)
     while (taken := schedule.take(NEVER_NS)) is not None:
@@ -89,22 +89,24 @@ def model_flow(scenario: Scenario, told: Rows) -> ModelFlow:
     return flow
 
 
-def claimed_until_s(told: Rows) -> float:
-    """When what was claimed of a run at its start ends, as a process was told; infinite if never.
+def claimed_until_s(received: Rows) -> float:
+    """When the claims at the start of a run end at a change; infinite if never.
 
     Args:
-        told: rows of one of the tables of changes.
+        received: rows of one of the tables of changes.
     """
-    ends_ns = [change.t_ns for change, _ in _told(told) if not is_of_loss_alone(change.settings)]
+    ends_ns = [
+        change.t_ns for change, _ in _changes_in(received) if not is_of_loss_alone(change.settings)
+    ]
     return min(ends_ns, default=np.inf) / NS_PER_S
 
 
 def model_flow_of(record: RunRecord) -> ModelFlow:
-    """What the controller's model followed in a run."""
+    """The flow of the controller's model in a run."""
     return model_flow(record.scenario, record[CONTROLLER_SETTING])
 
 
-def _told(rows: Rows) -> list[tuple[ParameterChange, int]]:
+def _changes_in(rows: Rows) -> list[tuple[ParameterChange, int]]:
     found = []
     for row in rows[np.argsort(rows["input"], kind="stable")]:
         try:

@@ -49,7 +49,7 @@ class RunRecord:
         notices: the lines of the run's log, each with t_ns, level, text and process.
         reports: each process's final report; a process that died has none.
         kind: live or simulated.
-        earlier: the final reports of those whose place another took.
+        earlier: the final reports of processes that were restarted later.
     """
 
     def __init__(
@@ -79,13 +79,13 @@ class RunRecord:
         return {table: self[table] for table in self.tables if OWNER[table] == role}
 
     def lives(self, role: str) -> list["Life"]:
-        """What there is of each process that had a role in the run, one after the other."""
+        """The rows and reports of each generation of a process, in order."""
         owned, newest = self.owned_by(role), self.reports.get(role)
         reports = {} if newest is None else {newest.get("generation", 0): newest}
         reports |= {one.get("generation", 0): one for one in self.earlier if one["process"] == role}
         again = any((one["process"], one["level"]) == (role, RESTART) for one in self.notices)
         begun = generations(owned) if again else [0]
-        which = {  # a number out of its turn is of the process before
+        which = {  # an unexpected number belongs to the generation before
             table: np.searchsorted(begun, rows["input"] // GENERATION, side="right") - 1
             for table, rows in owned.items()
         }
@@ -99,12 +99,12 @@ class RunRecord:
         ]
 
     def restarted(self) -> str | None:
-        """A role whose process another took the place of; None if there is none."""
+        """A role whose process was restarted; None if there is none."""
         return next((role for role in LOOP_ROLES if len(self.lives(role)) > 1), None)
 
 
 class Life(NamedTuple):
-    """What there is of one process of a run."""
+    """The rows and report of one generation of a process."""
 
     generation: int
     rows: Mapping[str, Rows]
@@ -112,9 +112,9 @@ class Life(NamedTuple):
     report: Mapping[str, Any] | None
 
     def hole_ns(self) -> int | None:
-        """When the last input came before rows that are missing; None if none are, as far as known.
+        """Time of the last input before a gap in the rows; None if there is no known gap.
 
-        What is missing at the end of a process that left no report, nobody knows.
+        Rows that are missing at the end of a process without a report are unknown.
         """
         inputs = np.concatenate([rows["input"] for rows in self.rows.values()])
         now_ns = np.concatenate([rows["now_ns"] for rows in self.rows.values()])
@@ -125,9 +125,9 @@ class Life(NamedTuple):
 
 
 def generations(owned: Mapping[str, Rows]) -> list[int]:
-    """The processes of a role that have left rows: every one's first input has a number of its own.
+    """The generations of a role that left rows: the first input of each has a number of its own.
 
-    If that is missing, what a later one left shows that there were others before it.
+    If that row is missing, the rows of a later generation show that there were earlier ones.
 
     Args:
         owned: the rows of the role's tables.
@@ -149,7 +149,7 @@ def load_record(run_dir: Path) -> RunRecord:
         raise CallerError(f"{run_dir}: not a run directory (no {SCENARIO_FILE})")
     if not folder.is_dir():
         raise CallerError(
-            f"{run_dir}: has no numeric record; `noack summary` finishes a run that was cut short"
+            f"{run_dir}: has no numeric record; `noack summary` finalises an interrupted run"
         )
     scenario = load(run_dir / SCENARIO_FILE, most_bytes=MOST_RECORDED_BYTES)
     rows = {
@@ -177,7 +177,7 @@ def write_record(record: RunRecord, run_dir: Path) -> None:
 def finish_record(run_dir: Path) -> RunRecord:
     """Turn a run's spool into its record, and remove the spool.
 
-    Works on whatever was spooled, by whomever, and merges what was spooled twice.
+    It merges all spools; rows that were spooled twice count once.
 
     Raises:
         MachineError: the record cannot be written; the spool is kept.
@@ -192,7 +192,7 @@ def finish_record(run_dir: Path) -> RunRecord:
     record = RunRecord(scenario, rows, notices, reports, kind_of(run_dir), earlier)
     try:
         write_record(record, run_dir)
-        if spool.is_dir():  # dropped in one step, so that nobody ever takes half a spool for all
+        if spool.is_dir():  # moved in one step, so that half a spool is never read as a whole
             shutil.rmtree(spool.rename(spool.with_name(f"{SPOOL}.done")), ignore_errors=True)
     except OSError as error:
         raise MachineError(
@@ -249,7 +249,7 @@ def _recorded(folder: Path, table: str, dtype: np.dtype[np.void]) -> Rows:
 
 def _spooled(spool: Path, table: str, dtype: np.dtype[np.void]) -> Iterator[Rows]:
     for _, data in read_chunks(spool, table):
-        if len(data) % dtype.itemsize == 0:  # of a damaged one nobody knows where its rows begin
+        if len(data) % dtype.itemsize == 0:  # the rows of a damaged chunk cannot be located
             yield np.frombuffer(data, dtype)
 
 
@@ -293,7 +293,7 @@ def report_of(role: str, said: bytes | str, tables: Iterable[str]) -> dict[str, 
 
 
 def write_reports(run_dir: Path, reports: Iterable[Mapping[str, Any]]) -> None:
-    """Write the final reports of all processes; each says of which ``process`` it is.
+    """Write the final reports of all processes; each has the key ``process``.
 
     Raises:
         MachineError: they cannot be written.
@@ -317,13 +317,13 @@ def _reports(
         said = read_object(run_dir / REPORTS_FILE)
         entries = [(role, said[role]) for role in LOOP_ROLES if role in said]
         entries += [(one["process"], one) for one in said.get(_EARLIER, ())]
-    # A dead recorder wrote none, or half of one.
+    # A killed recorder wrote none, or part of one.
     except (LookupError, TypeError):
         return {}, []
     reports: dict[str, dict[str, Any]] = {}
     earlier: list[dict[str, Any]] = []
     for role, entry in entries:
-        with contextlib.suppress(PeerError, TypeError):  # what is none, is as lost
+        with contextlib.suppress(PeerError, TypeError):  # an invalid report counts as missing
             if role not in LOOP_ROLES:
                 continue
             report = report_of(role, json.dumps(entry), rows)

@@ -1,7 +1,7 @@
 """Tight certificates: what is guaranteed of a loop, under which conditions, with which constants.
 
 For a trigger ‖e_s‖_W > βe^{−αt} that is tested every h seconds at the latest, a network that drops
-at most M − 1 updates in a row, and an input that is held, all signals scaled by e^{αt}:
+at most M − 1 consecutive updates, and an input that is held, all signals scaled by e^{αt}:
 
     sup‖C x‖    ≤ free_C + gain_C π                                     (plant, input error p)
     sup‖C e_c‖  ≤ (‖C W⁻¹‖ + Σ_{j<N} sup_{τ≥jδ} ‖C e^{(H+αI)τ} W⁻¹‖) β̃ = D_C β̃          (I1)
@@ -30,12 +30,12 @@ _COARSE, _FINE = 64, 256
 
 
 class NetworkConditions(NamedTuple):
-    """What a certificate presupposes of network and schedule, in the plant's time."""
+    """The assumptions of a certificate about network and schedule, in the plant's time."""
 
     dropouts: int
     """M − 1, the longest run of successive dropouts."""
     sampling_s: float = 0.0
-    """h, the longest time between two tests of the trigger; 0 is a trigger that watches always."""
+    """h, the longest time between two tests of the trigger; 0 is a continuous trigger."""
     spacing_s: float = 0.0
     """The shortest time between two tests; all others are its multiples."""
     delay_s: float = 0.0
@@ -70,11 +70,11 @@ class Constants(NamedTuple):
     inter_event_s: float | None
     """δ: no two events are closer; None if there is no such bound."""
     loop_gain: float
-    """How strongly errors reproduce themselves; below 1."""
+    """Loop gain of the errors (small-gain condition); below 1."""
 
 
 class VoidError(ArithmeticError):
-    """There is no certificate; the message says why."""
+    """There is no certificate; the message has the reason."""
 
 
 class PlantConstants(Protocol):

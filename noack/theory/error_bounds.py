@@ -1,9 +1,9 @@
-"""What can be said of ‖e_c‖ along a run, from what the sensor saw and the controller received.
+"""Bounds of ‖e_c‖ along a run, from the sensor's errors and the controller's updates.
 
 By (I1), e_c = e_s + Σ e^{H(t−t_k)} e_s(t_k⁻) over the missing events. Two bounds follow:
 
 * the identity's: ‖e_s‖ + Σ ‖e^{H(t−t_k)} e_s(t_k⁻)‖, for every plant, trigger and network;
-* the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a trigger that watches always.
+* the paper's eq:LossEv3: βe^{−αt} + Σ βe^{−αt_k} ‖e^{H(t−t_k)}‖, for a continuous trigger.
 """
 
 import math
@@ -32,7 +32,7 @@ class ErrorMonitor:
     """Follows a run, measurement by measurement.
 
     The work of a measurement is a few array operations over the missing events, however many: a
-    network that keeps to no bound may lose thousands in a row.
+    network without a bound may lose thousands of consecutive updates.
 
     Args:
         H: what both models integrate between updates, (n, n), per second.

@@ -1,7 +1,7 @@
-"""What a certificate needs to know of a loop: how strongly each signal moves each other one.
+"""The gains of a loop that a certificate needs: from each signal to each other one.
 
 All signals are scaled by e^{αt}, so that a decaying bound becomes a constant one. With K = U R (U
-has orthonormal columns), the input error is p = u − K x, felt by the plant through B U:
+has orthonormal columns), the input error is p = u − K x, which acts on the plant through B U:
 
     x' = (A + BK) x + B p,      e_s' = H e_s − E x − B p,      E = A + BK − H
 

@@ -10,7 +10,7 @@ from noack.theory.certificate import NetworkConditions
 def nominal_conditions(resolved: Scenario, late_periods: int = 0) -> NetworkConditions:
     """The conditions of a scenario's own schedule, if what is late is so by ``late_periods`` steps.
 
-    In the plant's time, whatever the rates: an update is felt from the first step on whose newest
+    In the plant's time, for all rates: an update takes effect from the first step on whose newest
     tick is not before it, and the model state behind an input ages until the step after the one
     that latched it. The plant steps before it takes what arrives at the same time. A delay of the
     network that has no bound is taken at four times its jitter; a run that exceeds that leaves the
@@ -48,5 +48,5 @@ def allowed_conditions(resolved: Scenario) -> NetworkConditions:
 
 
 def ideal_conditions(resolved: Scenario) -> NetworkConditions:
-    """The paper's: a trigger that watches always, an instant network, an input that is not held."""
+    """The paper's conditions: a continuous trigger, a network and input without delay."""
     return NetworkConditions(dropouts=resolved.network.mansd)

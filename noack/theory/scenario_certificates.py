@@ -1,4 +1,4 @@
-"""Certificates of a scenario: which claims stand, on which assumptions, under which conditions."""
+"""Certificates of a scenario: their constants, assumptions and conditions."""
 
 import contextlib
 import math
@@ -98,7 +98,7 @@ class ScenarioCertificate:
         return self._envelope(t_s, lambda c, level: c.state)
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, as JSON knows it."""
+        """All fields for JSON."""
         found = asdict(self)
         for key, value in (
             ("constants", self.constants),
@@ -194,9 +194,9 @@ class CertificateScope:
         resolved: the scenario.
         closed_loop: A + BK, the box's centre for a box, (n, n).
         plant_at: gives their gains.
-        start_error: at the start the plant feels an input already, of an earlier run: sup‖u − Kx‖,
-            scaled, as long as it does. The certificate stands only if its own π is no less, and
-            then that input is one of those it is about.
+        start_error: sup‖u − Kx‖, scaled, while the plant still applies inputs of an earlier run
+            at the start. The certificate exists only if its own π is at least that large, so that
+            it covers these inputs.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ class CertificateScope:
         self._plants: dict[tuple[float, float, bytes], PlantConstants] = {}
 
     def certificate(self, conditions: NetworkConditions) -> ScenarioCertificate:
-        """The certificate under some conditions; a void one says why."""
+        """The certificate under some conditions; a void one has the reason."""
         trigger = self._resolved.decaying
         first: Constants | None = None
         late: Constants | None = None

@@ -1,4 +1,4 @@
-"""Chooses the weight W of the trigger's norm, so that the certificate says as much as it can.
+"""Chooses the weight W of the trigger's norm for the tightest certificate.
 
 A factor W of P = WᵀW with (H+αI)ᵀP + P(H+αI) ⪯ 0 makes ‖·‖_W contract along the models, hence
 Δ ≤ M on an instant network. Among these factors, the one with the longest certified inter-event
@@ -37,7 +37,7 @@ def choose_weight(
         beta: β.
         alpha_per_s: α.
         mansd: M − 1.
-        progress: told the share of the work that is done.
+        progress: receives the share of the work that is done.
 
     Raises:
         NotDecayingError: α is not below the decay rate of e^{Ht} and e^{(A+BK)t}.

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from netem.engine.many_decisions import admit_many
 from netem.rule_program import empty_state, new_flow, new_memory, program_of, recent_width
-from noack.impairments.kinds import AnyImpairment
 from noack.impairments.kinds.blackout import Blackout
 from noack.impairments.kinds.corrupt import Corrupt
 from noack.impairments.kinds.delay import Delay
@@ -19,70 +18,17 @@ from noack.impairments.kinds.duplicate import Duplicate
 from noack.impairments.kinds.loss import LossOf
 from noack.impairments.kinds.rate import Rate
 from noack.impairments.kinds.reorder import Reorder
-from noack.impairments.link_records import LinkMemory, PacketDecision, RecordedDecision, dtype_of
-from noack.impairments.link_settings import LinkSettings
-from noack.impairments.loss_models.bernoulli import BernoulliLoss
-from noack.impairments.loss_models.four_state import FourStateLoss
-from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
-from noack.impairments.loss_models.periodic_loss import PeriodicLoss
-from noack.impairments.loss_models.scripted import ScriptedLoss
-from noack.impairments.loss_models.worst_case import WorstCaseLoss
-
-chances = st.floats(0, 1)
-correlations = st.just(0.0) | st.floats(0, 0.999)
-times_s = st.floats(0, 100.0)
-losses = st.one_of(
-    st.just(WorstCaseLoss()),
-    st.builds(BernoulliLoss, probability=chances, correlation=correlations),
-    st.builds(
-        GilbertElliottLoss, good_to_bad=chances, bad_to_good=chances, loss_in_good=chances,
-        loss_in_bad=chances,
-    ),
-    st.builds(FourStateLoss, p13=st.floats(0, 0.5), p31=st.floats(0, 0.5), p32=st.floats(0, 0.5),
-              p23=chances, p14=st.floats(0, 0.5)),
-    st.builds(PeriodicLoss, period=st.just(7), burst=st.integers(0, 7), first=st.integers(0, 5)),
-    st.sets(st.integers(0, 30)).map(lambda names: ScriptedLoss(lost=tuple(sorted(names)))),
-).map(lambda loss: LossOf(loss=loss))  # fmt: skip
-impairments: st.SearchStrategy[AnyImpairment] = st.one_of(
-    losses,
-    st.builds(Duplicate, probability=chances, correlation=correlations),
-    st.builds(Corrupt, probability=chances, correlation=correlations),
-    st.builds(
-        Delay, delay_s=times_s, jitter_s=times_s, correlation=correlations,
-        distribution=st.sampled_from(["uniform", "normal", "pareto", "paretonormal"]),
-    ),
-    st.builds(Delay, distribution=st.just("empirical"),
-              samples_s=st.lists(times_s, min_size=2, max_size=9).map(tuple)),
-    st.builds(Reorder, probability=chances, correlation=correlations, gap=st.integers(1, 4)),
-    st.builds(Rate, rate_bps=st.integers(1000, 10**10), queue=st.integers(1, 9),
-              cell_bytes=st.sampled_from([0, 48]), cell_overhead_bytes=st.just(5)),
-    st.just(Blackout(intervals_s=((0.001, 0.003), (0.004, 0.01)), every_s=0.012)),
-)  # fmt: skip
-
-
-def aware(loss: LossOf, correlation: float, of_loss: float) -> tuple[AnyImpairment, ...]:
-    """A loss, and a delay that knows of it."""
-    return loss, Delay(
-        delay_s=0.01, jitter_s=0.01, distribution="normal", correlation=correlation,
-        loss_correlation=of_loss,
-    )  # fmt: skip
-
-
-pairs = st.builds(
-    aware,
-    losses.filter(lambda one: isinstance(one.loss, BernoulliLoss | GilbertElliottLoss)),
-    correlations,
-    st.floats(-1, 1),
+from noack.impairments.link_records import (
+    LinkMemory,
+    PacketDecision,
+    RecordedDecision,
+    array_of,
+    dtype_of,
 )
-links = st.builds(
-    LinkSettings,
-    impairments=st.tuples(
-        st.just(()) | pairs, st.lists(impairments, max_size=5).map(tuple)
-    ).map(lambda both: both[0] + both[1]),
-    mansd=st.none() | st.integers(0, 5),
-    first_delivered=st.booleans(),
-    limit=st.sampled_from([1, 10, 10_000]),
-)  # fmt: skip
+from noack.impairments.link_settings import LinkSettings
+from noack.impairments.loss_models.gilbert_elliott import GilbertElliottLoss
+from tests.netem import any_settings
+
 decisions = st.builds(
     RecordedDecision, fate=st.integers(0, 5), delay_ns=st.integers(-1, 10**7),
     copy_delay_ns=st.just(-1) | st.integers(0, 10**7), bit=st.integers(-1, 9),
@@ -111,13 +57,14 @@ def rows(records: Sequence[Any]) -> Any:
 
 
 def assert_equal(decided: Any, verdicts: Any, state: LinkMemory) -> None:
-    """Verdicts, and all that is remembered."""
+    """Decisions, and all that is remembered."""
     np.testing.assert_array_equal(decided.verdicts, rows(verdicts))
     np.testing.assert_array_equal(decided.state.flows, rows(state.flows))
     np.testing.assert_array_equal(decided.state.recent_ns, state.recent_ns)
     np.testing.assert_array_equal(decided.state.departures_ns, state.departures_ns)
     if state.queues:
-        np.testing.assert_array_equal(decided.state.queues, rows(state.queues))
+        queues = array_of(decided.state.queues.dtype, state.queues)
+        np.testing.assert_array_equal(decided.state.queues, queues)
     for compiled_row, memories in zip(decided.state.memory, state.memory, strict=True):
         if memories:
             np.testing.assert_array_equal(compiled_row, rows(memories))
@@ -127,7 +74,7 @@ def assert_equal(decided: Any, verdicts: Any, state: LinkMemory) -> None:
 
 @settings(max_examples=100)
 @given(
-    links,
+    any_settings.computable,
     st.lists(
         st.tuples(st.integers(0, 2), st.integers(0, 1500), st.integers(0, 10**7)),
         min_size=1, max_size=40,
@@ -196,7 +143,15 @@ def test_a_record_is_repeated_exactly(decide: Any) -> None:
         )
     ]  # fmt: skip
     again = decide(EVERYTHING, count, seed=2, arrivals_ns=arrivals, decisions=[taken])
-    for field in ("fate", "packet", "run", "release_ns", "copy_ns", "bit", "copy_bit"):
+    for field in (
+        "fate",
+        "packet",
+        "consecutive_losses",
+        "release_ns",
+        "copy_ns",
+        "bit",
+        "copy_bit",
+    ):
         np.testing.assert_array_equal(again.verdicts[field][:recorded], past[field])
     assert (again.verdicts["hold_back_ns"][:recorded] == 0).all()
     assert (again.fates[recorded:] != first.fates[recorded:]).any()

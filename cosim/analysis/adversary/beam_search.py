@@ -38,7 +38,7 @@ def search_beam(
     known: float = -np.inf,
     report: Report = lambda nodes, value: None,
 ) -> WorstPatternFound:
-    """Look for a large value among patterns with at most ``mansd`` dropouts in a row.
+    """Look for a large value among patterns with at most ``mansd`` consecutive losses.
 
     Args:
         flow: the loop with its objective.
@@ -46,7 +46,7 @@ def search_beam(
         width: how many runs go on from one window to the next.
         window_s: about the time between two events.
         known: a value that is reached for sure.
-        report: is told of progress.
+        report: receives the progress.
 
     Raises:
         TooManyEventsError: two events at the same time.

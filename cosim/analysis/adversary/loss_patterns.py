@@ -1,4 +1,4 @@
-"""Given patterns: what they are worth, and what a change of single decisions makes of them."""
+"""The values of given patterns, and their improvement by changes of single decisions."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ _RANDOM = 64
 
 
 class Outcomes(NamedTuple):
-    """What became of patterns."""
+    """The results of patterns."""
 
     value: Vector
     """(N,)"""
@@ -86,7 +86,7 @@ def improve(
         mansd: M − 1.
         pattern: to begin with.
         value: of it.
-        most_nodes: give up beyond.
+        most_nodes: the search stops beyond.
     """
     # One that was only decided up to its worst moment is completed.
     pattern, visited = follow(flow, mansd, [pattern]).patterns[0], len(pattern)

@@ -22,7 +22,7 @@ from noack.core.linear_systems import Matrix
 
 
 class Objective(StrEnum):
-    """What is to be made as bad as possible."""
+    """The value that the adversary maximises."""
 
     ERROR = "error"
     STATE = "state"

@@ -32,15 +32,15 @@ def search_tree(
     ceiling: Ceiling | None = None,
     report: Report = lambda nodes, value: None,
 ) -> WorstPatternFound:
-    """Look for the largest value over all patterns with at most ``mansd`` dropouts in a row.
+    """Look for the largest value over all patterns with at most ``mansd`` consecutive losses.
 
     Args:
         flow: the loop with its objective.
         mansd: M − 1.
-        most_nodes: give up beyond.
+        most_nodes: the search stops beyond.
         known: a value that is reached for sure: what cannot exceed it is left out.
         ceiling: lets branches be left out that cannot exceed the best.
-        report: is told of progress.
+        report: receives the progress.
 
     Raises:
         TooManyEventsError: two events at the same time.

@@ -1,4 +1,4 @@
-"""Runs of the loop that are under way together, and what was decided on the way."""
+"""Runs of the loop that advance together, with the decisions of each."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ Indices = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 Report = Callable[[int, float], None]
-"""Is told the nodes visited and the best value so far."""
+"""Receives the nodes visited and the best value so far."""
 
 START = -1
 """The entry of runs in which nothing has been decided."""
@@ -46,7 +46,7 @@ class Nodes(NamedTuple):
 
 
 def root(flow: SegmentFlow) -> Nodes:
-    """The start: sensor and controller know x(0), be it from a first packet or before."""
+    """The start: sensor and controller have x(0), from the first packet or from the scenario."""
     x0 = flow.system.loop.x0
     z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
     return Nodes(
@@ -87,7 +87,7 @@ class DecisionLog:
 
 
 class WorstPatternFound(NamedTuple):
-    """What a search came to."""
+    """The result of a search."""
 
     value: float
     """The largest value seen, or what the search started with."""

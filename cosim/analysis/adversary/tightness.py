@@ -1,4 +1,4 @@
-"""What the adversary found, beside what a certificate claims."""
+"""The worst run that the adversary found, compared with a certificate."""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -70,7 +70,7 @@ class Worst:
         return "".join("D" if delivered else "·" for delivered in self.pattern)
 
     def to_json(self) -> dict[str, Any]:
-        """Everything, as JSON knows it: null stands for what is infinite, too."""
+        """All fields for JSON; an infinite value becomes null."""
         found = asdict(self) | {
             "objective": self.objective.value,
             "pattern": self.text,
@@ -92,7 +92,7 @@ def shown(value: float, objective: Objective) -> float | None:
 def certified(
     certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
 ) -> float | None:
-    """What the certificate says of the same quantity, at the same time."""
+    """The certificate's bound of the same quantity, at the same time."""
     first, late = certificate.constants, certificate.floor_constants
     if first is None:
         return None

@@ -39,7 +39,7 @@ _LONGEST = 1000
 _CONFIRMED = 1e-5
 
 SearchReport = Callable[[str, int, float], None]
-"""Is told what is going on, the nodes visited by it, and the worst value so far."""
+"""Receives the current step, the nodes it visited, and the worst value so far."""
 
 
 class _Known(NamedTuple):
@@ -67,14 +67,14 @@ def find_worst(
 
     Args:
         resolved: the scenario; its loss model does not matter here, its ``network.mansd`` does.
-        objective: what is to be as bad as possible.
+        objective: the value to maximise.
         horizon_s: the scenario's unless given.
         most_nodes: of the search through all patterns; 0 for none.
         beam: runs that the beam search carries along; 0 for none.
         seed: of the random patterns.
         certificate: to compare with; the scenario's own plant's, for continuous triggering and an
             instant network, unless given.
-        report: is told of progress.
+        report: receives the progress.
 
     Raises:
         CallerError: the events accumulate, or the threshold decays to nothing before the horizon.
@@ -153,7 +153,7 @@ class _Search:
         self.exact = False
 
     def guess(self, rng: np.random.Generator, own: Pattern) -> None:
-        """Try what anybody would, and the scenario's own losses."""
+        """Try regular and random patterns, and the scenario's own losses."""
         flow, mansd = self._flow, self._mansd
         busiest = follow(flow, mansd, [(False,) * _LONGEST]).patterns[0]
         self._window_s = flow.horizon_s / (len(busiest) + 1)

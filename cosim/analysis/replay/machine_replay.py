@@ -102,9 +102,9 @@ def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> 
 
 
 def _start(life: Life) -> Start:
-    """Where a process took up its work: of the controller, its first tick says it.
+    """Where a process began its work: for the controller, at its first tick.
 
-    If it died before that, what it took says so.
+    If it died before that, its first message shows it.
     """
     if not life.generation or CONTROLLER_STEP not in life.rows:
         return Start(life.generation)
@@ -242,7 +242,7 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
 
 
 def _settings(data: bytes) -> dict[str, Any]:
-    """What was changed; of a damaged record, nothing that a scenario knows."""
+    """The changes of settings; invalid ones of a damaged record are left out."""
     try:
         return settings_of(data)
     except ValueError:

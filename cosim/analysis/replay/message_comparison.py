@@ -55,12 +55,12 @@ def check_messages(
         found += [answers, returned]
     else:
         entering.compare_flows()
-    changes = () if (told := _compare_changes(record)) is None else (told,)
+    changes = () if (compared := _compare_changes(record)) is None else (compared,)
     return (*(one.result() for one in found), *changes)
 
 
 def _compare_changes(record: RunRecord) -> MessagesReplay | None:
-    """Look whether all processes were told the same of each change; None if there were none."""
+    """Compare the changes that the processes received; None if there were none."""
     first: dict[int, tuple[object, ...]] = {}
     compared, found = 0, None
     for table in SETTINGS:
@@ -71,7 +71,7 @@ def _compare_changes(record: RunRecord) -> MessagesReplay | None:
             known = first.setdefault(number, said)
             for column, one, other in zip(("t_ns", "change"), said, known, strict=True):
                 if one != other and found is None:
-                    what = "another process was told otherwise"
+                    what = "another process received another change"
                     found = difference(table, place, int(row["now_ns"]), what, column, one, other)
     received = sum(len(record[table]) for table in SETTINGS)
     return MessagesReplay("coordinator → all", received, compared, found) if received else None
@@ -169,7 +169,7 @@ class _Received:
                 self._differs(row, "netem does not let it through", "sequence", sequence)
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
-        """Return the message of a number, if it was sent; if that can be told at all."""
+        """Return the message of a number, if it was sent and its sender was replayed that far."""
         if (message := self._sent.get(sequence)) is not None:
             self._compared += 1
             return message

@@ -60,12 +60,15 @@ def check(
 
 def _print_plant(console: Console, resolved: Scenario) -> None:
     """Print a nonlinear plant's linearisation, and the defaults that depend on other keys."""
+    from controller_node.controller import law_of
     from cosim.analysis.model_comparison import linearisation, said
     from plant_server.plant import system_of
 
     if not resolved.coverage.is_linear:
         about = getattr(system_of(resolved), "about", resolved.plant.system.kind)
         console.print(f"the plant: {about}", highlight=False, markup=False)
+    if (law := getattr(law_of(resolved), "about", None)) is not None:
+        console.print(f"the controller: {law}", highlight=False, markup=False)
     if (near := linearisation(resolved)) is not None:
         for what, value in said(near):
             console.print(f"{what}: {value}", highlight=False, markup=False)

@@ -242,6 +242,7 @@ class Delay(Impairment):
             cls(delay_s=0.0005),
             *(cls(delay_s=0.004, jitter_s=0.004, distribution=shape) for shape in shapes),
             cls(jitter_s=0.0005, correlation=0.7),
+            cls(delay_s=0.01, jitter_s=0.01, distribution="normal", loss_correlation=0.8),
             cls(distribution="empirical", samples_s=(0.0, 0.001, 0.002, 0.009)),
         ]
 

@@ -192,7 +192,7 @@ def test_processes_that_were_told_otherwise_are_found() -> None:
     other = RunRecord(record.scenario, rows, record.notices, record.reports, "simulated")
     found = replay(other).first_difference
     assert found is not None
-    assert found.what == "another process was told otherwise"
+    assert found.what == "another process received another change"
 
 
 def test_who_hears_of_a_change_too_late_says_so_and_voids_what_it_touches() -> None:

@@ -43,9 +43,9 @@ def replayed(
         now_ns = int(event["t_ns"]) - began_ns
         let_out(now_ns)
         take(machine.handle(Datagram(int(event["flow"]), payload), now_ns))
-        verdict = machine.verdict
-        assert [event[field] for field in DECIDED] == [getattr(verdict, f) for f in DECIDED]
-        for field, t_ns in (("delay_ns", verdict.release_ns), ("copy_delay_ns", verdict.copy_ns)):
+        decision = machine.decision
+        assert [event[field] for field in DECIDED] == [getattr(decision, f) for f in DECIDED]
+        for field, t_ns in (("delay_ns", decision.release_ns), ("copy_delay_ns", decision.copy_ns)):
             assert event[field] == (-1 if t_ns < 0 else t_ns - now_ns)
     let_out(np.inf)
     return left

@@ -1,0 +1,206 @@
+"""CoDel, controlled delay (RFC 8289): drops packets while the queue's delay stays above a target.
+
+CoDel decides when a packet's service would begin. The bottleneck is a queue of deterministic rate
+in the order of arrival, so that this time, and with it the packet's time in the queue, is known on
+arrival, and the law can be applied there: packets are taken in the same order, at the same times. A
+packet that the law drops keeps its place in the queue until then. An empty queue resets the law in
+the RFC; here the next packet does, as it does not wait.
+
+One rule differs. The RFC spares a packet if at most one MTU waits behind it when it leaves the
+queue, which is not known on arrival. Here a packet is spared if at most one MTU is before it when
+it arrives. The two differ where a burst ends: the RFC spares its last packets, and this does not.
+
+A packet that must pass is served instead of dropped, and the law stays as it is: it drops the next
+packet that need not pass.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, FiniteFloat
+
+from noack.core.clock import NS_PER_S
+from noack.impairments.bottleneck import BottleneckStage, enters, occupy, serve
+from noack.impairments.feature import Behaviour, Impairment, QueueDiscipline, Table, Word
+from noack.impairments.link_records import (
+    DELIVERED,
+    NEVER_NS,
+    OVERFLOWED,
+    FlowState,
+    LinkMemory,
+    LinkProgram,
+    PacketDecision,
+    QueueState,
+    StageMemory,
+    refuse,
+)
+from noack.impairments.quantities import COUNT, OWN_TIME_S, time_text
+from noack.impairments.word_reader import WordReader
+
+
+@dataclass(slots=True, kw_only=True)
+class CodelStage(BottleneckStage):
+    """A bottleneck with CoDel as numbers."""
+
+    target_ns: int
+    interval_ns: int
+    mtu_ns: int
+    """How long the line is busy with one MTU."""
+
+
+@dataclass(slots=True)
+class CodelQueue(QueueState):
+    """A queue, and the variables of RFC 8289, Section 5."""
+
+    first_above_ns: int = 0
+    drop_next_ns: int = 0
+    drops: int = 0
+    """``count_`` of the RFC."""
+    last_drops: int = 0
+    dropping: int = 0
+    dropped_before: int = 0
+    """1: the law dropped the packet before, and ``drop_next_ns`` has not followed yet."""
+
+
+def service_ns(queue: QueueState) -> int:
+    """When the service of a packet would begin that has just come to the queue."""
+    return max(queue.entry_ns, queue.busy_until_ns)
+
+
+def control_law(stage: CodelStage, t_ns: int, drops: int) -> int:
+    """Return t + interval/√count."""
+    return t_ns + int(stage.interval_ns / math.sqrt(drops))
+
+
+def is_due(stage: CodelStage, queue: CodelQueue) -> bool:
+    """Whether the law wants to drop the packet that has just come to the queue."""
+    now_ns = service_ns(queue)
+    sojourn_ns = now_ns - queue.entry_ns
+    above_long_enough = False
+    if sojourn_ns < stage.target_ns or sojourn_ns <= stage.mtu_ns:
+        queue.first_above_ns = 0
+    elif queue.first_above_ns == 0:
+        queue.first_above_ns = now_ns + stage.interval_ns
+    else:
+        above_long_enough = now_ns >= queue.first_above_ns
+    if queue.dropped_before != 0:
+        queue.dropped_before = 0
+        if above_long_enough:
+            queue.drop_next_ns = control_law(stage, queue.drop_next_ns, queue.drops)
+    if not above_long_enough:
+        queue.dropping = 0
+        return False
+    return queue.dropping == 0 or now_ns >= queue.drop_next_ns
+
+
+def note_drop(stage: CodelStage, queue: CodelQueue) -> None:
+    """Advance the law past a dropped packet."""
+    now_ns = service_ns(queue)
+    if queue.dropping != 0:
+        queue.drops += 1
+        queue.dropped_before = 1
+        return
+    recent = now_ns - queue.drop_next_ns < 16 * stage.interval_ns
+    delta = queue.drops - queue.last_drops
+    queue.dropping = 1
+    queue.drops = delta if delta > 1 and recent else 1
+    queue.last_drops = queue.drops
+    queue.drop_next_ns = control_law(stage, now_ns, queue.drops)
+
+
+def apply(
+    program: LinkProgram,
+    state: LinkMemory,
+    stage: CodelStage,
+    memory: StageMemory,
+    flow: FlowState,
+    decision: PacketDecision,
+) -> None:
+    """Put the packet into the queue, and its copy behind it; a packet lost before takes no part."""
+    if decision.fate != DELIVERED:
+        return
+    queue, ring_ns = state.queues[stage.place], state.departures_ns
+    if not enters(stage, queue, ring_ns, decision.release_ns):
+        refuse(decision, OVERFLOWED)
+    if decision.fate == DELIVERED:
+        if is_due(stage, queue):
+            refuse(decision, OVERFLOWED)
+        if decision.fate == DELIVERED:
+            decision.release_ns = serve(stage, queue, ring_ns, decision.size_bytes)
+        else:
+            occupy(stage, queue, ring_ns, service_ns(queue))
+            note_drop(stage, queue)
+    if decision.copy_ns == NEVER_NS:
+        return
+    if decision.fate != DELIVERED or not enters(stage, queue, ring_ns, decision.copy_ns):
+        decision.copy_ns = NEVER_NS
+    elif is_due(stage, queue):
+        occupy(stage, queue, ring_ns, service_ns(queue))
+        note_drop(stage, queue)
+        decision.copy_ns = NEVER_NS
+    else:
+        decision.copy_ns = serve(stage, queue, ring_ns, decision.size_bytes)
+
+
+def _read(reader: WordReader) -> Table:
+    """``codel [target TIME] [interval TIME] [mtu BYTES]``."""
+    table: Table = {}
+    for word, key in (("target", "target_s"), ("interval", "interval_s")):
+        if reader.accept(word):
+            table[key] = reader.value(OWN_TIME_S)
+    if reader.accept("mtu"):
+        table["mtu_bytes"] = reader.value(COUNT)
+    return table
+
+
+_TimeS = Annotated[FiniteFloat, Field(ge=1e-6, le=3600)]
+_EXAMPLE = "rate 10mbit queue 1000 codel target 5ms interval 100ms"
+
+
+class Codel(QueueDiscipline):
+    """Drops packets while the delay of the queue stays above a target (RFC 8289)."""
+
+    kind: Literal["codel"] = "codel"
+    target_s: _TimeS = 0.005
+    """Delay that the queue may have."""
+    interval_s: _TimeS = 0.1
+    """The delay must be above the target for this long before the first packet is dropped."""
+    mtu_bytes: Annotated[int, Field(ge=0, le=65_535)] = 1500
+    """A packet that finds no more bytes before it is not dropped."""
+
+    words: ClassVar = (
+        Word("codel", _EXAMPLE, _read),
+        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval", "mtu")),
+    )
+    behaviour: ClassVar = Behaviour(CodelStage, apply, CodelQueue)
+
+    @property
+    def prediction_note(self) -> str:
+        return "as long as no queue overflows or CoDel drops"
+
+    @classmethod
+    def examples(cls) -> Sequence[Self]:
+        return [cls(), cls(target_s=1e-5, interval_s=1e-4, mtu_bytes=0)]
+
+    def text(self) -> str:
+        words = f"codel target {time_text(self.target_s)} interval {time_text(self.interval_s)}"
+        return words if self.mtu_bytes == 1500 else f"{words} mtu {self.mtu_bytes}"
+
+    def meaning(self) -> str:
+        return (
+            "more are dropped; CoDel drops packets while the delay of the queue stays above "
+            f"{time_text(self.target_s)} for {time_text(self.interval_s)} or longer"
+        )
+
+    def queue_stage(self, bottleneck: Mapping[str, int]) -> CodelStage:
+        return CodelStage(
+            **bottleneck,
+            target_ns=round(self.target_s * NS_PER_S),
+            interval_ns=round(self.interval_s * NS_PER_S),
+            mtu_ns=self.mtu_bytes * 8 * NS_PER_S // bottleneck["rate_bps"],
+        )
+
+    def tc_lacks(self, before: Sequence[Impairment]) -> str:
+        return "the discipline codel, which is a qdisc of its own"

@@ -1,0 +1,230 @@
+"""Against the pseudocode of RFC 8289, Section 5, on a queue that is simulated event by event."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from netem.link_machine import Link
+from netem.loss_prediction import predict
+from netem.words.words_to_settings import parse, settings_of, text_of
+from noack.impairments.disciplines.codel import Codel
+from noack.impairments.kinds.duplicate import Duplicate
+from noack.impairments.kinds.rate import Rate
+from noack.impairments.link_settings import LinkSettings
+
+MS = 10**6
+RATE_BPS = 8_000_000
+"""A byte takes 1 µs."""
+PER_BYTE_NS = 1000
+
+
+@dataclass
+class Packet:
+    number: int
+    size_bytes: int
+    enqueued_ns: int
+
+
+@dataclass
+class Reference:
+    """A line with CoDel: names and control flow of the RFC; ``spare`` replaces the MTU rule."""
+
+    target_ns: int
+    interval_ns: int
+    spare: Callable[["Reference", Packet, int], bool]
+    must_pass: Callable[[int], bool]
+    queue: deque[Packet] = field(default_factory=deque)
+    free_ns: int = 0
+    first_above: int = 0
+    drop_next: int = 0
+    count: int = 0
+    lastcount: int = 0
+    dropping: bool = False
+    leaves_ns: dict[int, int | None] = field(default_factory=dict)
+
+    def control_law(self, t: int, count: int) -> int:
+        return t + int(self.interval_ns / math.sqrt(count))
+
+    def dodequeue(self, now: int) -> tuple[Packet | None, bool]:
+        if not self.queue:
+            self.first_above = 0
+            return None, False
+        packet = self.queue.popleft()
+        sojourn = now - packet.enqueued_ns
+        if sojourn < self.target_ns or self.spare(self, packet, sojourn):
+            self.first_above = 0
+        elif self.first_above == 0:
+            self.first_above = now + self.interval_ns
+        elif now >= self.first_above:
+            return packet, True
+        return packet, False
+
+    def drop(self, packet: Packet) -> None:
+        self.leaves_ns[packet.number] = None
+
+    def dequeue(self, now: int) -> Packet | None:
+        packet, ok_to_drop = self.dodequeue(now)
+        if packet is None:
+            self.dropping = False
+            return None
+        if self.dropping:
+            if not ok_to_drop:
+                self.dropping = False
+            while packet and now >= self.drop_next and self.dropping:
+                if self.must_pass(packet.number):
+                    return packet
+                self.drop(packet)
+                self.count += 1
+                packet, ok_to_drop = self.dodequeue(now)
+                if not ok_to_drop:
+                    self.dropping = False
+                else:
+                    self.drop_next = self.control_law(self.drop_next, self.count)
+        elif ok_to_drop and not self.must_pass(packet.number):
+            self.drop(packet)
+            packet, _ = self.dodequeue(now)
+            self.dropping = True
+            delta = self.count - self.lastcount
+            self.count = 1
+            if delta > 1 and now - self.drop_next < 16 * self.interval_ns:
+                self.count = delta
+            self.drop_next = self.control_law(now, self.count)
+            self.lastcount = self.count
+        return packet
+
+    def serve_until(self, t_ns: int) -> None:
+        while self.free_ns <= t_ns and self.queue:
+            now = max(self.free_ns, self.queue[0].enqueued_ns)
+            packet = self.dequeue(now)
+            if packet:
+                self.free_ns = now + packet.size_bytes * PER_BYTE_NS
+                self.leaves_ns[packet.number] = self.free_ns
+        if self.free_ns <= t_ns and not self.queue:
+            self.dequeue(self.free_ns)
+
+
+def ahead(mtu_bytes: int) -> Callable[[Reference, Packet, int], bool]:
+    """The rule of this emulator: at most one MTU was before the packet on arrival."""
+    return lambda line, packet, sojourn: sojourn <= mtu_bytes * PER_BYTE_NS
+
+
+def behind(mtu_bytes: int) -> Callable[[Reference, Packet, int], bool]:
+    """The rule of the RFC: at most one MTU waits when the packet leaves the queue."""
+    return lambda line, _packet, _sojourn: sum(p.size_bytes for p in line.queue) <= mtu_bytes
+
+
+def reference(
+    arrivals: Sequence[tuple[int, int]], codel: Codel, spare: Any, mansd: int | None = None
+) -> list[int | None]:
+    """When each packet leaves, None if it is dropped; arrivals are (ns, bytes), ascending."""
+    leaves_ns: dict[int, int | None] = {}
+
+    def must_pass(number: int) -> bool:
+        before = range(number - mansd, number) if mansd is not None else range(-1, 0)
+        return all(leaves_ns.get(one, 0) is None for one in before)
+
+    line = Reference(
+        round(codel.target_s * 1e9), round(codel.interval_s * 1e9), spare, must_pass,
+        leaves_ns=leaves_ns,
+    )  # fmt: skip
+    for number, (t_ns, size_bytes) in enumerate(arrivals):
+        line.serve_until(t_ns)
+        line.queue.append(Packet(number, size_bytes, t_ns))
+    line.serve_until(2**62)
+    return [leaves_ns[number] for number in range(len(arrivals))]
+
+
+def emulated(
+    arrivals: Sequence[tuple[int, int]], codel: Codel, mansd: int | None = None
+) -> list[int | None]:
+    rate = Rate(rate_bps=RATE_BPS, queue=100_000, overhead_bytes=0, discipline=codel)
+    link = Link(LinkSettings(impairments=(rate,), mansd=mansd, limit=1_000_000), 0, "a")
+    found = [link.decide(0, size, t).release_ns for t, size in arrivals]
+    return [None if t_ns < 0 else t_ns for t_ns in found]
+
+
+def load(seed: int, count: int, share: float) -> list[tuple[int, int]]:
+    """Packets of 100 to 1500 bytes that fill ``share`` of the line, with pauses."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(100, 1501, count)
+    gaps = rng.exponential(800 * PER_BYTE_NS / share, count)
+    gaps[rng.integers(0, count, count // 400 + 1)] += 300 * MS
+    return list(zip(np.cumsum(gaps).astype(int).tolist(), sizes.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1, 1.5, 3.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_packets_are_dropped_by_the_control_law(share: float, seed: int) -> None:
+    arrivals, codel = load(seed, 6000, share), Codel()
+    expected = reference(arrivals, codel, ahead(1500))
+    assert emulated(arrivals, codel) == expected
+    drops = sum(t_ns is None for t_ns in expected)
+    assert drops > 20 or share < 1
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0, 1, 50_000, 10**6]), st.integers(1, 1500)), max_size=150),
+    st.sampled_from([0.0001, 0.001, 0.005]),
+    st.sampled_from([0.0001, 0.002, 0.02]),
+    st.sampled_from([None, 1, 3]),
+)
+def test_any_arrivals_and_any_cap(
+    steps: list[tuple[int, int]], target_s: float, interval_s: float, mansd: int | None
+) -> None:
+    """Packets that must pass are served, and the law drops the next packet that need not pass."""
+    times = np.cumsum([gap for gap, _ in steps]).tolist()
+    arrivals = [(t, size) for t, (_, size) in zip(times, steps, strict=True)]
+    codel = Codel(target_s=target_s, interval_s=interval_s, mtu_bytes=100)
+    assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
+
+
+def test_under_a_standing_queue_the_rule_for_the_mtu_is_the_rfcs() -> None:
+    """Until the burst ends: then the RFC spares its last packets."""
+    arrivals, codel = [(k * 500_000, 1000) for k in range(4000)], Codel()
+    found, of_rfc = emulated(arrivals, codel), reference(arrivals, codel, behind(1500))
+    last = max(k for k in range(4000) if (of_rfc[k] or 0) <= arrivals[-1][0])
+    assert found[: last + 1] == of_rfc[: last + 1]
+    assert of_rfc[-1] is not None
+
+
+def test_drops_are_spaced_by_the_interval_over_the_root_of_their_number() -> None:
+    """1000 bytes every 0.5 ms at 1 byte per µs: the delay stays above the target."""
+    arrivals = [(k * 500_000, 1000) for k in range(4000)]
+    leaves_ns = emulated(arrivals, Codel())
+    dropped = [k for k, t_ns in enumerate(leaves_ns) if t_ns is None]
+    at_ns = [max(t for t in leaves_ns[:k] if t is not None) for k in dropped[:40]]
+    # Above the target from the first packet on that waits 5 ms, i.e. the 11th, for 100 ms.
+    assert at_ns[0] == pytest.approx(10 * MS + 100 * MS, abs=MS)
+    due_ns = at_ns[0] + np.cumsum([100 * MS / math.sqrt(n) for n in range(1, 40)])
+    assert np.all(np.abs(np.array(at_ns[1:]) - due_ns) <= 1.5 * MS)  # a packet takes 1 ms
+
+
+def test_never_more_consecutive_losses_than_the_cap(decide: Any, longest_undelivered: Any) -> None:
+    codel = Codel(target_s=1e-6, interval_s=1e-6, mtu_bytes=0)
+    rate = Rate(rate_bps=RATE_BPS, queue=5, discipline=codel)
+    settings = LinkSettings(impairments=(Duplicate(probability=0.5), rate), mansd=3)
+    decided = decide(settings, 20_000, arrivals_ns=np.arange(20_000) * 10_000)
+    assert longest_undelivered(decided).max() == 3
+
+
+def test_words_and_their_meaning() -> None:
+    words = "rate 10mbit queue 500 codel target 2ms interval 50ms mtu 9000 loss 5%"
+    settings = settings_of(words)
+    assert text_of(settings) == words
+    assert settings.impairments[0] == Rate(
+        rate_bps=10_000_000, queue=500,
+        discipline=Codel(target_s=0.002, interval_s=0.05, mtu_bytes=9000),
+    )  # fmt: skip
+    assert parse("rate 1mbit codel").settings.impairments[0] == Rate(
+        rate_bps=1_000_000, discipline=Codel()
+    )
+    rate, note = predict(settings)
+    assert rate == pytest.approx(0.05)
+    assert note == "as long as no queue overflows or CoDel drops"
