@@ -202,7 +202,7 @@ def test_a_damaged_page_is_one_line_that_says_how_to_mend_it(full: Store) -> Non
     assert place > 0
     whole[place] ^= 1
     path.write_bytes(whole)
-    with pytest.raises(MachineError, match="is damaged; remove it, and the same command computes it"):
+    with pytest.raises(MachineError, match="is damaged; remove it, and the same"):
         full.columns(1, ["cost"])
 
 
