@@ -61,7 +61,7 @@ _HAPPENINGS_PER_WORD = 4096
 
 
 class DecidedLink:
-    """A link whose losses and delays somebody else decides: a pattern, an adversary, another run.
+    """A link whose losses and delays are decided outside: by a pattern, an adversary, another run.
 
     Args:
         decide: the network's word on each datagram.

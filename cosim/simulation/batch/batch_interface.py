@@ -1,4 +1,4 @@
-"""What a batch is, and what comes of it.
+"""The interface of the batch engine: settings, populations and rows of results.
 
 Everything is in SI units and in the paper's notation; k runs, n states, m inputs.
 """
@@ -60,7 +60,7 @@ run are NaN.
 
 
 class Population(NamedTuple):
-    """What is each run's own."""
+    """What differs between the runs."""
 
     A: NDArray[np.float64]
     """True plants, (k, n, n), per second."""

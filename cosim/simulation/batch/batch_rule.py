@@ -1,4 +1,4 @@
-"""When a policy looks at its comparison, and against what: its guards' times and thresholds.
+"""When the comparison of a trigger rule counts, and its threshold then.
 
 The numbers are those of :class:`noack.trigger.trigger_rule.TriggerRule`, and so are the meanings.
 """
@@ -16,7 +16,7 @@ _PER_S = 1e9
 
 
 class Rule(NamedTuple):
-    """A policy's guards but for their forms."""
+    """The numbers of a trigger rule; its forms are in ``quadratic_crossing``."""
 
     compares: bool
     """Whether there is a form."""
@@ -34,7 +34,7 @@ class Rule(NamedTuple):
 
 
 def rule_of(rule: TriggerRule) -> Rule:
-    """Return the numbers of a policy's guards."""
+    """Return the numbers of a trigger rule."""
     return Rule(
         compares=len(rule.form.up) > 0,
         integrates=rule.integrates,
@@ -52,7 +52,7 @@ def rule_of(rule: TriggerRule) -> Rule:
 
 
 class Span(NamedTuple):
-    """What an event makes of the rule; seconds since the run's start."""
+    """The rule between two events; times in seconds since the run's start."""
 
     since_s: float
     """t₀."""
@@ -98,10 +98,10 @@ def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
 
 
 class Phase(NamedTuple):
-    """What holds of the rule from a time on."""
+    """A time in which the comparison and its threshold keep their form."""
 
     until_s: float
-    """So long."""
+    """Its end."""
     compares: bool
     """The comparison counts."""
     threshold: float

@@ -19,11 +19,11 @@ from cosim.simulation.batch.quadratic_crossing import (
     SLOWEST,
     QuadraticCurves,
     compare,
+    dynamic_variable_at,
     first_event,
     first_look,
     left_side,
     put,
-    reserve_at,
     scale_of,
 )
 from cosim.simulation.batch.taylor import Array, degree_for, driven, powers, reaches, value
@@ -65,7 +65,7 @@ class BatchSystem(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """What is each run's own; matrices by columns, one run after the other."""
+    """What differs between the runs; matrices by columns, one run after the other."""
 
     A: Array
     B: Array
@@ -102,7 +102,7 @@ class BatchMemory(NamedTuple):
 
 
 class LossTable(NamedTuple):
-    """The compiled rules of the link, and what they remember."""
+    """The compiled rules of the link, and their state."""
 
     program: LinkProgram
     state: LinkMemory
@@ -321,7 +321,7 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
         event = found_s != NONE
         spent_s = found_s if event else window_s
         if squares is not None:
-            auxiliary = reserve_at(squares, p, spent_s) * (scale * scale)
+            auxiliary = dynamic_variable_at(squares, p, spent_s) * (scale * scale)
         p = degree_for(space.reach_s, spent_s)
         x_c, e_c = value(space.x_c, p, spent_s, n), value(space.e_c, p, spent_s, n)
         state = Models(x_c, e_c, value(space.d, p, spent_s, n))

@@ -40,7 +40,7 @@ SLOWEST = 2.0
 
 
 class QuadraticCurves(NamedTuple):
-    """The comparison's form, and that of its reserve; matrices by columns."""
+    """The forms of the comparison and of η; matrices by columns."""
 
     rows: Width
     """How many P and N have; rows of zeros fill them up."""
@@ -213,7 +213,7 @@ def first_event(
     return NONE, point
 
 
-def reserve_at(squares: QuadraticCurves, p: int, s: float) -> float:
+def dynamic_variable_at(squares: QuadraticCurves, p: int, s: float) -> float:
     """η, over the square of the scale."""
     if len(squares.gain) == 0:
         return 0.0

@@ -317,7 +317,7 @@ class ContinuousLoop:
     def _on_grid(
         self, z: Vector, t_s: float, event_s: float, end_s: float, condition: TriggerCondition
     ) -> DetectedEvent:
-        """Look at the comparison at the grid's points from ``t_s`` on, later than ``event_s``."""
+        """Evaluate the comparison at the grid times from ``t_s`` on, later than ``event_s``."""
         grid_s = condition.grid_ns * 1e-9
         first = max(
             math.ceil(t_s / grid_s - _GRID_SLACK), math.floor(event_s / grid_s + _GRID_SLACK) + 1

@@ -171,7 +171,7 @@ def test_a_folder_in_use_and_a_folder_of_someone_else_are_refused(
     store = Store(tmp_path / "out", grid(campaign, path), campaign.draws, campaign.chunk)
     with (
         opened(campaign, base, store),
-        pytest.raises(CallerError, match="another noack is at work"),
+        pytest.raises(CallerError, match="another noack uses this folder"),
         opened(campaign, base, store),
     ):
         pass
@@ -202,7 +202,7 @@ def test_a_damaged_page_is_one_line_that_says_how_to_mend_it(full: Store) -> Non
     assert place > 0
     whole[place] ^= 1
     path.write_bytes(whole)
-    with pytest.raises(MachineError, match="is damaged; remove it, and the same command makes it"):
+    with pytest.raises(MachineError, match="is damaged; remove it, and the same"):
         full.columns(1, ["cost"])
 
 
@@ -234,7 +234,7 @@ def test_runs_of_another_noack_are_shown_but_not_added_to(
         assert run_campaign(store, alone) == 0
     more = Store(folder, store.points, 10, campaign.chunk)
     with (
-        pytest.raises(CallerError, match=r"not be of one piece \(numpy is 1\.0 there"),
+        pytest.raises(CallerError, match=r"differ from the existing ones \(numpy is 1\.0 there"),
         opened(campaign, base, more),
     ):
         pass
