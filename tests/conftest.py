@@ -1,7 +1,7 @@
-"""Shared by all tests: one thread, Hypothesis without wall time or randomness, a small scenario.
+"""Fixtures for all tests: one thread, deterministic Hypothesis examples, a small scenario.
 
-The same few examples are tried every time; ``--hypothesis-profile search`` tries a thousand new
-ones of each.
+By default, each run tries the same few examples; ``--hypothesis-profile search`` tries a thousand
+new examples per test.
 """
 
 import os
@@ -24,7 +24,7 @@ settings.register_profile(
     deadline=None,
     derandomize=True,
     print_blob=True,
-    suppress_health_check=[HealthCheck.too_slow],  # it reads the wall clock
+    suppress_health_check=[HealthCheck.too_slow],  # this check reads the wall clock
 )
 settings.register_profile(
     "search",
@@ -43,17 +43,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         providers._get_local_constants = providers.Constants
 
 
-@pytest.hookimpl(optionalhook=True)  # there may be no xdist, or not be asked for
+@pytest.hookimpl(optionalhook=True)  # xdist may be absent or unused
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> LongestFirst | None:
     return LongestFirst(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(scope="session", autouse=True)
 def no_signal_is_ignored_by_children() -> Iterator[None]:
-    """Let processes that tests start receive signals that this process ignores.
+    """Stop child processes from inheriting ignored signals.
 
-    A shell's background process ignores SIGINT, a process under nohup SIGHUP, and their children
-    inherit that. A handler that does nothing is not inherited.
+    A background process of a shell ignores SIGINT, a process under nohup ignores SIGHUP, and
+    children inherit an ignored signal. They do not inherit a handler that does nothing.
     """
     ignored = [
         number
@@ -69,7 +69,7 @@ def no_signal_is_ignored_by_children() -> Iterator[None]:
 
 @pytest.fixture
 def content() -> dict[str, Any]:
-    """A valid scenario as parsed TOML: the double integrator, with as little as is required."""
+    """A minimal valid scenario of the double integrator, as parsed TOML."""
     return {
         "name": "small",
         "horizon_s": 1.0,

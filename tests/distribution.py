@@ -1,7 +1,7 @@
-"""Who runs which tests when there are several workers: ``--dist=loadfile``, longest files first.
+"""Distribute tests over several workers: ``--dist=loadfile``, longest files first.
 
-A worker that gets a long file last keeps the others waiting for it. And a file whose tests share
-nothing, but start a run each, is no unit: any worker may take any of them.
+If a worker starts a long file last, all other workers wait for it. If the tests of a file share no
+slow fixture, the scheduler distributes them one by one.
 """
 
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ LONGEST = (
     "tests/cosim/output/viewer/",
     "tests/netem/",
 )
-"""Files and folders, by what they take."""
+"""Files and folders, longest duration first."""
 
 APART = frozenset({
     "tests/integration/test_faults.py",
@@ -39,11 +39,11 @@ APART = frozenset({
     "tests/integration/test_terminals.py",
     "tests/test_examples.py",
 })  # fmt: skip
-"""Files whose tests share no fixture that takes long."""
+"""Files in which the tests share no slow fixture."""
 
 
 def in_order(items: Iterable[pytest.Item]) -> list[pytest.Item]:
-    """The tests, those of long files first."""
+    """Return the tests, those of long files first."""
     ranks = {file: rank for rank, file in enumerate(LONGEST)}
 
     def rank(item: pytest.Item) -> int:
@@ -59,7 +59,7 @@ def file_of(nodeid: str) -> str:
 
 
 class LongestFirst(LoadFileScheduling):
-    """Gives out files, or the tests of some, in the order of collection."""
+    """Assigns files, or single tests of the files in ``APART``, in the order of collection."""
 
     def __init__(self, config: pytest.Config, log: Any) -> None:
         config.option.loadscopereorder = False

@@ -1,4 +1,4 @@
-"""The documentation is run: its commands, its snippets, its tables of keys."""
+"""Run the documentation's commands and snippets, and compare its key tables with the code."""
 
 import json
 import os
@@ -54,7 +54,7 @@ def commands() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that looks like the repository to a command, with a short run in it."""
+    """A folder with the repository's files and a short run, in which commands can run."""
     folder = tmp_path_factory.mktemp("docs")
     (folder / "scenarios").symlink_to(ROOT / "scenarios")
     (links,) = blocks("docs/netem.md", "toml")
@@ -63,7 +63,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for code in [*blocks("docs/plants.md", "python"), *blocks("docs/plants.md", "toml")]:
         if (named := re.match(r"# (\w+\.(?:py|toml))\n", code)) is not None:
             (folder / named[1]).write_text(code)
-        elif code.startswith("import control"):  # which makes the file of the matrices
+        elif code.startswith("import control"):  # this snippet writes the matrices file
             subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
     noack = folder / ".venv" / "bin" / "noack"
     noack.write_text(f'#!/bin/sh\nexec {sys.executable} -m cosim.cli "$@"\n')
@@ -73,7 +73,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         cwd=folder, capture_output=True, text=True, check=False, timeout=250,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
-    for name in ("model", "hold"):  # commands are tried in no order: these are there to compare
+    for name in ("model", "hold"):  # two runs for `compare`, as commands run in any order
         (folder / "runs" / name).mkdir()
         (folder / "runs" / name / "latest").symlink_to((folder / "runs/latest").resolve())
     return folder
@@ -84,14 +84,13 @@ SHORTER = {
     "demo": ("--no-report",),
     "run": ("--no-report",),
 }
-"""What is added to a command so that it takes less of the machine: reports and long runs are tried
-elsewhere."""
+"""Arguments added to a command to shorten it; other tests cover reports and long runs."""
 
 
 def shorter(words: list[str]) -> list[str]:
     command = next((word for word in words[1:] if not word.startswith("-")), "")
     if command == "netem" and words[2:3] in (["--listen"], ["--links"]):
-        return [*words[:2], "--engine", "plain", *words[2:]]  # the other one is compiled first
+        return [*words[:2], "--engine", "plain", *words[2:]]  # needs no compilation
     more = SHORTER.get(command, ()) if words[0].endswith("noack") else ()
     long = "horizon_s" in " ".join(words)
     return [*words, *(more[2:] if long and more[:1] == ("--set",) else more)]
@@ -101,7 +100,7 @@ def shorter(words: list[str]) -> list[str]:
 def test_every_command_works(command: str, run_folder: Path) -> None:
     words = shorter(shlex.split(command.partition(" > ")[0]))
     if words[0] == "make":
-        # The targets themselves are what surrounds this test; here only that they exist.
+        # Running a make target could run this test again: check only that the target exists.
         done = subprocess.run(
             ["make", "--dry-run", *words[1:]], cwd=ROOT, capture_output=True, text=True, check=False
         )
@@ -124,7 +123,7 @@ def test_every_command_works(command: str, run_folder: Path) -> None:
 
 
 def snippets() -> list[str]:
-    """Programs; what begins with its own file's name is a file."""
+    """Return programs; a snippet that begins with a file name is a file instead."""
     pages = ("docs/plants.md", "docs/record.md", "docs/library.md", "docs/howto.md")
     found = [code for page in pages for code in blocks(page, "python")]
     return [snippet for snippet in found if not snippet.startswith("#")]
@@ -149,7 +148,7 @@ def keys_of(section: type[BaseModel], prefix: str = "") -> Iterator[str]:
 
 
 def choices(union: Any) -> tuple[type[BaseModel], ...]:
-    """The tables that a value may be, of an annotated union."""
+    """Return the member models of an annotated union."""
     tables: tuple[type[BaseModel], ...] = get_args(get_args(union)[0])
     return tables
 
@@ -197,7 +196,7 @@ def test_every_word_of_the_emulator_is_documented_and_understood() -> None:
 
 
 def documented_keys(text: str) -> set[str]:
-    """Names at the left of tables; those that begin with a dot lie in the first one's section."""
+    """Names in the left column of tables; a leading dot: the section of the row's first name."""
     rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
     found: set[str] = set()
     for row in rows:
@@ -228,7 +227,7 @@ def test_every_campaign_and_every_metric_is_documented() -> None:
     assert documented_keys(text) == METRICS.keys()
 
 
-def test_the_documented_campaign_is_a_campaign(tmp_path: Path) -> None:
+def test_the_documented_campaign_is_valid(tmp_path: Path) -> None:
     (text,) = blocks("docs/campaigns.md", "toml")
     path = tmp_path / "thresholds.toml"
     path.write_text(text)
@@ -244,11 +243,11 @@ def test_every_option_of_design_is_documented_and_no_other() -> None:
     assert documented | {"--help"} == known | {"--help"}
 
 
-def test_the_exported_schema_is_the_codes() -> None:
+def test_the_exported_schema_matches_the_code() -> None:
     assert json.loads((ROOT / "docs/scenario.schema.json").read_text()) == json_schema()
 
 
-def test_the_network_of_the_how_to_page_is_one(tmp_path: Path) -> None:
+def test_the_network_in_the_how_to_page_is_valid(tmp_path: Path) -> None:
     (network,) = blocks("docs/howto.md", "toml")
     text = (ROOT / "scenarios/unstable_pendulum.toml").read_text()
     path = tmp_path / "pendulum.toml"
@@ -261,7 +260,7 @@ def test_shipped_scenarios_are_valid_and_named_after_their_file(path: Path) -> N
     assert load(path).name == path.stem
 
 
-def test_links_lead_somewhere() -> None:
+def test_links_have_existing_targets() -> None:
     pages = [*(ROOT / "docs").glob("*.md"), *map(ROOT.joinpath, PAGES), *ROOT.glob("*.md")]
     for page in set(pages):
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):

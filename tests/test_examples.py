@@ -1,4 +1,4 @@
-"""The examples are programs, and run: as they stand, in a folder of their own."""
+"""Run each example program unchanged, in its own folder."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ FIGURES = {
 }
 
 
-def test_every_example_is_run_here() -> None:
+def test_every_example_has_a_test() -> None:
     assert {path.stem for path in EXAMPLES.iterdir()} == FIGURES.keys()
 
 
@@ -32,8 +32,8 @@ def test_an_example_runs_and_leaves_its_figures(name: str, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_an_example_is_a_page_in_cells(name: str) -> None:
-    """Prose and code by turns, in the percent format; a page begins with its title."""
+def test_an_example_is_in_the_percent_format(name: str) -> None:
+    """The percent format: prose and code cells alternate, and the page begins with its title."""
     first, *cells = (EXAMPLES / f"{name}.py").read_text().split("\n# %%")
     assert first.startswith("# %% [markdown]\n# # ")
     for cell in cells:

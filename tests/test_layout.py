@@ -1,4 +1,4 @@
-"""The layout of the repository, as far as the import contracts do not say it."""
+"""Layout rules of the repository that the import contracts do not cover."""
 
 from collections import Counter
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Identities and claims of the theory, on the whole loop in virtual time."""
+"""Check the theory's identities and claims on the whole loop in virtual time."""
 
 import itertools
 import math
@@ -43,7 +43,7 @@ STEPS = 40
 
 
 class Loop(Shuttle):
-    """A loop whose rows can be read while it runs."""
+    """A loop that exposes its recorded rows while it runs."""
 
     def __init__(
         self, plant: Plant, sensor: Sensor, controller: Controller, n: int, m: int, network: Network
@@ -67,7 +67,7 @@ class Loop(Shuttle):
             self.rows[output.table].append(np.array([output.row], self._types[output.table])[0])
 
     def _heard(self, role: str, machine: Any) -> Machine[Message]:
-        """Let what a machine is given be noted."""
+        """Record each input of a machine."""
         handle = machine.handle
 
         def noting(message: Message, now_ns: int) -> Sequence[Message | Record | Notice]:
@@ -86,7 +86,7 @@ def linear_plant(A: Matrix, B: Matrix, x0: Vector, horizon_ns: int) -> Plant:
 
 
 class Case(NamedTuple):
-    """A random loop with model mismatch, and what the network does to it."""
+    """A random loop with model mismatch, and the network's pattern of losses and delays."""
 
     A: Matrix
     B: Matrix
@@ -100,7 +100,7 @@ class Case(NamedTuple):
     delays_ns: list[int]
 
     def shuttle(self) -> Loop:
-        """The loop, its network repeating the pattern of losses and delays."""
+        """Return the loop; its network repeats the pattern of losses and delays."""
         known = self.x0 if self.known else None
         horizon_ns = STEPS * PERIOD_NS
         pattern = zip(itertools.cycle(self.lost), itertools.cycle(self.delays_ns), strict=False)
@@ -153,10 +153,10 @@ def cases(draw: st.DrawFn, *, delayed: bool) -> Case:
 
 
 def check_identity(case: Case) -> int:
-    """(I1) after everything that happens; returns how often both sides were compared.
+    """Check (I1) after every event of the loop; return the number of comparisons.
 
-    x_c(t) − x_s(t) = Σ_{k=r+1..q} e^{H(t−t_k)} e_s(t_k⁻), each term propagated in one step here,
-    x_c and x_s step by step by the machines.
+    x_c(t) − x_s(t) = Σ_{k=r+1..q} e^{H(t−t_k)} e_s(t_k⁻). This function propagates each term in one
+    step; the machines propagate x_c and x_s step by step.
     """
 
     @lru_cache(None)
@@ -175,7 +175,7 @@ def check_identity(case: Case) -> int:
             jumps.append((int(row["t_ns"]), row["x_s"] - row["x"]))
         received = int(deliveries[-1]["sequence"]) if deliveries else NO_SEQUENCE
         if not measured or not (case.known or deliveries):
-            continue  # the two models have nothing in common yet
+            continue  # no common start of the two models yet
         row = measured[-1]
         x_s = propagation(now_ns - int(row["t_ns"])) @ (
             row["x"] if row["event"] != NO_SEQUENCE else row["x_s"]
@@ -189,8 +189,8 @@ def check_identity(case: Case) -> int:
         for then_ns, e_s in jumps[received + 1 :]:
             missed += propagation(now_ns - then_ns) @ e_s
         largest = max(largest, *np.abs(x_s), *np.abs(x_c), *np.abs(missed))
-        # Some 80 propagations on either side, each with an error of some 1e-15 of the state,
-        # which the model then lets grow.
+        # Each side takes about 80 propagations. Each adds a relative error of about 1e-15,
+        # and the model dynamics can amplify it.
         np.testing.assert_allclose(x_c - x_s, missed, rtol=0, atol=1e-12 * growth * largest)
         compared += 1
     return compared
@@ -199,7 +199,7 @@ def check_identity(case: Case) -> int:
 @given(cases(delayed=False))
 def test_the_models_differ_by_the_missed_jumps(case: Case) -> None:
     compared = check_identity(case)
-    if case.known:  # each step, measurement and tick but those before the first measurement
+    if case.known:  # all steps, measurements and ticks from the first measurement on
         assert compared > 2 * STEPS
 
 
@@ -214,12 +214,12 @@ def test_the_models_differ_by_the_missed_jumps_in_a_network_that_delays_and_reor
     ("known", "lost"), [(True, [True]), (True, [True, True, False]), (False, [False, True])]
 )
 def test_the_identity_is_compared_at_every_sample(known: bool, lost: list[bool]) -> None:
-    """The checks above look at something: all samples but those before a common start."""
+    """``check_identity`` compares all samples except those before a common start."""
     A, B, K = np.array([[0.0, 1.0], [0.5, 0.0]]), np.array([[0.0], [1.0]]), np.array([[-1.0, -2.0]])
     case = Case(A, B, K, A + B @ K + 0.1, np.ones(2), known, PERIOD_NS // 2, 1e-3, lost, [0])
     loop = case.shuttle()
     happened = sum(1 for _ in loop.run())
-    # The first step, its measurement, and the update on its way through the network.
+    # Not compared: the first step, its measurement, and the update in the network.
     assert happened - check_identity(case) <= 3
     assert len(loop.rows[SENSOR_MEASUREMENT]) == STEPS + 1
     events = sum(row["event"] != NO_SEQUENCE for row in loop.rows[SENSOR_MEASUREMENT])
@@ -234,7 +234,7 @@ def test_nothing_flows_from_the_controller_to_the_sensor(case: Case) -> None:
     for _ in loop.run():
         pass
     assert {flow for role, flow in loop.received if role == "sensor"} == {Flow.MEASUREMENT}
-    # What the sensor did, it does again from the measurements alone.
+    # Replay the sensor from the measurements alone: its outputs are the same.
     alone = case.shuttle().machines["sensor"]
     for row in loop.rows[SENSOR_MEASUREMENT]:
         message = Message(Flow.MEASUREMENT, int(row["sequence"]), int(row["t_ns"]), row["x"].copy())
@@ -247,7 +247,7 @@ def test_nothing_flows_from_the_controller_to_the_sensor(case: Case) -> None:
         assert again.tobytes() == row.tobytes()
 
 
-def test_only_the_plant_is_heard_by_the_sensor() -> None:
+def test_the_sensor_accepts_datagrams_from_the_plant_only() -> None:
     assert [role for role, leg in ROUTES.items() if leg.to == "sensor"] == ["plant"]
     assert ROUTES["controller"].to == "plant"
     for flow in (Flow.UPDATE, Flow.ACTUATION):
@@ -257,8 +257,8 @@ def test_only_the_plant_is_heard_by_the_sensor() -> None:
         assert ear.rejected[Rejection.FLOW] == 1
 
 
-def test_acknowledgements_are_no_leg_of_the_loop_and_are_heard_by_nobody_in_it() -> None:
-    """Not even one of the run's own key: a decoder of the ordinary loop takes one flow."""
+def test_no_process_of_the_ordinary_loop_accepts_acknowledgements() -> None:
+    """Decoders of the loop reject them even under the run's key: each decoder accepts one flow."""
     assert all(Flow.ACKNOWLEDGEMENT not in (leg.receives, leg.sends) for leg in ROUTES.values())
     data = Encoder(RUN, KEY).encode(Message(Flow.ACKNOWLEDGEMENT, 0, 0, np.zeros(0)))
     for role in ("plant", "sensor", "controller"):
@@ -283,10 +283,10 @@ def test_an_overtaken_update_is_discarded_and_counted_as_dropped(case: Case) -> 
 
 
 def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
-    """No event at all (the model is exact): x(t_k) from the exact discretisation, by hand.
+    """The model is exact, so no event occurs; compare x(t_k) with the exact discretisation.
 
-    A scalar plant ẋ = x + u with u = −3 x_c; ticks fall on the plant's steps. The input of tick k
-    is latched at step k + 1 and acts from there on.
+    A scalar plant ẋ = x + u with u = −3 x_c; ticks coincide with the plant's steps. The plant
+    latches the input of tick k at step k + 1 and applies it from then on.
     """
     a, b, k, x0 = 1.0, 1.0, -3.0, 2.0
     h = PERIOD_NS * 1e-9
@@ -294,7 +294,7 @@ def test_a_linear_loop_without_losses_is_a_linear_recursion() -> None:
         np.array([[a]]), np.array([[b]]), np.array([x0]), horizon_ns=STEPS * PERIOD_NS
     )
     H = np.array([[a + b * k]])
-    sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # never an event
+    sensor = Sensor(H, DecayingTrigger(10.0, 1e-3), np.array([x0]))  # no event occurs
     controller = Controller(
         H,
         LinearFeedback(np.array([[k]])),
@@ -323,24 +323,24 @@ def papers_example(mode: str) -> RunRecord:
     return simulate(resolve(load(path, [f"mode={mode}"])))
 
 
-def test_the_papers_example_does_what_the_paper_says() -> None:
-    """Section V: U = −12, M = 5, β = 0.5, α = 0.25; 80 % of the packets would be lost."""
+def test_the_papers_example_behaves_as_the_paper_states() -> None:
+    """Section V: U = −12, M = 5, β = 0.5, α = 0.25; 80 % packet loss without the cap."""
     events, settles_s = {}, {}
     for mode in ("model", "zoh"):
         loop = papers_example(mode)
         measured, deliveries = loop[SENSOR_MEASUREMENT], loop[CONTROLLER_DELIVERY]
         is_event = measured["event"] != NO_SEQUENCE
         events[mode] = int(is_event.sum())
-        # At most four successive dropouts, and that many do occur.
+        # The longest loss burst has exactly four packets.
         assert loop.notices == []
         assert deliveries["sequence"][0] == 0
         assert deliveries["dropouts"].max() == 4
         assert len(deliveries) < events[mode] / 2  # "most of this transmitted packets are lost"
-        # An event is where ‖e_s‖ exceeds the threshold; the first is one whatever the error.
+        # An event occurs where ‖e_s‖ exceeds the threshold; the first packet is always an event.
         over = measured["e_s_norm"] > measured["threshold"]
         over[0] = True
         np.testing.assert_array_equal(over, is_event)
-        # "The state converges": in 20 s the threshold falls by e^5 = 148, the state with it.
+        # "The state converges": in 20 s the threshold and the state decrease by e^5 = 148.
         size = np.linalg.norm(measured["x"], axis=1)
         assert size[measured["t_ns"] >= 19 * 10**9].max() < 0.03 * size[0]
         settles_s[mode] = measured["t_ns"][np.flatnonzero(size > 0.2 * size[0])[-1]] * 1e-9

@@ -1,4 +1,4 @@
-"""The documentation site is built as `make docs` builds it: a warning is an error."""
+"""Build the documentation site as `make docs` does, with warnings as errors."""
 
 import re
 import subprocess
@@ -45,7 +45,7 @@ def test_every_public_name_of_the_library_is_on_its_page(site: Path) -> None:
         assert f'id="noack.{name}"' in text
 
 
-def test_formulas_are_set_by_mathjax_of_the_site_itself(site: Path) -> None:
+def test_the_site_serves_its_own_mathjax(site: Path) -> None:
     for name in ("theory", "derivations", "mansd"):
         page = (site / f"{name}.html").read_text()
         assert '<div class="math notranslate nohighlight">' in page or name == "mansd"
@@ -55,12 +55,12 @@ def test_formulas_are_set_by_mathjax_of_the_site_itself(site: Path) -> None:
         assert not re.search(r"\$|\\(?:lVert|beta|frac)", left)
 
 
-def test_what_noack_does_not_do_is_said_and_linked() -> None:
+def test_the_limits_of_noack_are_documented_and_linked() -> None:
     for page, link in (("README.md", "docs/limits.md"), ("docs/index.md", "limits.md")):
         assert f"]({link})" in (ROOT / page).read_text()
 
 
-def test_pictures_are_as_light_as_the_page(site: Path) -> None:
+def test_pictures_match_the_light_page_background(site: Path) -> None:
     readme = re.findall(r"!\[[^\]]*\]\(([^)]+\.png)\)", (ROOT / "README.md").read_text())
     pictures = [*(site / "_images").glob("*.png"), *(ROOT / name for name in readme)]
     assert len(pictures) > len(readme) > 0
@@ -74,7 +74,7 @@ def test_pictures_are_as_light_as_the_page(site: Path) -> None:
         assert background[1] in ("#fefefe", "#ffffff"), path.name
 
 
-def test_a_page_loads_nothing_from_elsewhere(site: Path) -> None:
+def test_a_page_loads_no_external_resources(site: Path) -> None:
     for page in site.glob("*.html"):
         loaded = re.findall(r"<(?:script|link|img|iframe)\b[^>]*>", page.read_text())
         assert not [tag for tag in loaded if re.search(r'(?:src|href)="(?:https?:)?//', tag)]

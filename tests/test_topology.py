@@ -5,8 +5,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
-def test_imports_go_down_only_and_the_four_processes_know_nothing_of_each_other() -> None:
-    """The contracts of ``pyproject.toml``, as import-linter finds them."""
+def test_imports_go_down_only_and_the_four_processes_do_not_import_each_other() -> None:
+    """import-linter finds no violation of the contracts in ``pyproject.toml``."""
     answer = subprocess.run(
         [Path(sys.executable).with_name("lint-imports"), "--no-cache"],
         cwd=ROOT,

@@ -1,4 +1,4 @@
-"""The tutorial is gone through: its files written, its commands run, what it shows compared."""
+"""Run the tutorial: write its files, run its commands, and compare its sample output."""
 
 import json
 import re
@@ -19,7 +19,7 @@ NUMBER = re.compile(r"-?\d[\d,.]*(?:e[-+]?\d+)?")
 
 
 class Step(NamedTuple):
-    """A command of the tutorial, and lines that it shows of the output."""
+    """A command of the tutorial, and the output lines that the tutorial shows."""
 
     command: str
     shown: list[str]
@@ -50,7 +50,7 @@ def noack(step: Step) -> list[str]:
 
 
 def shape(line: str) -> str:
-    """The line without its numbers, and without spaces: how wide a column is depends on them."""
+    """Return the line without numbers and spaces: the column width depends on the numbers."""
     return "".join(NUMBER.sub("0", line).split())
 
 
@@ -59,7 +59,7 @@ def numbers(line: str) -> list[float]:
 
 
 def alike(line: str, other: str) -> bool:
-    """Whether a page may show one for the other: to 2 %, or both are rounding."""
+    """Whether two output lines agree to 2 %, or both differ from zero by rounding only."""
     return shape(line) == shape(other) and numbers(line) == pytest.approx(
         numbers(other), rel=0.02, abs=1e-12
     )
@@ -78,12 +78,12 @@ MAKE = [step for step in steps() if step.command.startswith("make ")]
 LIVE = steps_of("noack", "run", "set")
 
 
-def test_every_step_is_gone_through() -> None:
+def test_every_step_is_tested() -> None:
     assert [step.command for step in steps()] == [step.command for step in [*MAKE, *STILL, *LIVE]]
 
 
 @pytest.mark.parametrize("step", MAKE, ids=lambda step: step.command)
-def test_its_targets_exist(step: Step) -> None:
+def test_make_targets_of_the_tutorial_exist(step: Step) -> None:
     done = subprocess.run(
         ["make", "--dry-run", *step.command.split()[1:]], cwd=ROOT, capture_output=True, check=False
     )
@@ -91,7 +91,7 @@ def test_its_targets_exist(step: Step) -> None:
 
 
 @pytest.mark.parametrize("step", STILL, ids=lambda step: step.command)
-def test_its_commands_show_what_it_shows(step: Step, folder: Path) -> None:
+def test_commands_of_the_tutorial_print_the_shown_output(step: Step, folder: Path) -> None:
     done = subprocess.run(noack(step), cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     output = (done.stdout + done.stderr).splitlines()
@@ -99,8 +99,8 @@ def test_its_commands_show_what_it_shows(step: Step, folder: Path) -> None:
         assert any(alike(line, said) for said in output), line
 
 
-def test_its_knob_can_be_turned(folder: Path) -> None:
-    """The run of one terminal is changed from another, and ended as by Ctrl-C."""
+def test_the_runtime_parameter_of_the_tutorial_can_be_changed(folder: Path) -> None:
+    """One terminal runs the loop; another changes a runtime parameter and then sends SIGINT."""
     run, turn = LIVE
     with subprocess.Popen(
         noack(run), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -1,4 +1,4 @@
-"""``python -m tests.attacks --number 1000000``: so many hostile datagrams at each port of a run."""
+"""``python -m tests.attacks --number N``: send N hostile datagrams to each port of a run."""
 
 import argparse
 import sys
@@ -20,7 +20,7 @@ _WIDTH = 120
 
 
 def table_of(run: Attacked) -> Table:
-    """Kinds and ports: how many were sent, and what became of them."""
+    """Return a table by kind and port: datagrams sent and rejected."""
     table = Table("", "", *LOOP_ROLES, title="Hostile datagrams at each port")
     for role in LOOP_ROLES:
         table.columns[2 + LOOP_ROLES.index(role)].justify = "right"
@@ -51,7 +51,7 @@ def _sent(run: Attacked, role: str, sender: str, kind: str) -> int | None:
 
 
 def main() -> int:
-    """Attack, print the table, and say what is wrong; 1 if anything is."""
+    """Attack a run and print the table and each failed check; return 1 if a check failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--number", type=int, default=1_000_000, help="datagrams to each port")
     parser.add_argument("--rate", type=float, default=4000.0, help="of them a second")

@@ -1,4 +1,4 @@
-"""A run under attack: started by hand, so that its ticket with the key can be read by its owner."""
+"""A run under attack, one process at a time, so that this user can read its ticket and key."""
 
 import contextlib
 import json
@@ -31,12 +31,12 @@ from tests.attacks.sender import Plan
 
 PATIENCE_S = 150.0
 Sent = Mapping[str, Mapping[str, Mapping[str, Mapping[str, int]]]]
-"""By role, sender, kind and expected reason."""
+"""Numbers of datagrams by role, sender, kind and expected rejection reason."""
 
 
 @dataclass(frozen=True)
 class Attacked:
-    """What became of a run under attack."""
+    """The result of a run under attack."""
 
     status: int
     summary: Mapping[str, Any]
@@ -45,17 +45,17 @@ class Attacked:
     sent: Sent
 
     def channel(self, role: str) -> Mapping[str, Any]:
-        """A process's account of its datagrams."""
+        """Return the datagram counters of a process."""
         found: Mapping[str, Any] = self.record.reports[role]["channel"]
         return found
 
     def accepted(self, role: str) -> int:
-        """How many datagrams a process took; the network emulator, which verifies none, relayed."""
+        """Datagrams that a process accepted, or that the emulator, which verifies none, relayed."""
         relayed = len(self.record[NETEM_PACKET])
         return int(self.channel(role).get("accepted", relayed))
 
     def sent_to(self, role: str) -> Counter[str]:
-        """How many of the attacker's datagrams a process should have rejected, by reason."""
+        """Return how many hostile datagrams a process must reject, by reason."""
         total: Counter[str] = Counter()
         for kinds in self.sent.get(role, {}).values():
             for reasons in kinds.values():
@@ -64,7 +64,7 @@ class Attacked:
 
 
 def may_forge_addresses() -> bool:
-    """Whether this user may send with another's address."""
+    """Whether this user is permitted to send from a forged source address."""
     try:
         socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_UDP).close()
     except OSError:
@@ -74,7 +74,7 @@ def may_forge_addresses() -> bool:
 
 @contextlib.contextmanager
 def run_by_hand(folder: Path, *arguments: str) -> Iterator["Run"]:
-    """Start a run, one process at a time; whatever is left is killed at the end."""
+    """Start a run, one process at a time; kill the remaining processes at the end."""
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
 
     def start(*command: str) -> subprocess.Popen[str]:
@@ -99,7 +99,7 @@ def run_by_hand(folder: Path, *arguments: str) -> Iterator["Run"]:
 
 
 class Run:
-    """A run under way."""
+    """An active run."""
 
     def __init__(
         self, folder: Path, recording: "subprocess.Popen[str]",
@@ -110,7 +110,7 @@ class Run:
         self._recording = recording
 
     def targets(self) -> list[Target]:
-        """Wait until the loop runs; return its processes, with where they listen."""
+        """Wait until the loop runs; return its processes with their ports."""
         ticket = self._ticket()
         run_dir = Path(ticket.run_dir)
         for table in (PLANT_ACTUATION, SENSOR_MEASUREMENT, CONTROLLER_DELIVERY):
@@ -128,7 +128,7 @@ class Run:
         ]  # fmt: skip
 
     def finish(self, sent: Sent) -> Attacked:
-        """Wait for the end."""
+        """Wait for the end of the run; return its result."""
         stdout, stderr = self._recording.communicate(timeout=PATIENCE_S + 600)
         for process in self.processes.values():
             process.communicate(timeout=PATIENCE_S)
@@ -164,11 +164,11 @@ def attack(
     """Attack all four ports of a run of the paper's example while it runs.
 
     Args:
-        folder: takes the run.
-        per_port: datagrams to each port.
-        rate_hz: how many of them a second.
-        forge_addresses: whether to send in the peers' names, too.
-        speed: of the run.
+        folder: the folder for the run directory.
+        per_port: number of datagrams to each port.
+        rate_hz: datagrams per second to each port.
+        forge_addresses: whether to send from the peers' addresses, too.
+        speed: the speed of the run relative to real time.
     """
     sending_s = per_port / rate_hz
     horizon_s = speed * (1.5 * sending_s + 7.0)

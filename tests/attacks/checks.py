@@ -1,4 +1,4 @@
-"""What must hold of a run under attack; each check yields what is wrong, a line each."""
+"""Checks of a run under attack; each check yields one line per failure."""
 
 from collections.abc import Callable, Iterator, Mapping
 
@@ -21,7 +21,7 @@ _TAKEN = {
 
 
 def ends_well(run: Attacked) -> Iterator[str]:
-    """The run reaches its horizon, and every process ends by itself."""
+    """The run reaches its horizon, and every process exits normally."""
     if run.status != 0:
         yield f"exit status {run.status}: {run.stderr.strip()}"
     if run.summary["exit"]["reason"] != "horizon":
@@ -29,7 +29,7 @@ def ends_well(run: Attacked) -> Iterator[str]:
 
 
 def nothing_is_accepted(run: Attacked) -> Iterator[str]:
-    """Each process took as many datagrams as its peer sent, and no others."""
+    """Each process accepted exactly as many datagrams as its peer sent."""
     for role in LOOP_ROLES:
         sent = run.channel(SENDER[role])["sent"]
         taken = len(run.record[_TAKEN[role]])
@@ -38,7 +38,7 @@ def nothing_is_accepted(run: Attacked) -> Iterator[str]:
 
 
 def all_are_accounted_for(run: Attacked) -> Iterator[str]:
-    """What was sent was rejected, each for its reason, or shed by the kernel before it was read."""
+    """Each hostile datagram was rejected for the expected reason or dropped by the kernel."""
     for role in LOOP_ROLES:
         expected, rejected = run.sent_to(role), dict(run.channel(role)["rejected"])
         shed = rejected.pop(SHED, 0)
@@ -50,7 +50,7 @@ def all_are_accounted_for(run: Attacked) -> Iterator[str]:
 
 
 def nothing_is_lost(run: Attacked) -> Iterator[str]:
-    """The loop's own datagrams all arrive, and all that happened is in the record."""
+    """All datagrams of the loop arrive, and the record is complete."""
     for key in ("unintended_losses", "missing_samples"):
         if run.summary[key]:
             yield f"{key}: {run.summary[key]}, {run.summary['unintended_losses_by_leg']}"
@@ -60,7 +60,7 @@ def nothing_is_lost(run: Attacked) -> Iterator[str]:
 
 
 def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
-    """The machines put out what they put out for these inputs, and (I1) holds to rounding."""
+    """Replay gives the recorded outputs, and (I1) holds to rounding."""
     if not (run.summary["replay"]["bit_exact"] and run.summary["replay"]["complete"]):
         yield f"replay: {run.summary['replay']}"
     if not run.summary["identity_residual_max"] < 1e-11:
@@ -68,7 +68,7 @@ def the_loop_computes_what_it_should(run: Attacked) -> Iterator[str]:
 
 
 def no_claim_is_violated(run: Attacked) -> Iterator[str]:
-    """What is certified holds; void it may be, as a busy machine is late."""
+    """No claim is violated; claims may be void because of deadlines missed on a busy machine."""
     claims = run.summary["claims"]
     if not any("state" in claim["what"] and claim["certified"] is not None for claim in claims):
         yield "no envelope of the state is claimed"

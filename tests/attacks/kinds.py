@@ -1,6 +1,6 @@
-"""What an attacker sends: one function a kind, each a datagram that nobody may act on.
+"""Hostile datagrams: one function per kind; no process may accept its datagrams.
 
-The attacker is a strong one: he knows the run's ports, its id and, to replay and misplace, its key.
+The attacker has the run's ports and id. To replay and misdirect datagrams, it also has the key.
 """
 
 import random
@@ -21,9 +21,9 @@ from noack.protocol.wire_format import (
 )
 
 FUTURE = 2**40
-"""A sequence number that no run reaches: newer than every one accepted."""
+"""A sequence number that no run reaches: greater than every accepted number."""
 REPLAYED = 0
-"""The number of what is replayed; it is used up when an attack begins."""
+"""The sequence number of replayed datagrams; it was accepted before an attack begins."""
 
 
 class Target(NamedTuple):
@@ -32,9 +32,9 @@ class Target(NamedTuple):
     role: str
     port: int
     peer_port: int
-    """From where it hears its peer."""
+    """The port from which its peer sends."""
     flow: Flow
-    """What it hears."""
+    """The flow that it receives."""
     dimension: int
     run_id: int
     key: bytes
@@ -60,7 +60,7 @@ def _authentic(
 
 
 def empty(target: Target, draw: random.Random) -> bytes:
-    """Nothing."""
+    """An empty datagram."""
     return b""
 
 
@@ -71,12 +71,12 @@ def noise(target: Target, draw: random.Random) -> bytes:
 
 
 def forged(target: Target, draw: random.Random) -> bytes:
-    """The right header, any numbers, a guessed tag."""
+    """A correct header, random values, a guessed tag."""
     return _authentic(target, draw)[:-TAG_BYTES] + draw.randbytes(TAG_BYTES)
 
 
 def flipped(target: Target, draw: random.Random) -> bytes:
-    """Authentic but for one bit."""
+    """An authentic datagram with one bit flipped."""
     data = bytearray(_authentic(target, draw))
     bit = draw.randrange(8 * len(data))
     data[bit // 8] ^= 1 << bit % 8
@@ -84,23 +84,23 @@ def flipped(target: Target, draw: random.Random) -> bytes:
 
 
 def truncated(target: Target, draw: random.Random) -> bytes:
-    """The beginning of an authentic one."""
+    """The beginning of an authentic datagram."""
     data = _authentic(target, draw)
     return data[: draw.randrange(len(data))]
 
 
 def oversized(target: Target, draw: random.Random) -> bytes:
-    """An authentic one, and more."""
+    """An authentic datagram with additional bytes."""
     return _authentic(target, draw) + bytes(draw.choice((1, 8, 1000, 60_000)))
 
 
 def replayed(target: Target, draw: random.Random) -> bytes:
-    """Authentic, and accepted once already."""
+    """An authentic datagram that was accepted before."""
     return _authentic(target, draw, sequence=REPLAYED)
 
 
 def cross_run(target: Target, draw: random.Random) -> bytes:
-    """Authentic in another run: another id, another key, or both."""
+    """A datagram of another run: another id, another key, or both."""
     other_id, other_key = draw.getrandbits(64), draw.randbytes(KEY_BYTES)
     which = draw.randrange(3)
     return _authentic(
@@ -111,13 +111,13 @@ def cross_run(target: Target, draw: random.Random) -> bytes:
 
 
 def cross_flow(target: Target, draw: random.Random) -> bytes:
-    """Authentic, but of a flow that goes elsewhere."""
+    """An authentic datagram of a flow to another process."""
     flows = [flow for flow in Flow if flow not in (target.flow, Flow.ACKNOWLEDGEMENT)]
     return _authentic(target, draw, flow=draw.choice(flows))
 
 
 def elsewhere(target: Target, draw: random.Random) -> bytes:
-    """Authentic and newer than all, from an address that is not the peer's."""
+    """An authentic datagram, newer than all others, not from the peer's address."""
     return _authentic(target, draw)
 
 
@@ -131,12 +131,12 @@ FROM_ANYWHERE: Mapping[str, Make] = {
 FROM_THE_PEER: Mapping[str, Make] = {
     name: make for name, make in FROM_ANYWHERE.items() if make is not elsewhere
 }
-"""What may be sent with the peer's address: whoever has that and the key is the peer."""
+"""Kinds for the peer's address; with address and key, a sender cannot be told from the peer."""
 
 
 class Expected:
-    """Under which reason a target rejects a datagram; what a stranger sends is the network
-    emulator's by its source alone."""
+    """The reason for which a target rejects a datagram; the network emulator rejects unknown
+    sources by their address alone."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -144,10 +144,10 @@ class Expected:
         assert self._decoder.decode(replayed(target, random.Random(0))) is not None
 
     def reason(self, data: bytes, *, from_peer: bool) -> Rejection:
-        """Return the reason.
+        """Return the rejection reason.
 
         Raises:
-            AssertionError: it would be accepted.
+            AssertionError: the target would accept the datagram.
         """
         if self._target.role == "netem":
             assert not from_peer

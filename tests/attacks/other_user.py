@@ -1,4 +1,4 @@
-"""A program that runs as another user of this machine, which takes root to start."""
+"""Run a program as another user of this machine; this needs root."""
 
 import os
 import subprocess
@@ -14,12 +14,12 @@ needs_root = pytest.mark.skipif(os.getuid() != 0, reason="acts as another user: 
 _BECOME = """
 import encodings.idna, http.server, os, sys, urllib.error, urllib.request
 os.setgroups([]); os.setgid({user}); os.setuid({user})
-"""  # imported first: he may not be able to read where Python lies
+"""  # imported first: the other user may not have access to Python's folder
 
 
 @contextmanager
 def as_another_user(code: str, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    """Run a program as another user while the context lasts; what it prints can be read."""
+    """Run a program as another user while the context lasts; its output can be read."""
     with subprocess.Popen(
         [sys.executable, "-c", _BECOME.format(user=NOBODY) + code, *arguments],
         stdout=subprocess.PIPE, text=True,

@@ -1,7 +1,7 @@
-"""The attacker's process: ``python -m tests.attacks.sender``, told what to do on standard input.
+"""The attacker's process: ``python -m tests.attacks.sender`` reads its plan from standard input.
 
-It sends each kind to each port in turn, at a steady rate, and prints what it sent as JSON: by role,
-sender and kind, how many by the reason under which they should be rejected.
+It sends each kind to each port in turn, at a steady rate. It prints as JSON the numbers of
+datagrams sent, by role, sender, kind and expected rejection reason.
 """
 
 import json
@@ -21,7 +21,7 @@ from tests.attacks.kinds import FROM_ANYWHERE, FROM_THE_PEER, Expected, Make, Ta
 STRANGER, PEER = "stranger", "forged address"
 _MADE_UP_FOR_S = 0.02
 _DISTINCT = 5000
-"""Datagrams of a kind and sender to a port that differ; they take time to make."""
+"""Number of distinct datagrams per kind, sender and port; making them takes time."""
 _UDP_HEADER = struct.Struct("!HHHH")
 
 
@@ -32,20 +32,20 @@ class Plan:
     targets: Sequence[Target]
     per_port: int
     rate_hz: float
-    """Datagrams a second and port."""
+    """Datagrams per second to each port."""
     forge_addresses: bool
     until_s: float
-    """When it ends even if not all have been sent, on the monotonic clock."""
+    """Latest end on the monotonic clock, even if datagrams are left."""
     seed: int = 1
 
     def dumps(self) -> str:
-        """The plan as JSON; it holds the run's key and belongs on a standard input."""
+        """Return the plan as JSON; it contains the run's key, so pass it on standard input only."""
         targets = [target._asdict() | {"key": target.key.hex()} for target in self.targets]
         return json.dumps(asdict(self) | {"targets": targets})
 
 
 def plan_from(text: str) -> Plan:
-    """Read a plan back."""
+    """Parse a plan from JSON."""
     fields = json.loads(text)
     fields["targets"] = [
         Target(**entry | {"key": bytes.fromhex(entry["key"]), "flow": Flow(entry["flow"])})
@@ -55,7 +55,7 @@ def plan_from(text: str) -> Plan:
 
 
 class _Sender:
-    """Sends as itself, or, where it may, in a peer's name."""
+    """Sends from its own address or, if permitted, from a peer's address."""
 
     def __init__(self, forge_addresses: bool) -> None:
         self._plain = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
@@ -73,7 +73,7 @@ class _Sender:
 
 
 class _Arm:
-    """A kind of datagram, sent by someone to a target."""
+    """A kind of datagram, its sender and its target."""
 
     def __init__(self, target: Target, sender: str, kind: str, make: Make, draw: random.Random):
         self.target, self.sender, self.kind = target, sender, kind
@@ -83,7 +83,7 @@ class _Arm:
         self._turn = 0
 
     def next(self) -> tuple[bytes, str]:
-        """Return a datagram, and why it should be rejected; after many, the first ones again."""
+        """Return a datagram and its rejection reason; datagrams repeat after ``_DISTINCT``."""
         self._turn = (self._turn + 1) % _DISTINCT
         if len(self._made) < _DISTINCT:
             data = self._make(self.target, self._draw)
@@ -95,13 +95,13 @@ class _Arm:
 
 def _arms(target: Target, forge_addresses: bool, draw: random.Random) -> list[_Arm]:
     arms = [_Arm(target, STRANGER, kind, make, draw) for kind, make in FROM_ANYWHERE.items()]
-    if forge_addresses and target.role != "netem":  # which believes the sensor's address
+    if forge_addresses and target.role != "netem":  # the emulator accepts the sensor's address
         arms += [_Arm(target, PEER, kind, make, draw) for kind, make in FROM_THE_PEER.items()]
     return arms
 
 
 def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
-    """Count at a steady rate; what was held up for long is not made up for in a burst."""
+    """Count at a steady rate; after a long stall, do not catch up in one burst."""
     due_s = time.monotonic()
     for number in range(count):
         now_s = time.monotonic()
@@ -115,7 +115,7 @@ def _paced(count: int, rate_hz: float, until_s: float) -> Iterator[int]:
 
 
 def carry_out(plan: Plan) -> dict[str, dict[str, dict[str, dict[str, int]]]]:
-    """Attack; return how many were sent, by role, sender, kind and expected reason."""
+    """Attack; return the numbers sent, by role, sender, kind and expected rejection reason."""
     draw, sender = random.Random(plan.seed), _Sender(plan.forge_addresses)
     every = [_arms(target, plan.forge_addresses, draw) for target in plan.targets]
     sent: Counter[tuple[str, str, str, str]] = Counter()

@@ -1,4 +1,4 @@
-"""Thousands of hostile datagrams of every kind at every port of a run: none is acted on."""
+"""Send thousands of hostile datagrams of every kind to every port of a run; none is accepted."""
 
 import random
 from collections.abc import Iterator
@@ -25,14 +25,16 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Attacked:
 
 
 @pytest.mark.parametrize("check", CHECKS.values(), ids=CHECKS)
-def test_under_attack(attacked: Attacked, check: "type[Iterator[str]]") -> None:
+def test_a_run_under_attack_passes_each_check(
+    attacked: Attacked, check: "type[Iterator[str]]"
+) -> None:
     assert list(check(attacked)) == []
 
 
 def test_every_kind_was_sent_to_every_port(attacked: Attacked) -> None:
     for role in LOOP_ROLES:
         assert attacked.sent[role][STRANGER].keys() == FROM_ANYWHERE.keys()
-        assert attacked.sent_to(role).total() > 1000  # as many as a busy machine sends in time
+        assert attacked.sent_to(role).total() > 1000  # even on a busy machine
 
 
 def test_datagrams_with_a_forged_peer_address_are_rejected_by_content(attacked: Attacked) -> None:
@@ -45,7 +47,7 @@ def test_datagrams_with_a_forged_peer_address_are_rejected_by_content(attacked: 
 
 @pytest.mark.parametrize("kind", FROM_ANYWHERE)
 def test_each_kind_of_attack_is_rejected_for_its_reasons(kind: str) -> None:
-    """Of a stranger and in the peer's name, with the reasons that the kind allows."""
+    """From an unknown source and from the peer's address, with the reasons of this kind."""
     target = Target("sensor", 1, 2, Flow.MEASUREMENT, 4, 9, bytes(range(32)))
     allowed = {
         "empty": {"length"},
@@ -69,10 +71,10 @@ def test_each_kind_of_attack_is_rejected_for_its_reasons(kind: str) -> None:
 
 
 def test_a_dropped_update_can_be_delivered_late_but_not_twice_nor_after_a_newer_one() -> None:
-    """What is left to somebody who may send in the network's name, and has no key.
+    """The remaining ability of an attacker who sends from the network's address without a key.
 
-    A datagram that the network dropped is authentic and not yet used up. Whoever kept a copy can
-    deliver it, once, as long as no newer one has been: as a network with a delay might have.
+    A datagram that the network dropped is authentic and was not accepted yet. An attacker with a
+    copy can deliver it once, until a newer one is accepted. A network with delay can do the same.
     """
     key = bytes(range(32))
     encoder, ear = Encoder(1, key), Decoder(Flow.UPDATE, 1, 1, key)

@@ -1,6 +1,6 @@
-"""Compiled code that another user could have planted: it is not kept there, and not loaded.
+"""noack neither writes nor loads compiled code in a folder to which another user can write.
 
-numba unpickles what it finds in its cache, so that who can write there runs code as the user.
+numba unpickles the files in its cache, so a user with write access there can run code as this user.
 """
 
 import os
@@ -40,7 +40,7 @@ CHANGES = [pytest.param(give_away, marks=needs_root), open_up, open_to_the_group
 
 
 class Payload:
-    """What runs a command of the attacker's choice when it is unpickled."""
+    """Unpickling this object runs the attacker's command."""
 
     def __init__(self, trace: Path) -> None:
         self.trace = trace
@@ -81,7 +81,7 @@ def test_no_cache_below_a_folder_that_others_may_write(
 
 
 @needs_root
-def test_nor_where_a_file_is_another_users(home: Path) -> None:
+def test_no_cache_in_a_folder_with_a_file_of_another_user(home: Path) -> None:
     folder = cache_folder("netem", SOURCES)
     assert folder is not None
     (folder / "of.another-1.nbi").write_bytes(b"planted")
@@ -101,7 +101,7 @@ def test_created_folders_are_private(home: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", [0o755, 0o775, 0o777])
-def test_the_folder_that_an_older_version_left_to_the_umask_is_closed(
+def test_a_folder_of_an_older_version_with_open_permissions_is_made_private(
     mode: int, home: Path
 ) -> None:
     before = cache_folder("netem", SOURCES)
@@ -113,8 +113,8 @@ def test_the_folder_that_an_older_version_left_to_the_umask_is_closed(
 
 @needs_root
 @pytest.mark.parametrize("level", ["noack", "noack/below"])
-def test_unless_another_user_has_put_his_own_there(level: str, home: Path) -> None:
-    """Either the whole folder, or, where he could write, the one in which the code lies."""
+def test_no_cache_in_a_folder_of_another_user(level: str, home: Path) -> None:
+    """The other user owns either the whole folder or the inner folder with the code."""
     folder = cache_folder("netem", SOURCES)
     assert folder is not None
     folder.parent.chmod(0o777)
@@ -123,13 +123,13 @@ def test_unless_another_user_has_put_his_own_there(level: str, home: Path) -> No
 
 
 def test_a_cache_below_a_sticky_folder_is_allowed(home: Path) -> None:
-    """There others may make files, but neither replace nor remove the user's."""
+    """In a sticky folder, others can create files but cannot replace or remove this user's."""
     home.mkdir(parents=True)
     home.parent.chmod(0o1777)
     assert cache_folder("netem", SOURCES) is not None
 
 
-def test_a_link_is_followed_to_where_it_is_checked(home: Path, tmp_path: Path) -> None:
+def test_the_target_of_a_symbolic_link_is_checked(home: Path, tmp_path: Path) -> None:
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs").chmod(0o777)
     home.parent.mkdir()

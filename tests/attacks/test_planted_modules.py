@@ -1,4 +1,4 @@
-"""Files planted in the current folder: no process that noack starts imports them."""
+"""No process that noack starts imports modules from the current folder."""
 
 import os
 import re
@@ -23,7 +23,7 @@ if __name__ == "__main__":
 
 @pytest.fixture
 def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Stand in a folder whose modules leave a trace when one is imported; return the trace."""
+    """Enter a folder with modules that write a trace file when imported; return its path."""
     folder, trace = tmp_path / "planted", tmp_path / "trace"
     folder.mkdir()
     for name in SHADOWED:
@@ -32,12 +32,12 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return trace
 
 
-def test_the_plants_are_imported_where_nothing_prevents_it(planted: Path) -> None:
+def test_planted_modules_are_imported_without_protection(planted: Path) -> None:
     subprocess.run([sys.executable, "-c", "import fcntl"], check=True)
     assert planted.read_text() == "fcntl "
 
 
-def test_the_live_viewers_process_imports_none(planted: Path) -> None:
+def test_the_live_viewers_process_imports_no_planted_module(planted: Path) -> None:
     recording = planted.with_name("recording.rrd")
     recording.write_bytes(b"RRF2")
     live = LiveView(native=False)
@@ -49,8 +49,8 @@ def test_the_live_viewers_process_imports_none(planted: Path) -> None:
 
 
 @pytest.mark.parametrize("flag", [(), ("-P",)])
-def test_workers_import_none(planted: Path, flag: tuple[str, ...]) -> None:
-    """Started as the program ``noack`` starts them, whose own folder is not the current one."""
+def test_workers_import_no_planted_module(planted: Path, flag: tuple[str, ...]) -> None:
+    """The program ``noack`` starts them; its own folder is not the current folder."""
     program = planted.with_name("program.py")
     program.write_text(POOL)
     done = subprocess.run(
@@ -61,8 +61,8 @@ def test_workers_import_none(planted: Path, flag: tuple[str, ...]) -> None:
     assert done.stdout == "32\n", done.stderr
 
 
-def test_one_function_starts_python() -> None:
-    """Whoever names the interpreter himself may forget ``-P``."""
+def test_only_one_function_starts_the_interpreter() -> None:
+    """A call that names the interpreter directly could omit ``-P``."""
     naming = [
         str(path.relative_to(ROOT))
         for package in PACKAGES

@@ -1,7 +1,7 @@
-"""The user's runtime folder in a place where everybody may write: nobody else is let in.
+"""The runtime folder in a world-writable place: other users get no access.
 
-The other user is impersonated where only the outcome counts; what needs a second user id skips
-without root.
+Some tests imitate the other user's actions; tests that need a second user id are skipped without
+root.
 """
 
 import os
@@ -26,7 +26,7 @@ OWN = f"noack-{os.getuid()}"
 EMULATOR = emulator_session.Session("lab", "tcp/127.0.0.1:1", "secret")
 
 _swaps: list[Callable[[str], None]] = []
-"""What another user does as this process opens a file; an audit hook stays for ever."""
+"""Actions of the other user as this process opens a file; an audit hook cannot be removed."""
 
 
 def _as_a_file_is_opened(event: str, details: tuple[Any, ...]) -> None:
@@ -39,7 +39,7 @@ sys.addaudithook(_as_a_file_is_opened)
 
 @pytest.fixture
 def shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder for temporary files, there being no XDG_RUNTIME_DIR."""
+    """The folder for temporary files, used without XDG_RUNTIME_DIR."""
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
@@ -74,10 +74,10 @@ USES: dict[str, Callable[[Ticket], Callable[[], object]]] = {
 
 
 @pytest.mark.parametrize("use", USES.values(), ids=USES)
-def test_a_link_in_the_folders_place_is_refused(
+def test_a_symbolic_link_instead_of_the_folder_is_refused(
     use: Callable[[Ticket], Callable[[], object]], shared: Path, ticket: Ticket
 ) -> None:
-    """Even one that leads to a folder of the user's own: it can be led elsewhere at any time."""
+    """Even a link to this user's own folder: its owner can change the target at any time."""
     own = shared / "own"
     for folder in (own, own / "runs", own / "netem"):
         folder.mkdir(mode=0o700)
@@ -108,17 +108,17 @@ def test_a_folder_of_another_user_inside_is_refused(
 def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(
     shared: Path, ticket: Ticket
 ) -> None:
-    """Between the check of the folder and the opening of the file."""
+    """The swap happens after the folder is checked and before the file is opened."""
     theirs = shared / "theirs"
     theirs.mkdir()
 
     def swap(_: str) -> None:
         (shared / OWN).rename(shared / "away")
         (shared / OWN).symlink_to(theirs)
-        (theirs / f"default.{os.getpid()}").touch(mode=0o666)  # theirs if it is opened, not made
+        (theirs / f"default.{os.getpid()}").touch(mode=0o666)  # theirs if opened, not created
 
     with published(ticket, "other"):
-        pass  # the folder exists, as after any earlier run
+        pass  # creates the folder, as an earlier run does
     _swaps.append(swap)
     with published(ticket, "default"):
         assert not _swaps
@@ -128,7 +128,7 @@ def test_a_ticket_is_not_written_into_a_folder_swapped_in_meanwhile(
 def test_a_ticket_is_not_read_from_a_folder_swapped_in_meanwhile(
     shared: Path, ticket: Ticket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nor is what the other user put there believed when he swaps the folder back."""
+    """Even if the other user swaps the folder back, noack does not use the planted ticket."""
     theirs, away = shared / "theirs", shared / "away"
     theirs.mkdir()
     (theirs / "default.json").write_text(ticket._replace(run_dir="theirs").dumps())
@@ -162,7 +162,7 @@ def test_a_file_of_another_user_is_not_read(theirs: str, shared: Path, ticket: T
 
 
 def test_only_regular_files_are_read(shared: Path) -> None:
-    """A named pipe would hold up whoever reads it."""
+    """A named pipe would block its reader."""
     (shared / OWN).mkdir(mode=0o700)
     os.mkfifo(ticket_path("default"))
     with pytest.raises(CallerError, match="file of yours"):
@@ -175,7 +175,7 @@ def test_the_doctor_reports_a_folder_that_cannot_be_used(shared: Path) -> None:
     assert "closed to others" in str(_runtime_folder())
 
 
-def test_without_a_folder_there_is_no_run(shared: Path) -> None:
+def test_a_run_without_a_usable_folder_is_refused(shared: Path) -> None:
     with pytest.raises(PeerError, match="no run to join"):
         join()
     with pytest.raises(CallerError, match="no run is active"):

@@ -1,4 +1,4 @@
-"""Another user of the machine at the ports of the web viewer: he neither reads nor replaces."""
+"""Another user at the web viewer's ports can neither read nor replace the recording."""
 
 import http.client
 import os
@@ -48,7 +48,7 @@ def server(tmp_path: Path) -> Iterator[RecordingServer]:
 
 
 def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """Ask without following redirections, nor mending the path."""
+    """Send a request without following redirections or normalising the path."""
     parts = urlsplit(url)
     target = url.removeprefix(f"{parts.scheme}://{parts.netloc}")
     with socket.create_connection((str(parts.hostname), parts.port)) as connection:
@@ -61,7 +61,7 @@ def ask(url: str, host: str | None = None) -> tuple[int, http.client.HTTPMessage
             return answer.status, answer.headers, answer.read()
 
 
-def test_the_page_is_only_at_the_printed_address(server: RecordingServer) -> None:
+def test_only_the_printed_address_serves_the_page(server: RecordingServer) -> None:
     address = server.start_page()
     status, headers, _ = ask(f"{address}?theme=light")
     assert status == 302
@@ -130,7 +130,7 @@ def test_an_invalid_path_gives_one_line(
     assert capfd.readouterr().err == ""
 
 
-def test_nobody_is_told_the_address_by_the_browser(server: RecordingServer) -> None:
+def test_the_browser_sends_no_referrer(server: RecordingServer) -> None:
     address = server.start_page()
     for url in (
         address,
@@ -142,8 +142,8 @@ def test_nobody_is_told_the_address_by_the_browser(server: RecordingServer) -> N
         assert ask(url)[1]["Referrer-Policy"] == "no-referrer"
 
 
-def test_when_reruns_program_ends_the_page_does_too(server: RecordingServer) -> None:
-    """Even where another program of this user's takes its port."""
+def test_the_page_ends_with_the_rerun_program(server: RecordingServer) -> None:
+    """Also if another program of this user binds the same port."""
     address = server.start_page()
     assert server.web_viewer is not None
     server.web_viewer.process.kill()
@@ -156,8 +156,10 @@ def test_when_reruns_program_ends_the_page_does_too(server: RecordingServer) -> 
 
 
 @needs_root
-def test_another_users_program_on_reruns_port_is_not_believed(server: RecordingServer) -> None:
-    """He has bound the port before rerun, or after it."""
+def test_responses_of_another_users_program_on_reruns_port_are_refused(
+    server: RecordingServer,
+) -> None:
+    """The other user has bound the port before rerun, or after it."""
     address = server.start_page()
     with as_another_user(THEIR_SERVER, "0") as theirs:
         assert theirs.stdout is not None
@@ -171,8 +173,8 @@ def test_another_users_program_on_reruns_port_is_not_believed(server: RecordingS
 
 
 @needs_root
-def test_reruns_port_cannot_be_had_by_another_user(server: RecordingServer) -> None:
-    """There is no time in which it is chosen and not yet bound."""
+def test_another_user_cannot_bind_reruns_port(server: RecordingServer) -> None:
+    """The port is bound as it is chosen."""
     server.start_page()
     assert server.web_viewer is not None
     code = """
@@ -193,7 +195,7 @@ for host in ("127.0.0.1", "0.0.0.0"):
 
 @needs_root
 def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) -> None:
-    """It is on a command line, so that others know it."""
+    """The address is on a command line, where other users can read it."""
     assert said_by_another_user(THEIR_GET, server.window_address + RECORDING) == "404"
     assert not server.requested.is_set()
     assert ask(server.window_address + RECORDING)[::2] == (200, CONTENT)
@@ -201,7 +203,7 @@ def test_a_windows_address_is_served_to_this_user_only(server: RecordingServer) 
 
 
 @needs_root
-def test_the_user_at_the_other_end_is_told() -> None:
+def test_peer_user_is_the_user_at_the_other_end() -> None:
     code = """
 import socket, time
 with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
@@ -217,12 +219,12 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))):
         connection.close()
 
 
-def test_so_is_this_user_once_somebody_has_accepted() -> None:
+def test_peer_user_is_this_user_after_accept() -> None:
     with (
         socket.create_server((HOST, 0)) as listening,
         socket.create_connection(listening.getsockname()) as ours,
     ):
-        assert peer_user(ours) is None  # nobody yet
+        assert peer_user(ours) is None  # no connection accepted yet
         accepted, _ = listening.accept()
         assert peer_user(ours) == peer_user(accepted) == os.getuid()
         accepted.close()

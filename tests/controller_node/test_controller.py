@@ -46,7 +46,7 @@ def update(sequence: int, t_ns: int, x: Sequence[float] = (1.0, -2.0)) -> Messag
 
 
 def tick(controller: Controller) -> tuple[Message, Any]:
-    """Do the next tick in time; return the actuation and its row."""
+    """Execute the next tick on time; return the actuation and its row."""
     t_ns = controller.next_deadline_ns()
     assert t_ns is not None
     message, record = controller.on_timer(t_ns)
@@ -68,7 +68,7 @@ def propagated(x: Sequence[float] | np.ndarray, dt_ns: int) -> np.ndarray:
     return np.asarray(expm(H * dt_ns * 1e-9) @ x)
 
 
-def test_actuations_come_on_their_grid_up_to_the_horizon() -> None:
+def test_actuations_are_sent_on_their_grid_up_to_the_horizon() -> None:
     controller = new_controller(phase_ns=MS, horizon_ns=9 * MS)
     sent = []
     while controller.next_deadline_ns() is not None:
@@ -88,12 +88,12 @@ def test_the_input_is_the_gain_times_the_model_state_bit_for_bit() -> None:
         assert row["x_c"].tobytes() == controller.x_c.tobytes()
 
 
-def test_between_deliveries_the_model_runs_freely() -> None:
+def test_the_model_is_propagated_without_input_between_deliveries() -> None:
     x0 = np.array([0.3, -1.7])
     controller = new_controller(x0=x0)
     for _ in range(400):
         message, _ = tick(controller)
-        # 400 propagations, each good to some 1e-15; this model does not grow in 0.8 s.
+        # 400 propagations, each with an error of about 1e-15; this model does not grow in 0.8 s.
         np.testing.assert_allclose(controller.x_c, propagated(x0, message.t_ns), atol=1e-12)
 
 
@@ -117,27 +117,27 @@ def test_a_late_update_is_propagated_from_its_event_time() -> None:
     for _ in range(6):
         tick(controller)
     x = [1.0, -2.0]
-    outputs = controller.handle(update(0, 4 * MS, x), 12 * MS)  # the model stands at 11 ms
+    outputs = controller.handle(update(0, 4 * MS, x), 12 * MS)  # the model's time is now 11 ms
     np.testing.assert_allclose(controller.x_c, propagated(x, 7 * MS), rtol=1e-13)
     (row,) = rows(outputs, CONTROLLER_DELIVERY)
     assert (row["t_ns"], row["now_ns"], row["model_t_ns"]) == (4 * MS, 12 * MS, 11 * MS)
     assert row["x"].tolist() == x
     np.testing.assert_array_equal(row["x_c"], controller.x_c)
-    tick(controller)  # at 13 ms, as if it had come in time
+    tick(controller)  # at 13 ms, as if it had arrived on time
     np.testing.assert_allclose(controller.x_c, propagated(x, 9 * MS), rtol=1e-13)
 
 
-def test_an_update_that_is_newer_than_the_model_takes_it_along() -> None:
+def test_an_update_newer_than_the_model_advances_the_model() -> None:
     x0 = np.array([0.3, -1.7])
     controller = new_controller(x0=x0)
     outputs = controller.handle(update(0, 6 * MS, [1.0, -2.0]), 6 * MS)  # ticks at 1, 3, 5 ms late
     (row,) = rows(outputs, CONTROLLER_DELIVERY)
     assert row["model_t_ns"] == 6 * MS
     np.testing.assert_allclose(row["x_c_before"], propagated(x0, 6 * MS), rtol=1e-13)
-    for t_ns in (MS, 3 * MS, 5 * MS):  # caught up, but the model does not go back
+    for t_ns in (MS, 3 * MS, 5 * MS):  # caught up; the model's time does not go back
         message, row = tick(controller)
         assert row["t_ns"] == t_ns
-        assert message.t_ns == 6 * MS  # that of the model behind it
+        assert message.t_ns == 6 * MS  # the time of the model state used for the input
         assert row["model_t_ns"] == 6 * MS
         assert row["x_c"].tolist() == [1.0, -2.0]
     _, row = tick(controller)
@@ -147,7 +147,7 @@ def test_an_update_that_is_newer_than_the_model_takes_it_along() -> None:
 
 @given(st.lists(st.none() | st.tuples(st.integers(0, 40), st.integers(0, 3)), max_size=40))
 def test_the_models_time_never_runs_back(inputs: list[tuple[int, int] | None]) -> None:
-    """Ticks (None) and updates of any age and gap, in any order."""
+    """Ticks (None) and updates of any age and gap arrive in any order."""
     controller = new_controller(mansd=0)
     model_ns, sequence, newest = 0, -1, None
     for item in inputs:
@@ -172,7 +172,7 @@ def test_the_models_time_never_runs_back(inputs: list[tuple[int, int] | None]) -
             np.testing.assert_allclose(controller.x_c, expected, atol=1e-13)
 
 
-def test_late_ticks_are_dated_as_they_were_due() -> None:
+def test_late_ticks_carry_their_nominal_time() -> None:
     late, in_time = new_controller(x0=np.ones(2)), new_controller(x0=np.ones(2))
     for k in range(5):
         message, record = late.on_timer(50 * MS)
@@ -186,7 +186,7 @@ def test_late_ticks_are_dated_as_they_were_due() -> None:
 
 @pytest.mark.parametrize("mansd", [0, 1, 4])
 @pytest.mark.parametrize("gap", range(7))
-def test_a_violation_is_told_exactly_when_more_were_lost_than_assumed(mansd: int, gap: int) -> None:
+def test_a_violation_is_reported_exactly_when_losses_exceed_m_minus_1(mansd: int, gap: int) -> None:
     controller = new_controller(mansd=mansd)
     assert notices(controller.handle(update(0, 0), 0)) == []
     outputs = controller.handle(update(1 + gap, 77 * MS), 90 * MS)
@@ -202,7 +202,8 @@ def test_a_violation_is_told_exactly_when_more_were_lost_than_assumed(mansd: int
             f"MANSD violated: {gap} successive dropouts before update {1 + gap}, "
             f"at most {mansd} assumed"
         )
-    assert notices(controller.handle(update(2 + gap, 78 * MS), 91 * MS)) == []  # counted anew
+    # the count starts again
+    assert notices(controller.handle(update(2 + gap, 78 * MS), 91 * MS)) == []
 
 
 @pytest.mark.parametrize(
@@ -217,7 +218,7 @@ def test_a_violation_is_told_exactly_when_more_were_lost_than_assumed(mansd: int
         (True, 3, "MANSD violated: 3 successive dropouts"),
     ],
 )
-def test_the_paper_needs_a_delivered_or_a_known_start(
+def test_lost_first_updates_are_a_violation_without_a_known_start(
     known: bool, lost: int, told: str | None
 ) -> None:
     controller = new_controller(mansd=2, x0=np.ones(2) if known else None)
@@ -231,17 +232,17 @@ def test_the_paper_needs_a_delivered_or_a_known_start(
         assert (notice.t_ns, notice.level) == (5 * MS, "violation")
         assert notice.text.startswith(told)
         assert str(lost) in notice.text or lost == 1
-    # From then on the flow has begun: a gap within the cap is no news.
+    # The flow has begun: a gap within the cap is no violation.
     assert notices(controller.handle(update(lost + 2, 7 * MS), 8 * MS)) == []
 
 
-def test_without_a_known_start_the_model_is_at_rest() -> None:
+def test_the_model_starts_at_zero_without_a_known_start() -> None:
     message, row = tick(new_controller())
     assert message.vector.tolist() == [0.0, 0.0, 0.0]
     assert row["x_c"].tolist() == [0.0, 0.0]
 
 
-def test_a_controller_puts_out_its_safe_input_until_it_knows_a_state() -> None:
+def test_the_safe_input_is_sent_until_the_first_update() -> None:
     safe = np.array([0.1, -0.2, 0.3])
     controller = new_controller(safe_input=safe)
     for _ in range(3):
@@ -252,14 +253,16 @@ def test_a_controller_puts_out_its_safe_input_until_it_knows_a_state() -> None:
     assert message.vector.tobytes() == (K @ controller.x_c).tobytes() == row["u"].tobytes()
 
 
-def test_a_controller_that_knows_the_start_needs_no_safe_input() -> None:
+def test_no_safe_input_is_sent_with_a_known_start() -> None:
     x0 = np.array([0.3, -1.7])
     message, _ = tick(new_controller(x0=x0, safe_input=np.full(3, 9.0)))
     np.testing.assert_allclose(message.vector, K @ propagated(x0, MS), rtol=1e-13)
 
 
 def test_an_actuation_carries_the_state_that_it_was_computed_from() -> None:
-    """And its time, although a newer update took the model ahead of a late tick."""
+    """An actuation also carries the state's time, although a newer update advanced the model past a
+    late tick.
+    """
     controller = new_controller(predictive=True, safe_input=np.full(3, 0.5))
     message, _ = tick(controller)
     assert message.vector.tolist() == [0.5, 0.5, 0.5, 0.0, 0.0]
@@ -269,7 +272,7 @@ def test_an_actuation_carries_the_state_that_it_was_computed_from() -> None:
     assert message.vector.tobytes() == np.append(row["u"], [1.0, -2.0]).tobytes()
 
 
-def test_inputs_are_numbered_in_their_order() -> None:
+def test_inputs_are_numbered_in_order_of_processing() -> None:
     controller = new_controller()
     numbers = [tick(controller)[1]["input"]]
     numbers += rows(controller.handle(update(0, 0), 0), CONTROLLER_DELIVERY)["input"].tolist()
@@ -278,7 +281,7 @@ def test_inputs_are_numbered_in_their_order() -> None:
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_controller_of_a_scenario_knows_the_model_not_the_plant(
+def test_the_controller_of_a_scenario_uses_the_model_not_the_plant(
     content: dict[str, Any], mode: str
 ) -> None:
     content |= {"mode": mode, "controller": {"rate_hz": 2.0, "phase": 0.5}}
@@ -289,7 +292,7 @@ def test_the_controller_of_a_scenario_knows_the_model_not_the_plant(
     message, _ = controller.on_timer(250_000_000)
     assert isinstance(message, Message)
     assert controller.next_deadline_ns() == 750_000_000
-    # ẍ = −x − 1.5 ẋ from (1, 0), by hand, or held; u = −x − 1.5 ẋ.
+    # ẍ = −x − 1.5 ẋ from (1, 0), by hand, or constant under a hold; u = −x − 1.5 ẋ.
     w, t = math.sqrt(1 - 0.75**2), 0.25
     decay = math.exp(-0.75 * t)
     position = decay * (math.cos(w * t) + 0.75 / w * math.sin(w * t))
@@ -300,7 +303,7 @@ def test_the_controller_of_a_scenario_knows_the_model_not_the_plant(
     assert len(notices(controller.handle(update(4, 0, [0.0, 0.0]), 0))) == 1
 
 
-def test_a_scenario_without_a_known_start_leaves_the_controller_at_rest(
+def test_the_controller_of_a_scenario_without_a_known_start_starts_at_zero(
     content: dict[str, Any],
 ) -> None:
     assert controller_of(resolve(validate(content, "here"))).x_c.tolist() == [0.0, 0.0]

@@ -1,4 +1,4 @@
-"""What disturbs a plant, and how it is measured: laws, independence, and the plant under it."""
+"""Disturbances and measurement noise: their laws, their independence, and the disturbed plant."""
 
 from typing import Any
 
@@ -55,7 +55,9 @@ def steps_of(plant: Plant, scenario: Scenario, count: int) -> tuple[Any, list[Me
     return np.array(rows, tables_of(scenario)["plant_step"]), sent
 
 
-def test_each_is_distributed_as_it_says_and_no_two_alike(disturbed: dict[str, Any]) -> None:
+def test_disturbances_have_their_distributions_and_are_independent(
+    disturbed: dict[str, Any],
+) -> None:
     disturbance = disturbance_of(resolved(disturbed))
     assert disturbance is not None
     pairs = [disturbance(step) for step in range(STEPS)]
@@ -66,12 +68,14 @@ def test_each_is_distributed_as_it_says_and_no_two_alike(disturbed: dict[str, An
     assert kstest(normal, "norm").pvalue > 1e-3
     assert kstest(w[:, 0], "uniform", (-0.2, 0.4)).pvalue > 1e-3
     np.testing.assert_allclose(w[:, 1], 1.5 * np.sin(2 * np.pi * 0.7 * t_s + 0.4), atol=1e-12)
-    # White, and nothing to do with each other: correlations of 4,000 are within 4/√4000.
+    # White and mutually independent: correlations of 4,000 samples are within 4/√4000.
     for one, other in ((normal[1:], normal[:-1]), (w[1:, 0], w[:-1, 0]), (normal, w[:, 0])):
         assert abs(np.corrcoef(one, other)[0, 1]) < 4 / np.sqrt(STEPS)
 
 
-def test_a_step_is_the_same_wherever_one_begins(disturbed: dict[str, Any]) -> None:
+def test_a_disturbance_does_not_depend_on_the_order_of_the_steps(
+    disturbed: dict[str, Any],
+) -> None:
     one, other = disturbance_of(resolved(disturbed)), disturbance_of(resolved(disturbed))
     assert one is not None
     assert other is not None
@@ -82,7 +86,7 @@ def test_a_step_is_the_same_wherever_one_begins(disturbed: dict[str, Any]) -> No
             assert (d.tobytes(), w.tobytes()) == tuple(v.tobytes() for v in backward[step])
 
 
-def test_seeds_change_what_they_are_of_and_nothing_else(disturbed: dict[str, Any]) -> None:
+def test_a_seed_changes_only_its_own_disturbance(disturbed: dict[str, Any]) -> None:
     base = resolved(disturbed)
     rows, sent = steps_of(plant_of(base), base, 20)
     noise = base.model_copy(update={"seeds": base.seeds.model_copy(update={"noise": 1})})
@@ -99,7 +103,7 @@ def test_seeds_change_what_they_are_of_and_nothing_else(disturbed: dict[str, Any
     np.testing.assert_allclose(v, v_2, atol=1e-12)
 
 
-def test_the_plant_moves_as_an_integrator_does_under_what_is_on_record(
+def test_the_plant_agrees_with_an_integrator_under_the_recorded_disturbance(
     disturbed: dict[str, Any],
 ) -> None:
     scenario = resolved(disturbed)
@@ -115,7 +119,7 @@ def test_the_plant_moves_as_an_integrator_does_under_what_is_on_record(
         np.testing.assert_allclose(rows["x"][k + 1], x, atol=1e-10)
 
 
-def test_a_plant_that_is_not_linear_feels_disturbances_of_its_input(
+def test_input_disturbances_act_on_a_nonlinear_plant(
     content: dict[str, Any],
 ) -> None:
     content["model"] = {
@@ -134,7 +138,7 @@ def test_a_plant_that_is_not_linear_feels_disturbances_of_its_input(
         other.handle(Message(Flow.ACTUATION, k, 0, np.array([0.6])), 0)
         one.on_timer(k * 2_000_000)
         other.on_timer(k * 2_000_000)
-    # Before the first actuation the second plant was pushed by nothing: both start at once.
+    # The second plant has no input before the first actuation, so both start in the same state.
     np.testing.assert_array_equal(one.x, other.x)
 
 
@@ -151,7 +155,7 @@ def test_measurements_carry_the_inputs_of_every_step_since_the_last(
         assert message.vector[2:].tolist() == rows["u"][3 * k - 3 : 3 * k, 0].tolist()
 
 
-def test_noise_is_distributed_as_it_says() -> None:
+def test_noise_has_its_distribution() -> None:
     C = np.array([[1.0, 2.0]])
     measuring = MeasurementModel(C, np.array([0.5]), np.array([0.0]), seed=7)
     y = np.array([measuring(np.array([1.0, 3.0]), k)[0] for k in range(STEPS)])
@@ -161,12 +165,12 @@ def test_noise_is_distributed_as_it_says() -> None:
     assert kstest(y, "uniform", (-0.2, 0.4)).pvalue > 1e-3
 
 
-def test_exact_measurements_are_the_state_itself(content: dict[str, Any]) -> None:
+def test_measurements_without_noise_equal_the_state(content: dict[str, Any]) -> None:
     content["plant"]["measurement"] = {"C": [[1.0, 0.0], [0.0, 1.0]], "noise_std": [0.0, 0.0]}
     assert measurement_model_of(resolved(content)) is None
 
 
-def test_normal_numbers_are_finite_at_the_ends_and_found_at_once() -> None:
+def test_normal_numbers_are_finite_and_any_row_is_computed_directly() -> None:
     table = normals(3, "test", rows=range(1000), width=3)
     assert np.isfinite(table).all()
     assert normals(3, "test", rows=range(500, 503), width=3).tolist() == table[500:503].tolist()

@@ -43,7 +43,7 @@ def measured(outputs: Sequence[object]) -> list[Message]:
 
 
 def rows(outputs: Sequence[object], table: str) -> Any:
-    """The table's rows, as the record will hold them."""
+    """The table's rows in the form that is recorded."""
     found = [out.row for out in outputs if isinstance(out, Record) and out.table == table]
     return np.array(found, tables(2, 2)[table])
 
@@ -59,7 +59,8 @@ def test_a_scalar_plant_follows_its_closed_form_through_changing_inputs() -> Non
         assert message.vector.item() == pytest.approx(x, rel=1e-13, abs=1e-13)
         u = math.sin(step)
         plant.handle(actuation(step, [u]), step * 50_000_000 + 1)
-        # Taken now, held from the next step on: x(t + h) is still due to the input before.
+        # Latched now and applied from the next step on: x(t + h) still results from the previous
+        # input.
         held = math.sin(step - 1) if step else 0.0
         x = math.exp(a * 0.05) * x + math.expm1(a * 0.05) / a * b * held
     assert plant.next_deadline_ns() is None
@@ -85,7 +86,7 @@ def test_the_plant_moves_as_an_integrator_does(inputs: list[tuple[float, float]]
         np.testing.assert_allclose(message.vector, x, atol=1e-10)
 
 
-def test_late_steps_are_of_the_same_length_and_caught_up() -> None:
+def test_late_steps_keep_their_length_and_are_caught_up() -> None:
     on_time, late = new_plant(), new_plant()
     expected, found = [], []
     for plant in (on_time, late):
@@ -94,8 +95,8 @@ def test_late_steps_are_of_the_same_length_and_caught_up() -> None:
         expected += on_time.on_timer(step * H_NS)
     now_ns = 0
     for step in range(20):
-        assert late.next_deadline_ns() == step * H_NS  # the grid does not move
-        # Asleep for a quarter of the run, then each step at once.
+        assert late.next_deadline_ns() == step * H_NS  # the grid does not shift
+        # Stopped for a quarter of the run, then every step at once.
         now_ns = max(now_ns, step * H_NS) if step != 5 else 10 * H_NS + 123
         found += late.on_timer(now_ns)
     for one, other in zip(measured(expected), measured(found), strict=True):
@@ -120,7 +121,7 @@ def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
     outputs += plant.handle(actuation(9, [0.0, 5.0]), 200)
     outputs += plant.on_timer(H_NS)
     assert plant.u.tolist() == [0.0, 5.0]
-    outputs += plant.on_timer(2 * H_NS)  # nothing new: held on
+    outputs += plant.on_timer(2 * H_NS)  # no newer actuation: the input is held
     steps = rows(outputs, PLANT_STEP)
     assert steps["actuation"].tolist() == [-1, 9, 9]
     assert steps["u"].tolist() == [[0.0, 0.0], [0.0, 5.0], [0.0, 5.0]]
@@ -133,14 +134,15 @@ def test_the_newest_actuation_is_latched_at_the_next_step_only() -> None:
 
 
 @pytest.mark.parametrize("every", [1, 2, 3, 7])
-def test_every_so_many_steps_are_measured(every: int) -> None:
+def test_measurements_are_sent_every_given_number_of_steps(every: int) -> None:
     plant, outputs = new_plant(measure_every=every), []
     for step in range(20):
         outputs += plant.on_timer(step * H_NS)
     sent = measured(outputs)
     assert {message.flow for message in sent} == {Flow.MEASUREMENT}
     assert [message.t_ns for message in sent] == [k * H_NS for k in range(0, 20, every)]
-    assert [message.sequence for message in sent] == list(range(len(sent)))  # no gap for the sensor
+    # the sensor sees no gap
+    assert [message.sequence for message in sent] == list(range(len(sent)))
     steps = rows(outputs, PLANT_STEP)
     assert steps["sequence"].tolist() == list(range(20))
     assert [m.vector.tolist() for m in sent] == steps["x"][::every].tolist()
@@ -155,7 +157,7 @@ def test_the_last_step_is_at_the_horizon(horizon_ns: int, steps: int) -> None:
     assert count == steps
 
 
-def test_what_was_measured_stays_as_it_was() -> None:
+def test_a_measurement_does_not_change_with_later_steps() -> None:
     x0 = np.array([1.0, -0.5])
     plant = linear_plant(A, B, x0, horizon_ns=10**9)
     (message,) = measured(plant.on_timer(0))
@@ -163,7 +165,7 @@ def test_what_was_measured_stays_as_it_was() -> None:
     assert message.vector.tolist() == x0.tolist() == [1.0, -0.5]
 
 
-def test_the_plant_of_a_scenario_is_the_true_one(content: dict[str, Any]) -> None:
+def test_the_plant_of_a_scenario_is_the_true_plant_not_the_model(content: dict[str, Any]) -> None:
     content["horizon_s"] = 0.3
     content["plant"] = {
         "draw": "given",

@@ -1,4 +1,4 @@
-"""Which input is in force when no actuation has come for too long."""
+"""The input that the plant applies when the last actuation is too old."""
 
 from typing import Any
 
@@ -35,7 +35,7 @@ def scenario(policy: str, **changes: Any) -> Any:
 
 
 class Driven:
-    """A plant whose steps are all in time."""
+    """A plant that executes every step on time."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -43,7 +43,7 @@ class Driven:
         self.notices: list[Notice] = []
 
     def until(self, t_ns: int) -> None:
-        """Make every step up to ``t_ns``."""
+        """Execute every step up to ``t_ns``."""
         while (due_ns := self.plant.next_deadline_ns()) is not None and due_ns <= t_ns:
             for out in self.plant.on_timer(due_ns):
                 if isinstance(out, Notice):
@@ -58,7 +58,7 @@ class Driven:
         self.plant.handle(Message(Flow.ACTUATION, sequence, t_ns, np.array(entries)), t_ns)
 
 
-def test_an_actuation_is_too_old_when_it_is_older_than_the_timeout() -> None:
+def test_the_watchdog_trips_when_the_actuation_is_older_than_the_timeout() -> None:
     for fallback, then in ((hold, 2.0), (zero, 0.0)):
         watchdog = Watchdog(1, 50 * MS, fallback)
         watchdog.take(np.array([2.0]), 7 * MS, 0)
@@ -84,7 +84,7 @@ def test_before_the_first_actuation_its_age_counts_from_the_start() -> None:
 
 
 @pytest.mark.parametrize("policy", ["hold", "zero", "model"])
-def test_it_trips_once_and_says_how_long_it_lasted(policy: str) -> None:
+def test_the_watchdog_reports_each_trip_once_with_its_duration(policy: str) -> None:
     driven = Driven(plant_of(scenario(policy)))
     carried = (2.0, 0.0, 0.0)[: 3 if policy == "model" else 1]
     driven.until(10 * MS)
@@ -98,11 +98,12 @@ def test_it_trips_once_and_says_how_long_it_lasted(policy: str) -> None:
     trip, end, _ = (notice.text for notice in driven.notices)
     assert trip.startswith("the newest actuation is as old as 0.055 s, 0.05 s allowed: ")
     assert end == "actuations are back; there was none in time for 0.07 s"
-    assert driven.steps[80 * MS]["actuation"] == 0  # the newest, even if it does not act
+    # the newest actuation, even if it is not applied
+    assert driven.steps[80 * MS]["actuation"] == 0
     assert driven.u(50 * MS) == driven.u(130 * MS) == 2.0
 
 
-def test_hold_and_zero() -> None:
+def test_the_policies_hold_and_zero_apply_the_last_input_or_zero() -> None:
     for policy, then in (("hold", 2.0), ("zero", 0.0)):
         driven = Driven(plant_of(scenario(policy)))
         driven.take(0, 0, 2.0)
@@ -111,8 +112,8 @@ def test_hold_and_zero() -> None:
         assert [driven.u(t_ns) for t_ns in (60 * MS, 90 * MS)] == [then, then]
 
 
-def test_the_model_s_input_is_what_the_controller_would_put_out() -> None:
-    """u = K e^{Ht} x_c at every step, from actuations of any time, the newest too old one too."""
+def test_the_model_policy_applies_the_input_that_the_controller_would_send() -> None:
+    """u = K e^{Ht} x_c at every step, from actuations of any age, including one that is too old."""
     driven = Driven(plant_of(scenario("model")))
     closed = np.array([[0.0, 1.0], [1.0, 0.5]]) + np.array([[0.0], [1.0]]) @ K
     x_c = np.array([0.7, -0.2])
@@ -126,24 +127,24 @@ def test_the_model_s_input_is_what_the_controller_would_put_out() -> None:
     driven.until(210 * MS)
     expected = K @ expm(closed * 0.09) @ late
     assert driven.u(210 * MS) == pytest.approx(expected.item(), rel=1e-12)
-    assert len(driven.notices) == 1  # it was too old when it came
+    assert len(driven.notices) == 1  # it was too old on arrival
 
 
-def test_a_model_that_holds_is_a_hold_of_the_input() -> None:
+def test_the_model_policy_with_a_hold_model_holds_the_input() -> None:
     driven = Driven(plant_of(scenario("model", mode="zoh")))
     driven.take(0, 3 * MS, 0.1, 0.3, -0.7)
     driven.until(300 * MS)
     assert {driven.u(t_ns) for t_ns in range(10 * MS, 310 * MS, 10 * MS)} == {0.1}
 
 
-def test_the_safe_input_of_a_controller_without_a_state_is_gone_on_with() -> None:
+def test_the_safe_input_is_continued_if_the_controller_had_no_state() -> None:
     driven = Driven(plant_of(scenario("model")))
     driven.take(0, 5 * MS, 0.25, 0.0, 0.0)
     driven.until(200 * MS)
     assert driven.u(200 * MS) == 0.25
 
 
-def test_what_an_actuation_carried_is_on_record() -> None:
+def test_the_state_carried_by_an_actuation_is_recorded() -> None:
     plant = plant_of(scenario("model"))
     message = Message(Flow.ACTUATION, 4, 5 * MS, np.array([0.5, 1.0, 2.0]))
     (record,) = plant.handle(message, 6 * MS)
@@ -153,7 +154,7 @@ def test_what_an_actuation_carried_is_on_record() -> None:
     assert row["x_c"].tolist() == [1.0, 2.0]
 
 
-def test_by_default_fifty_periods_of_the_controller_are_allowed() -> None:
+def test_the_default_timeout_is_fifty_controller_periods() -> None:
     plant = {"initial_state": [1.0, 0.0], "rate_hz": 100.0}
     resolved = scenario("hold", plant=plant, controller={"rate_hz": 200.0})
     assert resolved.timing.actuation_timeout_ns == 250 * MS

@@ -1,4 +1,4 @@
-"""The sensor of the acknowledgement baseline, by hand."""
+"""The sensor of the acknowledgement baseline, checked by hand."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -44,14 +44,14 @@ def sensor(timeout_ns: int = 3 * GRID_NS, x0: Sequence[float] | None = None) -> 
     return AcknowledgedSensor(H, ALWAYS, known, timeout_ns=timeout_ns, period_ns=GRID_NS)
 
 
-def test_an_event_resets_nothing_and_its_acknowledgement_does() -> None:
+def test_the_acknowledgement_resets_the_error_and_the_event_does_not() -> None:
     one = sensor(x0=[1.0, 0.0])
     (update,), row = split(one.handle(measurement(1, [2.0, 0.5]), GRID_NS))
     before = transition(H, GRID_NS) @ [1.0, 0.0]
     np.testing.assert_allclose(row["x_s"], before, rtol=1e-14)
     assert (row["event"], update.flow, update.sequence, update.t_ns) == (0, Flow.UPDATE, 0, GRID_NS)
     sent, row = split(one.handle(measurement(2, [2.0, 0.5]), 2 * GRID_NS))
-    assert sent == []  # the rule says so, but it waits
+    assert sent == []  # the rule is met, but the sensor is waiting
     assert row["compared"] > row["threshold"]
     np.testing.assert_allclose(row["x_s"], transition(H, 2 * GRID_NS) @ [1.0, 0.0], rtol=1e-13)
     sent, row = split(one.handle(acknowledgement(update), 2 * GRID_NS + 5 * MS))
@@ -61,7 +61,7 @@ def test_an_event_resets_nothing_and_its_acknowledgement_does() -> None:
     np.testing.assert_allclose(
         row["x_s_before"], transition(H, 2 * GRID_NS) @ [1.0, 0.0], rtol=1e-13
     )
-    (update,), row = split(one.handle(measurement(3, [3.0, 0.0]), 3 * GRID_NS))  # waits no more
+    (update,), row = split(one.handle(measurement(3, [3.0, 0.0]), 3 * GRID_NS))  # no longer waiting
     np.testing.assert_allclose(row["x_s"], transition(H, 2 * GRID_NS) @ [2.0, 0.5], rtol=1e-13)
     assert update.sequence == 1
 
@@ -79,7 +79,7 @@ def test_without_an_acknowledgement_it_transmits_the_current_state_after_the_tim
     assert [message.sequence for message in sent] == list(range(len(sent)))
 
 
-def test_it_does_not_transmit_again_if_the_rule_does_not_say_so_any_more() -> None:
+def test_it_does_not_retransmit_if_the_rule_is_no_longer_met() -> None:
     one = AcknowledgedSensor(
         np.zeros((2, 2)), DecayingTrigger(1.0, 1e-9), np.zeros(2), timeout_ns=2 * GRID_NS
     )
@@ -109,14 +109,14 @@ def test_an_older_acknowledgement_leaves_it_waiting_for_the_newer() -> None:
     np.testing.assert_allclose(one.x_s, transition(H, 1) @ [2.0, 0.0], rtol=1e-14)
 
 
-def test_an_acknowledgement_of_what_was_never_sent_changes_nothing() -> None:
+def test_an_acknowledgement_of_an_unsent_update_changes_nothing() -> None:
     one = sensor(x0=[1.0, 1.0])
     before = one.x_s.copy()
     _, row = split(one.handle(Message(Flow.ACKNOWLEDGEMENT, 7, 0, NO_VECTOR), 5))
     assert row["x_s"].tobytes() == row["x_s_before"].tobytes() == before.tobytes()
 
 
-def test_every_input_leaves_one_numbered_row() -> None:
+def test_every_input_gives_one_numbered_row() -> None:
     one = sensor(GRID_NS)
     numbers = []
     for k in range(6):

@@ -1,4 +1,4 @@
-"""Observers against independent formulas, and the sensor that has one."""
+"""Observers against independent formulas, and a sensor with an observer."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -38,7 +38,7 @@ def model(steps: int = 1) -> EstimationModel:
 
 @pytest.fixture
 def observed(content: dict[str, Any]) -> dict[str, Any]:
-    """The double integrator, of which the position is measured, with noise."""
+    """The double integrator with a noisy position measurement."""
     content["plant"] |= {"rate_hz": 100.0, "measurement": {"C": [[1.0, 0.0]], "noise_std": [0.01]}}
     content["controller"] = {"rate_hz": 100.0}
     content["observer"] = {
@@ -56,7 +56,7 @@ def measurement(sequence: int, t_ns: int, vector: Sequence[float]) -> Message:
 
 
 def batch_estimate(P0: Matrix, x0: Vector, u: Vector, y: Vector) -> tuple[Vector, Matrix]:
-    """x(t_K) given all of y by the conditional mean of jointly normal numbers: no recursion.
+    """x(t_K) given all of y by the conditional mean of jointly normal numbers, without recursion.
 
     Stacks ξ = (x(0), q_1 … q_K, v_0 … v_K); x(t_k) and y(t_k) are linear in it.
     """
@@ -97,7 +97,7 @@ def test_the_kalman_filter_is_the_conditional_mean() -> None:
     np.testing.assert_allclose(following._observer.covariance, covariance, rtol=1e-8)  # type: ignore[attr-defined]
 
 
-def test_its_covariance_comes_to_the_riccati_equations() -> None:
+def test_the_filters_covariance_converges_to_the_riccati_equations() -> None:
     kalman = KalmanObserver(model(), np.zeros(2), np.eye(2))
     for _ in range(2000):
         kalman.predict(np.zeros(1))
@@ -110,7 +110,7 @@ def test_its_covariance_comes_to_the_riccati_equations() -> None:
 
 @pytest.mark.parametrize("steps", [1, 3])
 def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
-    """e(t_k) = (I − L C) e^{AT} e(t_{k−1}), whatever the input does in between."""
+    """e(t_k) = (I − L C) e^{AT} e(t_{k−1}), for any input in between."""
     T_s = steps * H_NS * 1e-9
     Ad_T = expm(A * T_s)
     poles = (np.exp(-5 * T_s), np.exp(-8 * T_s))
@@ -132,7 +132,7 @@ def test_a_luenberger_observers_error_follows_its_matrix(steps: int) -> None:
         error = x_hat - x
 
 
-def test_complex_poles_and_more_outputs_are_placed_as_well() -> None:
+def test_complex_poles_and_several_outputs_are_placed() -> None:
     Ad = expm(np.array([[0.0, 1, 0], [0, 0, 1], [1, -2, 0.5]]) * 0.01)
     wanted = (np.exp((-3 + 4j) * 0.01), np.exp((-3 - 4j) * 0.01), np.exp(-9 * 0.01 + 0j))
     for outputs in (np.eye(3)[:1], np.eye(3)[[0, 2]], np.eye(3)):
@@ -141,14 +141,14 @@ def test_complex_poles_and_more_outputs_are_placed_as_well() -> None:
         np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), atol=1e-7)
 
 
-def test_what_does_not_show_is_told_by_its_eigenvalue() -> None:
+def test_an_unobservable_mode_is_reported_by_its_eigenvalue() -> None:
     Ad = np.diag([1.5, 0.5, 0.9])
     assert unobservable_mode(Ad, np.array([[1.0, 0.0, 0.0]])) is None
     assert unobservable_mode(Ad, np.array([[0.0, 1.0, 1.0]])) == 1.5
     assert unobservable_mode(Ad, np.array([[1.0, 1.0, 0.0]]), stable_too=True) == 0.9
 
 
-def test_missing_measurements_are_bridged_by_the_first_input_that_is_known() -> None:
+def test_missing_measurements_are_bridged_with_the_next_known_input() -> None:
     one = AppliedInputTracker(
         LuenbergerObserver(model(2), np.zeros((2, 1)), np.ones(2)), 1, 1, H_NS, 0
     )
@@ -173,7 +173,7 @@ def test_the_trigger_works_on_the_estimate_and_the_update_carries_it(
         (record,) = [one for one in outputs if isinstance(one, Record)]
         row = np.array([record.row], types)[0]
         assert (row["y"].tolist(), row["u_applied"].tolist()) == ([y], [u])
-        # The sensor that measures the state itself does with x̂ what this one does.
+        # A sensor that measures x directly does the same with x̂.
         expected = alone.handle(measurement(k, t_ns, row["x"].tolist()), t_ns)
         for mine, others in zip(outputs, expected, strict=True):
             if isinstance(mine, Message) and isinstance(others, Message):
@@ -195,7 +195,7 @@ def estimates(outputs: Sequence[Output]) -> Vector:
     return found
 
 
-def test_a_sensor_that_is_started_anew_begins_its_observer_anew_and_says_so(
+def test_a_restarted_sensor_restarts_its_observer_and_reports_it(
     observed: dict[str, Any],
 ) -> None:
     observed["network"]["initial_sync"] = "known_state"
@@ -204,7 +204,8 @@ def test_a_sensor_that_is_started_anew_begins_its_observer_anew_and_says_so(
     again = sensor_of(scenario, Start(1, t_ns)).handle(measurement(40, t_ns, [y, u]), t_ns)
     (notice,) = [one for one in again if isinstance(one, Notice)]
     assert notice.text == "the observer restarts from its initial estimate"
-    # From x̂ = 0 and P(0) = I: y weighs P/(P + R), and says nothing of the velocity.
+    # From x̂ = 0 and P(0) = I: y has the weight P/(P + R) and carries no information on the
+    # velocity.
     np.testing.assert_allclose(estimates(again), [y / (1 + 1e-4), 0.0], rtol=1e-12)
     first = sensor_of(scenario).handle(measurement(0, 0, [y, 0.0]), 0)
     assert not [one for one in first if isinstance(one, Notice)]
@@ -213,7 +214,9 @@ def test_a_sensor_that_is_started_anew_begins_its_observer_anew_and_says_so(
     np.testing.assert_allclose(estimates(first), expected, rtol=1e-12)
 
 
-def test_what_the_filter_is_not_told_it_takes_from_the_scenario(observed: dict[str, Any]) -> None:
+def test_filter_settings_default_to_the_scenarios_noise_and_disturbances(
+    observed: dict[str, Any],
+) -> None:
     observed["plant"]["disturbances"] = [
         {"kind": "gaussian", "at": "input", "std": [0.3]},
         {"kind": "uniform", "at": "state", "bound": [0.0, 0.6]},
@@ -222,7 +225,7 @@ def test_what_the_filter_is_not_told_it_takes_from_the_scenario(observed: dict[s
     del observed["observer"]["input_std"]
     scenario = resolved(observed)
     believed, h = assumed_model(scenario), 0.01
-    into = np.array([h**2 / 2, h])  # the double integrator's, of a held input
+    into = np.array([h**2 / 2, h])  # of the double integrator with a held input
     expected = (0.3**2 + 0.6**2 / 3) * np.outer(into, into)
     np.testing.assert_allclose(believed.Q, expected, rtol=1e-9)
     assert believed.R.tolist() == [[0.01**2]]
@@ -233,7 +236,7 @@ def test_what_the_filter_is_not_told_it_takes_from_the_scenario(observed: dict[s
     np.testing.assert_allclose(true_model(resolved(observed)).Q, expected, rtol=1e-9)
 
 
-def test_the_steady_state_of_a_scalar_is_the_quadratic_equations(content: dict[str, Any]) -> None:
+def test_the_scalar_steady_state_solves_the_quadratic_equation(content: dict[str, Any]) -> None:
     """P⁻ = a²P⁻R/(P⁻ + R) + q, solved by hand."""
     a, h, r, q = 2.0, 0.01, 0.04, 9e-4
     content["model"] = {"A": [[a]], "B": [[1.0]], "gain": [[-3.0]]}

@@ -47,7 +47,7 @@ def next_on_grid_ns(t_s: float) -> int:
     return (math.floor(t_s * 1e9 / GRID_NS) + 1) * GRID_NS
 
 
-def test_a_held_scalar_crosses_where_its_closed_form_does() -> None:
+def test_a_scalar_under_a_hold_has_closed_form_events() -> None:
     """H = 0, x = x₀e^{−t}, α = 1: |x(t_i) − x(t)| > βe^{−t} from t_i + ln(1 + β/x₀) on."""
     x0, beta = 2.0, 0.3
     sensor = Sensor(ZOH, DecayingTrigger(beta, 1.0), np.array([x0]))
@@ -59,7 +59,7 @@ def test_a_held_scalar_crosses_where_its_closed_form_does() -> None:
     assert len(sent) == 21  # 0.14 s apart
 
 
-def test_a_modelled_scalar_crosses_where_its_closed_form_does() -> None:
+def test_a_scalar_with_a_model_has_closed_form_events() -> None:
     """H = −1, x = x₀e^{−2t}, α = 1: x₀(e^{−t} − e^{−2t}) > βe^{−t} from −ln(1 − β/x₀) on."""
     x0, beta = 2.0, 0.3
     sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(beta, 1.0), np.array([x0]))
@@ -72,8 +72,8 @@ def test_a_perfect_model_never_transmits() -> None:
     assert updates(feed(sensor, lambda t: math.exp(-0.5 * t), 10.0)) == []
 
 
-def test_a_floor_takes_over_from_the_decay() -> None:
-    """A ramp x = t held at its last update passes every ε seconds once the floor rules."""
+def test_the_floor_replaces_the_decayed_threshold() -> None:
+    """A ramp x = t held at its last update has an event every ε seconds once the floor applies."""
     sensor = Sensor(ZOH, DecayingTrigger(1e-3, 1.0, 0.205), np.array([0.0]))
     sent = updates(feed(sensor, lambda t: t, 2.0))
     assert [message.t_ns for message in sent] == [k * 210_000_000 for k in range(1, 10)]
@@ -113,19 +113,20 @@ def test_an_event_is_exactly_where_the_error_exceeds_the_threshold(
     for k, (t_ns, x) in enumerate(run):
         outputs = sensor.handle(measurement(k, t_ns, x), t_ns)
         (row,), sent = rows(outputs, len(x)), updates(outputs)
-        # x_s anew from the last event in one step, not measurement by measurement.
+        # x_s from the last event in one step, not measurement by measurement.
         x_s = x if reset is None else expm(H * (t_ns - reset_ns) * 1e-9) @ reset
         e_s = x_s - x if W is None else W @ (x_s - x)
         error = float(np.linalg.norm(e_s))
         threshold = max(0.2 * math.exp(-0.5 * t_ns * 1e-9), floor)
-        # Thirty propagations, each good to some 1e-15, grown by ‖e^{Ht}‖ < e^{4 · 1.5}.
+        # Thirty propagations, each with an error of about 1e-15, amplified by ‖e^{Ht}‖ < e^{4 ·
+        # 1.5}.
         np.testing.assert_allclose(row["x_s"], x_s, atol=1e-11)
         assert row["e_s_norm"] == pytest.approx(error, abs=1e-10)
         assert row["threshold"] == pytest.approx(threshold, rel=1e-14)
         if abs(error - threshold) > 1e-9:
             assert bool(sent) == (reset is None or error > threshold)
         assert (row["event"] != NO_SEQUENCE) == bool(sent)
-        if sent:  # whatever becomes of the packet
+        if sent:  # whether or not the packet arrives
             assert sensor.x_s is not None
             assert sensor.x_s.tolist() == x.tolist()
             reset_ns, reset = t_ns, x
@@ -147,7 +148,7 @@ def test_an_update_carries_the_measured_state_and_its_time() -> None:
     assert record["input"].tolist() == [0, 1, 2, 3]
     assert record["sequence"].tolist() == [10, 11, 12, 13]
     assert record["now_ns"].tolist() == [k * GRID_NS + 777 for k in range(4)]
-    # Before the reset, so that the record holds e_s(t_k⁻).
+    # Before the reset, so that the record contains e_s(t_k⁻).
     assert record["x_s"].tolist() == [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0], [3.0, 2.0]]
 
 
@@ -159,15 +160,15 @@ def test_the_first_measurement_is_an_event_unless_the_start_is_known() -> None:
 
 
 def test_a_known_start_is_propagated_to_the_first_measurement() -> None:
-    """A sensor that misses the measurement at t = 0 still knows x(0)."""
+    """A sensor that misses the measurement at t = 0 still starts from x(0)."""
     sensor = Sensor(np.array([[-1.0]]), DecayingTrigger(1e-6, 1e-3), np.array([2.0]))
     outputs = sensor.handle(measurement(0, 500_000_000, [2 * math.exp(-0.5)]), 0)
     assert updates(outputs) == []
     assert rows(outputs, 1)["x_s"].item() == pytest.approx(2 * math.exp(-0.5), rel=1e-14)
 
 
-def test_when_a_datagram_is_read_does_not_matter() -> None:
-    """Read in time or up to seconds late, the sensor does the same, bit for bit."""
+def test_the_reading_time_of_a_datagram_does_not_matter() -> None:
+    """Read on time or up to seconds late, the datagrams give the same results, bit for bit."""
     rng = np.random.default_rng(0)
     lateness_ns = np.sort(rng.integers(0, 5 * 10**9, 200))
     runs = []
@@ -193,7 +194,7 @@ def test_the_sensor_acts_on_measurements_only() -> None:
 
 
 @pytest.mark.parametrize("mode", ["model", "zoh"])
-def test_the_sensor_of_a_scenario_knows_the_model_not_the_plant(
+def test_the_sensor_of_a_scenario_uses_the_model_not_the_plant(
     content: dict[str, Any], mode: str
 ) -> None:
     content |= {"mode": mode}
@@ -202,7 +203,7 @@ def test_the_sensor_of_a_scenario_knows_the_model_not_the_plant(
     content["trigger"] = {"beta": 1.0, "alpha_per_s": 0.5, "weight": [[2.0, 0.0], [0.0, 1.0]]}
     sensor = sensor_of(resolve(validate(content, "here")))
     (row,) = rows(sensor.handle(measurement(0, 10**9, [0.0, 0.0]), 10**9), 2)
-    # ẍ = u with u = −x − 1.5 ẋ from (1, 0): by hand for the closed loop, or held.
+    # ẍ = u with u = −x − 1.5 ẋ from (1, 0), by hand for the closed loop, or constant under a hold.
     w = math.sqrt(1 - 0.75**2)
     modelled = [
         math.exp(-0.75) * (math.cos(w) + 0.75 / w * math.sin(w)),

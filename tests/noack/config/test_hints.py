@@ -1,4 +1,4 @@
-"""A mistake that is easily made is answered with what would be right, and that is right."""
+"""The error message for a common mistake suggests the right value, and the suggestion is valid."""
 
 import json
 import tomllib
@@ -28,7 +28,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def mistake(path: Path, *settings: str) -> str:
-    """The line that a person reads."""
+    """The line of the error message."""
     with pytest.raises(CallerError, match=r"^[^\n]*$") as caught:
         load(path, settings)
     return str(caught.value)
@@ -63,21 +63,21 @@ def test_hint_is_what_would_be_right(
     tomllib.loads(f"value = {right}")
     value = f'{{model="scripted",lost={right}}}' if key == "network.loss.lost" else right
     setting = f"{key.removesuffix('.lost')}={value}"
-    load(path, [*before, "model.allow_unstable=true", setting])  # the hint is about the form only
+    load(path, [*before, "model.allow_unstable=true", setting])  # the hint concerns the form only
 
 
 @pytest.mark.parametrize(
     "setting",
     [
-        "network.loss.probability=800",  # no percentage
+        "network.loss.probability=800",  # not a percentage
         "network.loss.probability=-80",
         "network.loss.probability=true",
         "network.loss.probability=much",
-        "horizon_s=80%",  # no share
-        "model.B=[[0, 1, 2]]",  # neither way round
+        "horizon_s=80%",  # not a share
+        "model.B=[[0, 1, 2]]",  # wrong in either order
     ],
 )
-def test_nothing_is_suggested_that_would_not_be_right(path: Path, setting: str) -> None:
+def test_no_invalid_value_is_suggested(path: Path, setting: str) -> None:
     said = mistake(path, setting)
     assert "% is" not in said
     assert "transposed" not in said
@@ -90,22 +90,22 @@ def test_nothing_is_suggested_that_would_not_be_right(path: Path, setting: str) 
         ("trigger=absolute", '{ policy = "absolute", delta = ... }'),
     ],
 )
-def test_hint_names_the_kind_of_table_that_a_word_stands_for(
+def test_hint_names_the_table_when_its_kind_alone_is_given(
     path: Path, setting: str, example: str
 ) -> None:
     assert mistake(path, setting).endswith(f"should be a table, e.g. {example}")
 
 
-def test_list_of_tables_is_said_to_be_one(path: Path) -> None:
+def test_hint_asks_for_a_list_of_tables(path: Path) -> None:
     assert mistake(path, "network.impairments=4").endswith("= 4: should be a list of tables")
 
 
 class Car:
-    """A plant of the user's own, of which only the name is looked at."""
+    """A user's plant class; only its name is used."""
 
 
 @pytest.mark.parametrize("key", ["plant.system", "plant.system.name", "plant.system.file"])
-def test_class_is_given_by_its_file_and_its_name(
+def test_class_is_converted_to_its_file_and_name(
     key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content: dict[str, Any] = {"plant.system": {"kind": "python", "name": "Car"}}
@@ -122,6 +122,6 @@ def test_class_is_given_by_its_file_and_its_name(
     assert (loaded.plant.system.kind, loaded.plant.system.name) == ("python", "Car")
 
 
-def test_other_object_is_no_value() -> None:
+def test_other_objects_are_refused_as_values() -> None:
     with pytest.raises(CallerError, match=r"a value of type Car is no value of a setting$"):
         noack.load("double_integrator", {"plant.system": Car()})

@@ -1,4 +1,4 @@
-"""Files that settings name: what they say, and what is wrong with them."""
+"""Files that settings refer to: their contents, and the errors in them."""
 
 import math
 import tomllib
@@ -30,7 +30,7 @@ def the_delay(settings: LinkSettings) -> Delay:
 
 
 @pytest.mark.parametrize("repeat", [True, False])
-def test_a_trace_loses_what_it_marks(repeat: bool, tmp_path: Path) -> None:
+def test_a_trace_drops_the_packets_it_marks(repeat: bool, tmp_path: Path) -> None:
     (tmp_path / "trace.txt").write_text("0100 1\n11\t0\r\n")
     settings = LinkSettings(impairments=(LossOf(loss=TraceLoss(file="trace.txt", repeat=repeat)),))
     link = Link(read_files(settings, tmp_path), 0, "test")
@@ -61,7 +61,7 @@ def test_observed_delays_have_units_comments_and_signs(tmp_path: Path) -> None:
     assert delay.delay_s == 0.02
 
 
-def test_a_table_of_tc_is_scaled_by_the_jitter(tmp_path: Path) -> None:
+def test_a_tc_distribution_table_is_scaled_by_the_jitter(tmp_path: Path) -> None:
     (tmp_path / "some.dist").write_text("# a table\n -8192 -4096 0\n 8192 16384\n")
     settings = LinkSettings(
         impairments=(
@@ -70,7 +70,7 @@ def test_a_table_of_tc_is_scaled_by_the_jitter(tmp_path: Path) -> None:
     )
     delay = the_delay(read_files(settings, tmp_path))
     assert delay.samples_s == pytest.approx((-0.002, -0.001, 0, 0.002, 0.004), rel=1e-15)
-    # Its quantiles are those of the table, around the constant part.
+    # The quantiles are those of the table, shifted by the constant delay.
     link = Link(LinkSettings(impairments=(delay,)), 0, "test")
     drawn = sorted(link.decide(0, 100, 0).release_ns for _ in range(4001))
     for quantile, expected_s in ((0, 0.018), (1000, 0.019), (2000, 0.02), (3000, 0.022)):
@@ -85,7 +85,7 @@ TABLES = Path("/usr/lib/x86_64-linux-gnu/tc")
 
 @pytest.mark.skipif(not TABLES.is_dir(), reason="tc's tables are not installed")
 @pytest.mark.parametrize("name", ["normal", "pareto", "paretonormal", "experimental"])
-def test_tcs_own_tables_are_read(name: str) -> None:
+def test_distribution_tables_shipped_with_tc_are_read(name: str) -> None:
     settings = LinkSettings(
         impairments=(
             Delay(jitter_s=8.192, distribution="empirical", file=str(TABLES / f"{name}.dist")),
@@ -97,7 +97,7 @@ def test_tcs_own_tables_are_read(name: str) -> None:
     assert all(abs(t_s * 1000 - round(t_s * 1000)) < 1e-9 for t_s in samples_s)
 
 
-def test_what_names_no_file_stays_as_it_is(tmp_path: Path) -> None:
+def test_settings_without_files_are_unchanged(tmp_path: Path) -> None:
     settings = LinkSettings(impairments=(Delay(delay_s=1.0), Rate(rate_bps=1000)), mansd=4)
     assert read_files(settings, tmp_path) == settings
 
@@ -140,7 +140,7 @@ def test_a_mistake_in_a_trace_gets_one_line(
         ("t.dist", 0.001, "1 2\n0.5", "line 2: 0.5: expected whole numbers, 8192 for 1"),
     ],
 )
-def test_a_mistake_in_a_file_of_delays_gets_one_line(
+def test_a_mistake_in_a_delay_file_gets_one_line(
     name: str, jitter_s: float, content: str | None, says: str, tmp_path: Path
 ) -> None:
     if content is not None:
@@ -166,7 +166,7 @@ def scenario_with_files(content: dict[str, Any], tmp_path: Path) -> Path:
     return path
 
 
-def test_a_loaded_scenario_needs_its_files_no_more(scenario_with_files: Path) -> None:
+def test_a_loaded_scenario_no_longer_needs_its_files(scenario_with_files: Path) -> None:
     scenario = load(scenario_with_files)
     assert scenario.network.loss == ScriptedLoss(lost=(2, 3), repeat_every=4)
     assert scenario.network.impairments == (
@@ -176,7 +176,7 @@ def test_a_loaded_scenario_needs_its_files_no_more(scenario_with_files: Path) ->
         assert validate(tomllib.loads(dumps(one)), "copy") == one
 
 
-def test_a_scenario_says_which_key_names_a_wrong_file(scenario_with_files: Path) -> None:
+def test_an_error_in_a_file_names_the_scenario_key(scenario_with_files: Path) -> None:
     (scenario_with_files.parent / "files/trace.txt").unlink()
     with pytest.raises(CallerError) as caught:
         load(scenario_with_files)

@@ -1,4 +1,4 @@
-"""What a link's settings refuse, and the words that they find for it."""
+"""Link settings that are refused, and the error messages."""
 
 import json
 from typing import Any
@@ -110,13 +110,17 @@ def message(adapter: TypeAdapter[Any], content: Any) -> str:
 
 
 @pytest.mark.parametrize(("content", "words"), LOSS_MISTAKES)
-def test_a_loss_model_says_what_is_wrong(content: dict[str, Any], words: str) -> None:
+def test_an_invalid_loss_model_is_refused_with_the_reason(
+    content: dict[str, Any], words: str
+) -> None:
     assert words in message(LOSS, content)
     assert words in message(ONE, {"kind": "loss", "loss": content})
 
 
 @pytest.mark.parametrize(("content", "words"), MISTAKES)
-def test_an_impairment_says_what_is_wrong(content: dict[str, Any], words: str) -> None:
+def test_an_invalid_impairment_is_refused_with_the_reason(
+    content: dict[str, Any], words: str
+) -> None:
     assert words in message(ONE, content)
     assert words in message(TypeAdapter(LinkSettings), {"impairments": [content]})
 
@@ -132,7 +136,7 @@ def test_an_impairment_says_what_is_wrong(content: dict[str, Any], words: str) -
         ],
     ],
 )
-def test_a_delay_that_knows_of_losses_needs_a_loss_that_tells(before: list[Any]) -> None:
+def test_a_delay_that_depends_on_the_loss_state_needs_a_loss_with_states(before: list[Any]) -> None:
     late = {"kind": "delay", "jitter_s": 0.1, "loss_correlation": 0.5}
     found = message(TypeAdapter(LinkSettings), {"impairments": [*before, late]})
     assert f"impairments.{len(before)}.loss_correlation: needs a loss before it" in found
@@ -142,7 +146,9 @@ def test_a_delay_that_knows_of_losses_needs_a_loss_that_tells(before: list[Any])
 
 @given(st.floats(0, 0.99), st.floats(1, 1000))
 def test_means_determine_the_chain(loss: float, burst: float) -> None:
-    """Bursts last 1/r and p/(p + r) is lost; refused exactly if p were above 1."""
+    """Bursts last 1/r on average and the loss rate is p/(p + r); refused exactly if p would exceed
+    1.
+    """
     if loss / (1 - loss) > burst:
         with pytest.raises(ValidationError, match="needs longer bursts"):
             GilbertElliottLoss(mean_loss=loss, mean_burst=burst)
@@ -152,7 +158,7 @@ def test_means_determine_the_chain(loss: float, burst: float) -> None:
     assert p / (p + r) == pytest.approx(loss)
 
 
-def test_the_longest_delay_is_the_sum_of_the_upper_ends() -> None:
+def test_the_longest_delay_is_the_sum_of_the_maximum_delays() -> None:
     settings = LinkSettings(
         impairments=(
             Delay(delay_s=0.1, jitter_s=0.01),

@@ -1,4 +1,4 @@
-"""Matrices from files: what they say stands in the scenario, and what they must not be."""
+"""Matrices from files: the scenario contains their values; invalid files are refused."""
 
 from pathlib import Path
 from typing import Any
@@ -54,9 +54,7 @@ SUFFIXES = pytest.mark.parametrize("suffix", [".npz", ".mat"])
 
 @SUFFIXES
 @pytest.mark.parametrize("gain", ["gain", "K"])
-def test_a_file_gives_the_model_and_another_the_plant(
-    suffix: str, gain: str, tmp_path: Path
-) -> None:
+def test_model_and_plant_may_come_from_two_files(suffix: str, gain: str, tmp_path: Path) -> None:
     save(tmp_path / f"model{suffix}", A=A, B=B, C=np.eye(2), D=np.zeros((2, 1)), **{gain: K})
     save(tmp_path / f"true{suffix}", A=A + 0.1, B=B + 0.1, unrelated="text")
     loaded = scenario(
@@ -73,7 +71,7 @@ def test_a_file_gives_the_model_and_another_the_plant(
 
 
 @SUFFIXES
-def test_a_scenarios_gain_goes_before_the_files_and_arrays_may_have_other_names(
+def test_the_scenarios_gain_overrides_the_files_and_array_names_may_be_set(
     suffix: str, tmp_path: Path
 ) -> None:
     save(tmp_path / f"two{suffix}", A=0 * A, B=0 * B, A_lat=A, B_lat=B, K=K)
@@ -83,7 +81,7 @@ def test_a_scenarios_gain_goes_before_the_files_and_arrays_may_have_other_names(
     assert np.array_equal(np.array(loaded.model.A), A)
 
 
-def test_a_sparse_matrix_and_whole_numbers_are_matrices(tmp_path: Path) -> None:
+def test_sparse_matrices_and_integers_are_accepted(tmp_path: Path) -> None:
     save(tmp_path / "m.mat", A=csc_matrix(A), B=B.astype(np.int8), K=K)
     loaded = scenario(tmp_path, 'file = "m.mat"')
     assert np.array_equal(np.array(loaded.model.A), A)
@@ -107,7 +105,7 @@ def test_a_sparse_matrix_and_whole_numbers_are_matrices(tmp_path: Path) -> None:
         ({"A": A, "B": np.zeros((3, 1)), "K": K}, "B = [[0.0], [0.0], [0.0]]: expected 2 x 1"),
     ],
 )
-def test_a_file_that_is_no_such_system_is_refused_in_one_line(
+def test_a_file_without_a_valid_system_is_refused_in_one_line(
     arrays: dict[str, Any], expected: str, tmp_path: Path
 ) -> None:
     save(tmp_path / "m.npz", **arrays)
@@ -135,7 +133,7 @@ def test_a_file_that_is_no_such_system_is_refused_in_one_line(
         ('names = { A = "G" }\nA = [[1.0]]\nB = [[1.0]]\ngain = [[-2.0]]', "give file, too"),
     ],
 )
-def test_what_is_wrong_with_a_file_or_its_key_is_said(
+def test_a_wrong_file_or_key_is_refused_with_the_reason(
     model: str, expected: str, tmp_path: Path
 ) -> None:
     save(tmp_path / "m.npz", A=A, B=B, K=K)
@@ -150,7 +148,7 @@ def test_what_is_wrong_with_a_file_or_its_key_is_said(
     assert any(expected in line for line in str(refused.value).split("\n"))
 
 
-def test_an_array_that_claims_to_be_huge_takes_no_memory(tmp_path: Path) -> None:
+def test_an_array_with_a_huge_declared_size_takes_no_memory(tmp_path: Path) -> None:
     save(tmp_path / "m.npz", A=A, B=B, K=K)
     content = (tmp_path / "m.npz").read_bytes()
     huge = content.replace(b"'shape': (2, 2), }          ", b"'shape': (99999999, 99999), ")
@@ -164,7 +162,7 @@ def test_an_array_that_claims_to_be_huge_takes_no_memory(tmp_path: Path) -> None
 
 
 def test_a_file_on_which_scipy_crashes_is_refused(tmp_path: Path) -> None:
-    """A type of data that the format does not have ends SciPy 1.17's reader with SIGSEGV."""
+    """An array type that the format does not define crashes SciPy 1.17's reader with SIGSEGV."""
     save(tmp_path / "m.mat", A=A, B=B, K=K)
     content = bytearray((tmp_path / "m.mat").read_bytes())
     place = content.index(b"\x09\x00\x00\x00\x20\x00\x00\x00")  # 32 bytes of doubles: A

@@ -26,7 +26,7 @@ def test_the_lane_model_is_the_papers() -> None:
     assert model.state_names == ("V", "r", "psi", "Y_g")
 
 
-def test_the_lane_example_admits_the_papers_alpha() -> None:
+def test_the_papers_alpha_is_below_the_lane_examples_decay_rate() -> None:
     """eig(Â + B̂K) = {−1.126 ± 2.481i, −1.759, −0.365}: α = 0.25 is below 0.365."""
     model = lane_following({})
     found = sorted(

@@ -1,4 +1,4 @@
-"""What may be wrong with disturbances, measurements and observers: one clear line each."""
+"""Mistakes in disturbances, measurements and observers: one clear line each."""
 
 import json
 from typing import Any
@@ -46,12 +46,14 @@ def said_of(content: dict[str, Any], **changes: Any) -> str:
         ({"kind": "uniform", "std": [1.0]}, "plant.disturbances.0.std = [1.0]: unknown key"),
     ],
 )  # fmt: skip
-def test_disturbances(content: dict[str, Any], one: dict[str, Any], line: str) -> None:
+def test_a_mistake_in_disturbances_gets_one_line(
+    content: dict[str, Any], one: dict[str, Any], line: str
+) -> None:
     said = said_of(content, plant__disturbances=[one])
     assert said.startswith(f"file: {line}") or f"\nfile: {line}" in said, said
 
 
-def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any]) -> None:
+def test_a_state_disturbance_needs_a_linear_plant(content: dict[str, Any]) -> None:
     content["model"] = {
         "A": [[0.0] * 4] * 4, "B": [[0.0]] * 4, "gain": [[0.0] * 4], "allow_unstable": True,
     }  # fmt: skip
@@ -122,7 +124,7 @@ def test_the_state_of_what_is_not_linear_is_not_disturbed(content: dict[str, Any
          "did you mean luenberger?"),
     ],
 )  # fmt: skip
-def test_measurements_and_observers(
+def test_a_mistake_in_measurements_or_observers_gets_one_line(
     content: dict[str, Any], measurement: Any, observer: Any, line: str
 ) -> None:
     changes = {"plant__measurement": measurement}
@@ -131,7 +133,7 @@ def test_measurements_and_observers(
     assert "\n" not in said
 
 
-def test_what_a_datagram_cannot_carry(content: dict[str, Any]) -> None:
+def test_measurements_too_long_for_a_datagram_are_refused(content: dict[str, Any]) -> None:
     changes: dict[str, Any] = {"plant__measurement": POSITION, "plant__measure_every": 64}
     assert said_of(content, **changes, observer=KALMAN) == (
         "file: plant.measure_every = 64: with an observer a measurement carries y and the inputs "
@@ -139,11 +141,11 @@ def test_what_a_datagram_cannot_carry(content: dict[str, Any]) -> None:
     )
 
 
-def test_every_flow_has_its_length(content: dict[str, Any]) -> None:
+def test_every_flow_has_its_vector_length(content: dict[str, Any]) -> None:
     content["plant"] |= {"measurement": POSITION, "measure_every": 3}
     scenario = validate(content | {"observer": KALMAN}, "file")
     lengths = [scenario.message_sizes.entries(flow) for flow in Flow]
-    assert lengths == [1 + 3, 2, 1, 0]  # y and three inputs; x̂; u; nothing
+    assert lengths == [1 + 3, 2, 1, 0]  # y and three inputs; x̂; u; empty
 
 
 def test_a_resolved_scenario_has_its_gain_and_resolves_to_itself(content: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Changes of settings: what may change, how it is said, and what a machine keeps of it."""
+"""Changes of runtime parameters: the keys, their notation, and each machine's schedule."""
 
 from typing import Any
 
@@ -47,7 +47,7 @@ def scenario(content: dict[str, Any]) -> Scenario:
         ({"network.loss": {"model": "scripted", "lost": list(range(900))}}, "at most 1024"),
     ],
 )
-def test_a_mistaken_change_is_one_line(
+def test_an_invalid_change_is_refused_in_one_line(
     scenario: Scenario, settings: dict[str, Any], why: str
 ) -> None:
     with pytest.raises(CallerError, match=why) as raised:
@@ -56,7 +56,7 @@ def test_a_mistaken_change_is_one_line(
     assert raised.value.exit_status == 2
 
 
-def test_the_rest_stays_as_it_is(scenario: Scenario) -> None:
+def test_a_change_leaves_all_other_settings_unchanged(scenario: Scenario) -> None:
     settings = {"network.loss.probability": 0.9, "network.mansd": 1, "trigger.beta": 0.25}
     found = changed(scenario, settings)
     assert found.network.loss == BernoulliLoss(probability=0.9)
@@ -65,7 +65,7 @@ def test_the_rest_stays_as_it_is(scenario: Scenario) -> None:
     assert changed(found, back) == scenario
 
 
-def test_another_loss_model_begins_without_the_keys_of_the_one_before(scenario: Scenario) -> None:
+def test_a_new_loss_model_does_not_inherit_the_old_models_keys(scenario: Scenario) -> None:
     settings = {
         "network.loss.model": "gilbert_elliott",
         "network.loss.mean_loss": 0.5,
@@ -82,13 +82,13 @@ def test_a_change_is_valid_if_the_whole_scenario_is(scenario: Scenario) -> None:
         )
 
 
-def test_nothing_changes_where_updates_are_acknowledged(content: dict[str, Any]) -> None:
+def test_changes_are_refused_with_acknowledgements(content: dict[str, Any]) -> None:
     content["network"]["protocol"] = "ack"
     with pytest.raises(CallerError, match='with "ack", nothing can be changed'):
         changed(resolve(validate(content, "here")), {"network.mansd": 1})
 
 
-def test_a_scenario_says_what_changes_and_is_read_back(
+def test_a_scenario_with_changes_is_written_and_read_back(
     content: dict[str, Any], tmp_path: Any
 ) -> None:
     content["changes"] = [
@@ -114,7 +114,7 @@ def test_a_scenario_says_what_changes_and_is_read_back(
         ([{"at_s": 0.5, "set": {}}], "changes.0.set.*needs at least|changes.0.set"),
     ],
 )
-def test_mistakes_in_what_changes_are_told(
+def test_an_invalid_table_of_changes_is_refused_in_one_line(
     content: dict[str, Any], changes: list[dict[str, Any]], why: str
 ) -> None:
     content["changes"] = changes
@@ -123,7 +123,7 @@ def test_mistakes_in_what_changes_are_told(
     assert "\n" not in str(raised.value)
 
 
-def test_short_names_are_names_of_what_can_be_changed(scenario: Scenario) -> None:
+def test_short_names_refer_to_runtime_parameters(scenario: Scenario) -> None:
     names = current_parameters(scenario)
     for short in ("loss", "mansd", "beta", "alpha", "floor", "setpoint"):
         assert full_key(short) in names
@@ -132,7 +132,7 @@ def test_short_names_are_names_of_what_can_be_changed(scenario: Scenario) -> Non
     assert full_key("trigger.beta") == "trigger.beta"
 
 
-def test_what_is_of_the_loss_alone() -> None:
+def test_a_change_of_the_loss_alone_is_recognised() -> None:
     assert is_of_loss_alone({"network.loss.probability": 0.1, "network.loss.model": "x"})
     assert not is_of_loss_alone({"network.loss.probability": 0.1, "network.mansd": 1})
 
@@ -145,7 +145,7 @@ def test_settings_are_recorded_in_full() -> None:
     assert text_of(settings) == 'network.loss = { model = "lossless" }, trigger.beta = 0.3'
 
 
-def test_a_later_change_that_is_told_first_builds_on_an_earlier_one(scenario: Scenario) -> None:
+def test_changes_announced_out_of_order_are_applied_in_order_of_time(scenario: Scenario) -> None:
     schedule = ChangeSchedule(scenario)
     schedule.announce("t", ParameterChange(0, 200, {"trigger.beta": 0.1}), 0, 0, -1)
     schedule.announce("t", ParameterChange(1, 100, {"network.mansd": 5}), 1, 0, -1)
@@ -164,7 +164,7 @@ def test_a_later_change_that_is_told_first_builds_on_an_earlier_one(scenario: Sc
     assert caps == [2, 5]
 
 
-def test_what_is_heard_of_too_late_is_applied_late_and_said(scenario: Scenario) -> None:
+def test_a_change_announced_too_late_is_applied_late_and_reported(scenario: Scenario) -> None:
     schedule = ChangeSchedule(scenario)
     record, notice = schedule.announce(
         "t", ParameterChange(0, 100, {"trigger.beta": 0.1}), 7, 350, 300
@@ -176,7 +176,7 @@ def test_what_is_heard_of_too_late_is_applied_late_and_said(scenario: Scenario) 
     assert "too late" in notice.text
 
 
-def test_an_impossible_change_changes_nothing(scenario: Scenario) -> None:
+def test_an_invalid_change_leaves_the_schedule_unchanged(scenario: Scenario) -> None:
     schedule = ChangeSchedule(scenario)
     with pytest.raises(CallerError):
         schedule.announce("t", ParameterChange(0, 100, {"trigger.beta": -1.0}), 0, 0, -1)

@@ -18,7 +18,7 @@ WIDTH_B = np.array([[0.05], [0.0]])
 
 @pytest.fixture
 def box(content: dict[str, Any]) -> dict[str, Any]:
-    """A scenario whose plant is drawn from a box around the double integrator."""
+    """A scenario that draws its plant from a box around the double integrator."""
     content["plant"] |= {
         "draw": "uniform",
         "uncertainty_A": WIDTH_A.tolist(),
@@ -34,7 +34,7 @@ def resolved(content: dict[str, Any], **seeds: int) -> Scenario:
 
 
 def deviations(content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """A − Â and B − B̂ of many draws, (seeds, rows, columns)."""
+    """A − Â and B − B̂ of one draw per seed, (seeds, rows, columns)."""
     loops = [loop_of(resolved(content, plant=seed)) for seed in SEEDS]
     A = np.array([loop.A - loop.A_model for loop in loops])
     B = np.array([loop.B - loop.B_model for loop in loops])
@@ -43,10 +43,11 @@ def deviations(content: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
 
 def test_uniform_draws_fill_their_box_and_stay_inside(box: dict[str, Any]) -> None:
     for deviation, width in zip(deviations(box), (WIDTH_A, WIDTH_B), strict=True):
-        # Â is at most 1 here: the sum Â + d, and the difference taken back, round to 2⁻⁵³ each.
+        # |Â| is at most 1 here: Â + d and the difference from Â are each rounded to 2⁻⁵³.
         assert (np.abs(deviation) <= width + 2.3e-16).all()
         spread = width > 1e-6
-        # Of 200 draws, the farthest is within 5 % of each end but with probability 2 · 0.975^200.
+        # The extreme of 200 draws misses the outer 5 % at an end with probability at most 2 ·
+        # 0.975^200.
         assert (deviation.max(axis=0)[spread] > 0.95 * width[spread]).all()
         assert (deviation.min(axis=0)[spread] < -0.95 * width[spread]).all()
         assert (deviation[:, width == 0] == 0).all()
@@ -63,7 +64,7 @@ def test_vertex_draws_are_corners_and_all_of_them_occur(box: dict[str, Any]) -> 
         ):
             assert ((true == model + width) | (true == model - width)).all()
         corners.add((*(np.sign(loop.A - loop.A_model)[0]), np.sign(loop.B - loop.B_model)[0, 0]))
-    # Eight corners in 200 draws: one is missed with probability below 8 · (7/8)^200 = 2e-11.
+    # Eight corners in 200 draws: the probability of missing one is below 8 · (7/8)^200 = 2e-11.
     assert len(corners) == 8
 
 
@@ -90,7 +91,7 @@ def test_seeds_are_independent_of_each_other(box: dict[str, Any]) -> None:
         assert (other.plant.initial_state == base.plant.initial_state) is state_stays
 
 
-def test_widening_one_interval_leaves_the_other_draws_alone(box: dict[str, Any]) -> None:
+def test_widening_one_interval_does_not_change_the_other_draws(box: dict[str, Any]) -> None:
     before = loop_of(resolved(box, plant=3))
     box["plant"]["uncertainty_A"][0][0] = 5.0
     del box["plant"]["uncertainty_B"]
@@ -100,7 +101,7 @@ def test_widening_one_interval_leaves_the_other_draws_alone(box: dict[str, Any])
     assert after.B.tolist() == after.B_model.tolist()
 
 
-def test_a_resolved_scenario_leaves_nothing_to_chance(box: dict[str, Any]) -> None:
+def test_a_resolved_scenario_has_no_random_values_left(box: dict[str, Any]) -> None:
     once = resolved(box, plant=3, initial_state=4)
     assert once.plant.draw == "given"
     assert once.model.name is None
@@ -125,7 +126,7 @@ def test_a_plant_that_is_not_drawn_is_what_the_file_says(
 @pytest.mark.parametrize(
     ("mode", "H"), [("model", [[0.0, 1.0], [-1.0, -1.5]]), ("zoh", [[0.0, 0.0], [0.0, 0.0]])]
 )
-def test_the_models_integrate_the_nominal_closed_loop_or_hold(
+def test_the_models_are_the_nominal_closed_loop_or_a_hold(
     content: dict[str, Any], mode: str, H: list[list[float]]
 ) -> None:
     content |= {"mode": mode}
@@ -135,7 +136,7 @@ def test_the_models_integrate_the_nominal_closed_loop_or_hold(
     assert (loop.n, loop.m) == (2, 1)
 
 
-def test_names_are_the_models_or_made_up(content: dict[str, Any]) -> None:
+def test_signal_names_are_the_models_or_generated(content: dict[str, Any]) -> None:
     def names() -> Sequence[Sequence[str]]:
         loop = loop_of(resolved(content))
         return loop.state_names, loop.input_names
@@ -148,14 +149,14 @@ def test_names_are_the_models_or_made_up(content: dict[str, Any]) -> None:
     assert names() == (("x_1",), ("u_1", "u_2"))
 
 
-def test_a_named_model_may_get_another_gain(content: dict[str, Any]) -> None:
+def test_the_gain_of_a_named_model_may_be_replaced(content: dict[str, Any]) -> None:
     content["model"] |= {"gain": [[-7.0, -8.0]], "parameters": {"stiffness": 3.0}}
     assert loop_of(resolved(content)).K.tolist() == [[-7.0, -8.0]]
     del content["model"]["gain"]
     assert loop_of(resolved(content)).K.tolist() == [[-3.0, -1.5]]
 
 
-def test_the_shipped_lane_is_the_papers() -> None:
+def test_the_shipped_lane_scenario_has_the_papers_numbers() -> None:
     """Â, B̂, K, β, α, M − 1 and the box of Section V."""
     scenario = load(SCENARIOS / "lane_following.toml")
     loop, paper = loop_of(resolve(scenario)), lane_following({})
@@ -169,5 +170,5 @@ def test_the_shipped_lane_is_the_papers() -> None:
     off_A, off_B = np.abs(loop.A - loop.A_model), np.abs(loop.B - loop.B_model)
     assert ((off_A > 0) == (np.indices((4, 4)).max(axis=0) < 2)).all()
     assert ((off_B > 0) == np.eye(4, 2, dtype=bool)).all()
-    assert off_A.max() <= 0.1 + 1e-14  # rounding beside 10.45
+    assert off_A.max() <= 0.1 + 1e-14  # rounding relative to 10.45
     assert off_B.max() <= 0.05 + 1e-14

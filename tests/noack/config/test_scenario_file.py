@@ -1,4 +1,4 @@
-"""Every mistake in a scenario gets one line: file, key, value, and what would be right."""
+"""Every mistake in a scenario gives one line: file, key, value, and the remedy."""
 
 import json
 import math
@@ -50,7 +50,7 @@ network = { mansd = 2, loss = { model = "worst_case" } }
 
 
 def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
-    """What a person is told about a scenario whose file says these ``key=value`` too."""
+    """The error message for a scenario file with these ``key=value`` settings added."""
     content = tomllib.loads(text)
     for line in lines:
         key, _, value = line.partition("=")
@@ -59,7 +59,7 @@ def mistakes(text: str, folder: Path, lines: Sequence[str] = ()) -> list[str]:
 
 
 def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]:
-    """What a person is told who gives settings, with the file's name shortened to FILE."""
+    """The error message for these settings, with the file's name shortened to FILE."""
     path = folder / "some.toml"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(CallerError) as caught:
@@ -68,16 +68,16 @@ def mistakes_with(text: str, folder: Path, settings: Sequence[str]) -> list[str]
 
 
 @pytest.mark.parametrize("text", [LANE, DOUBLE], ids=["lane", "double"])
-def test_the_scenarios_that_are_spoilt_below_are_right(text: str, tmp_path: Path) -> None:
+def test_the_scenarios_are_valid_before_mistakes_are_added(text: str, tmp_path: Path) -> None:
     path = tmp_path / "some.toml"
     path.write_text(text)
     resolve(load(path))
 
 
-# One setting each that spoils LANE: how its line begins after the file, and what it must go on to
-# say of the remedy.
+# One setting each that makes LANE invalid: how its line begins after the file name, and what the
+# remedy must contain.
 LANE_MISTAKES = [
-    # A key that nobody knows, at every level.
+    # Unknown keys, at every level.
     ("sped=2", "sped = 2: unknown key; ", "did you mean speed?"),
     ("xyzzy=2", "xyzzy = 2: unknown key; ", "the keys here are certificate, .*, trigger"),
     ("pland.rate_hz=9", 'pland = {"rate_hz": 9}: unknown key; ', "did you mean plant?"),
@@ -247,7 +247,7 @@ LANE_MISTAKES = [
     ("ports.netem=47001", "ports.netem = 47001: ", "already given to plant"),
     ("realtime.fifo_priority=99", "realtime.fifo_priority = 99: ", "less than or equal to 98"),
     ("realtime.spin_us=-1", "realtime.spin_us = -1: ", "greater than or equal to 0"),
-    # Not numbers to count with.
+    # Values that are not finite numbers.
     ("horizon_s=nan", "horizon_s = NaN: ", "finite|greater than 0"),
     ("horizon_s=inf", "horizon_s = Infinity: ", "finite"),
     ("trigger.beta=nan", "trigger.beta = NaN: ", "finite|greater than 0"),
@@ -257,10 +257,10 @@ LANE_MISTAKES = [
     ("plant.initial_state=[1,2,3,inf]", "plant.initial_state.3 = Infinity: ", "finite"),
     ("model.parameters.a11=nan", "model.parameters.a11 = NaN: ", "finite"),
     ("trigger.weight=[[nan]]", "trigger.weight.0.0 = NaN: ", "finite"),
-    # Rates whose period is no whole number of nanoseconds; the remedy is a rate that has one.
+    # Rates with a period that is not a whole number of nanoseconds; the remedy is a valid rate.
     ("plant.rate_hz=300", "plant.rate_hz = 300: ", r"whole .* 300\.000030000003"),
     ("controller.rate_hz=60", "controller.rate_hz = 60: ", r"whole .* 59\.9999988"),
-    # Shapes, which only model and plant together tell.
+    # Shapes that depend on both model and plant.
     ("plant.initial_state=[1,2,3]", "plant.initial_state = [1, 2, 3]: ", "4 entries.*found 3"),
     (
         "plant.initial_state_halfwidth=[1,2]",
@@ -306,14 +306,14 @@ LANE_MISTAKES = [
     ("model.gain=[[1,2],[3]]", "model.gain = [[1, 2], [3]]: ", "all rows need the same length"),
     ('model.state_names=["a"]', 'model.state_names = ["a"]: ', "expected 4 entries .*, found 1"),
     ('model.input_names=["a"]', 'model.input_names = ["a"]: ', "expected 2 entries .*, found 1"),
-    # What goes together.
+    # Combinations of settings.
     ("plant.draw=given", "plant.A: ", 'draw = "given" needs both matrices A and B'),
     ("plant.A=[[1]]", "plant.A = [[1]]: ", 'matrices are for draw = "given", not .*"uniform"'),
     ("model.A=[[1]]", 'model.name = "lane_following": ', "give one or the other"),
     # A gain that does not stabilise.
     ("model.parameters.gain=-1.0", 'model.parameters = {"gain": -1.0}: ', "u = -K x does: give -K"),
     ("model.gain=[[0,0,0,0],[0,0,0,0]]", "model.gain = ", "all eigenvalues of A . BK have neg"),
-    # Numbers that the named model cannot use.
+    # Values that the named model cannot use.
     ("model.parameters.look_ahead=0", "model.parameters.look_ahead = 0: ", "zero|0"),
 ]
 
@@ -331,7 +331,7 @@ def test_a_mistake_gets_one_line(setting: str, begins: str, remedy: str, tmp_pat
     assert_told(mistakes(LANE, tmp_path, [setting]), begins, remedy)
 
 
-# The same for DOUBLE, whose model is given by its matrices.
+# The same for DOUBLE, which gives its model by matrices.
 DOUBLE_MISTAKES = [
     ("model.A=[[0,1]]", "model.A = [[0, 1]]: ", "1 x 1 .*square.*found 1 x 2"),
     ("model.A=[[0,1],[0]]", "model.A = [[0, 1], [0]]: ", r"same length, found lengths \[1, 2\]"),
@@ -404,7 +404,7 @@ def test_a_mistake_in_given_matrices_gets_one_line(
         ('{model="bernoulli"}', "probability: missing ", ["good_to_bad", "loss_in_bad"]),
     ],
 )
-def test_only_the_chosen_loss_models_keys_are_proposed(
+def test_only_keys_of_the_chosen_loss_model_are_suggested(
     loss: str, begins: str, others: list[str], tmp_path: Path
 ) -> None:
     begins = f"network.loss.{begins}"
@@ -437,14 +437,15 @@ def test_a_missing_key_is_named(content: Content, key: str, tmp_path: Path) -> N
         section = section[part]
     del section[last]
     (line,) = mistakes(tomli_w.dumps(content), tmp_path)
-    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)  # what it is for
+    # the purpose of the key
+    assert re.fullmatch(rf"FILE: {re.escape(key)}: missing \(.{{10,}}\)", line)
 
 
 @pytest.mark.parametrize(
     ("key", "begins"),
     [("network.mansd", "M − 1, the "), ("network.loss", "what is lost, ")],
 )
-def test_what_a_missing_key_is_for_begins_as_in_a_sentence(
+def test_the_description_of_a_missing_key_begins_in_lower_case(
     content: Content, key: str, begins: str, tmp_path: Path
 ) -> None:
     section, last = key.split(".")
@@ -472,8 +473,8 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
         (["trigger.bet=1"], ["--set trigger.bet = 1: unknown key; did you mean beta?"]),
         (["plant.initial_state=[1,2]"], ["--set plant.initial_state = [1, 2]: "]),
         (["trigger.beta=-1", "nam=2"], ["--set trigger.beta = -1: ", "--set nam = 2: "]),
-        (["trigger.beta=1"], ["FILE: name = 1: "]),  # nothing is wrong with what was set
-        # The file alone is right, but not with what was set.
+        (["trigger.beta=1"], ["FILE: name = 1: "]),  # the settings themselves are valid
+        # The file alone is valid, but not with these settings.
         (["model.A=[[1]]"], ['FILE with --set model.A: model.name = "lane_following": ']),
         (
             ["horizon_s=3", 'network.loss.model="gilbert_elliott"', "network.mansd=9"],
@@ -482,7 +483,7 @@ def test_every_mistake_gets_its_own_line(tmp_path: Path) -> None:
         (["mode=zoh", "observer.kind=kalman"], ["FILE with --set observer.kind: observer."]),
     ],
 )
-def test_what_is_wrong_with_a_setting_is_not_said_of_the_file(
+def test_an_error_in_a_setting_is_not_attributed_to_the_file(
     settings: list[str], told: list[str], tmp_path: Path
 ) -> None:
     name = "1" if told[0].startswith("FILE: ") else '"lane"'
@@ -493,7 +494,7 @@ def test_what_is_wrong_with_a_setting_is_not_said_of_the_file(
         assert line.startswith(begins), line
 
 
-def test_an_empty_file_lacks_everything_that_is_required(tmp_path: Path) -> None:
+def test_an_empty_file_reports_every_required_key(tmp_path: Path) -> None:
     lines = mistakes("", tmp_path)
     assert [line.split(": ")[1] for line in lines] == [
         "name",
@@ -505,7 +506,7 @@ def test_an_empty_file_lacks_everything_that_is_required(tmp_path: Path) -> None
     ]
 
 
-def test_a_long_value_is_cut_short(tmp_path: Path) -> None:
+def test_a_long_value_is_shortened(tmp_path: Path) -> None:
     (line,) = mistakes(LANE, tmp_path, [f'mode="{"x" * 500}"'])
     assert len(line) < 200
     assert "xxx..." in line
@@ -521,13 +522,13 @@ def test_a_long_value_is_cut_short(tmp_path: Path) -> None:
         ("just words", "line 1"),
     ],
 )
-def test_text_that_is_not_toml_is_told_by_line(text: str, says: str, tmp_path: Path) -> None:
+def test_invalid_toml_is_reported_with_its_line(text: str, says: str, tmp_path: Path) -> None:
     (line,) = mistakes_with(text, tmp_path, ())
     assert line.startswith("FILE: not valid TOML: ")
     assert says in line
 
 
-def test_a_missing_file_is_told_with_its_neighbours(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_with_the_files_beside_it(tmp_path: Path) -> None:
     (tmp_path / "lane.toml").write_text(LANE)
     with pytest.raises(CallerError) as caught:
         load(tmp_path / "lan.toml")
@@ -537,7 +538,7 @@ def test_a_missing_file_is_told_with_its_neighbours(tmp_path: Path) -> None:
     assert str(caught.value) == f"{tmp_path}/nowhere/lan.toml: no such file"
 
 
-def test_what_cannot_be_read_as_text_is_told(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_reported(tmp_path: Path) -> None:
     (tmp_path / "bytes.toml").write_bytes(b"name = '\xff'")
     for path in (tmp_path, tmp_path / "bytes.toml"):
         with pytest.raises(CallerError, match=r"^[^\n]*: cannot be read: [^\n]*$"):
@@ -556,7 +557,7 @@ def test_what_cannot_be_read_as_text_is_told(tmp_path: Path) -> None:
         ("network.enforce_mansd=false", lambda s: s.network.enforce_mansd is False),
         ("plant.initial_state=[1, 2, 3, 4]", lambda s: s.plant.initial_state == (1, 2, 3, 4)),
         ('network.loss={model="worst_case"}', lambda s: s.network.loss.model == "worst_case"),
-        ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that the file does not have
+        ("seeds.loss=7", lambda s: s.seeds.loss == 7),  # in a table that is missing from the file
         ("realtime.enabled=false", lambda s: not s.realtime.enabled),
     ],
 )
@@ -568,10 +569,10 @@ def test_settings_replace_values_of_the_file(
     assert not read(load(path))
     changed = load(path, [setting])
     assert read(changed)
-    assert changed.ports == load(path).ports  # the rest stays
+    assert changed.ports == load(path).ports  # all other settings are unchanged
 
 
-def test_the_last_setting_of_a_key_counts(tmp_path: Path) -> None:
+def test_the_last_setting_of_a_key_wins(tmp_path: Path) -> None:
     path = tmp_path / "some.toml"
     path.write_text(LANE)
     assert load(path, ["speed=2", "speed=3"]).speed == 3
@@ -596,18 +597,20 @@ def test_the_last_setting_of_a_key_counts(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_setting_that_cannot_be_applied_is_told(setting: str, says: str, tmp_path: Path) -> None:
+def test_a_setting_that_cannot_be_applied_is_reported(
+    setting: str, says: str, tmp_path: Path
+) -> None:
     assert mistakes_with(LANE, tmp_path, [setting]) == [says]
 
 
-def test_only_the_sources_name_goes_into_the_message(content: Content) -> None:
+def test_the_message_quotes_only_the_name_of_the_source(content: Content) -> None:
     content["speed"] = -1
     with pytest.raises(CallerError, match=r"^run 7/scenario\.toml: speed = -1: "):
         validate(content, "run 7/scenario.toml")
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_shipped_scenarios_survive_being_written_and_read(path: Path, tmp_path: Path) -> None:
+def test_shipped_scenarios_are_unchanged_by_writing_and_reading(path: Path, tmp_path: Path) -> None:
     resolved = resolve(load(path))
     for scenario in (load(path), resolved):
         copy = tmp_path / "copy.toml"
@@ -616,7 +619,7 @@ def test_shipped_scenarios_survive_being_written_and_read(path: Path, tmp_path: 
     assert resolve(load(copy)) == resolved
 
 
-numbers = st.floats(-1e3, 1e3)  # a step of larger ones may reach infinity
+numbers = st.floats(-1e3, 1e3)  # a step with larger values may overflow to infinity
 
 
 @st.composite

@@ -1,4 +1,4 @@
-"""The JSON Schema of scenario files, as editors use it."""
+"""The JSON Schema of scenario files, which editors use."""
 
 import copy
 import json
@@ -16,7 +16,7 @@ SHIPPED = sorted((ROOT / "scenarios").glob("*.toml"))
 
 
 def test_the_published_schema_is_the_codes() -> None:
-    """``noack schema > docs/scenario.schema.json`` brings it up to date."""
+    """``noack schema > docs/scenario.schema.json`` updates it."""
     published = (ROOT / "docs" / "scenario.schema.json").read_text(encoding="utf-8")
     assert json.loads(published) == json_schema()
 
@@ -72,7 +72,7 @@ def test_shipped_scenarios_are_valid(validator: Any, path: Path) -> None:
         ("trigger", None),
     ],
 )
-def test_mistakes_are_not_valid(
+def test_the_schema_refuses_mistakes(
     validator: Any, content: dict[str, Any], key: str, value: object
 ) -> None:
     assert validator.is_valid(content)

@@ -1,4 +1,4 @@
-"""Set-points: where a model can rest, by hand and against a solver."""
+"""Set-points: the equilibria of a model, by hand and against a solver."""
 
 from typing import Any
 
@@ -15,21 +15,21 @@ from noack.core.errors import CallerError
 A_DOUBLE, B_DOUBLE = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
 
 
-def test_a_mass_rests_anywhere_without_a_force() -> None:
+def test_a_free_mass_is_at_equilibrium_anywhere_without_a_force() -> None:
     assert input_at(A_DOUBLE, B_DOUBLE, np.array([3.5, 0.0])).tolist() == [0.0]
 
 
-def test_a_spring_wants_the_force_that_holds_it() -> None:
+def test_the_equilibrium_input_of_a_spring_balances_its_force() -> None:
     A = np.array([[0.0, 1.0], [-2.0, -0.1]])
     assert input_at(A, B_DOUBLE, np.array([3.0, 0.0])) == pytest.approx([6.0])
 
 
-def test_what_moves_does_not_rest_and_the_nearest_that_does_is_named() -> None:
+def test_a_set_point_that_moves_is_refused_with_the_nearest_equilibrium() -> None:
     with pytest.raises(ValueError, match=r"dimension 1, and the nearest one is \[2, 0\]"):
         input_at(A_DOUBLE, B_DOUBLE, np.array([2.0, 1.0]))
 
 
-def test_a_model_may_rest_nowhere_else() -> None:
+def test_a_model_may_have_the_origin_as_its_only_equilibrium() -> None:
     with pytest.raises(ValueError, match="none but 0"):
         input_at(np.array([[1.0]]), np.zeros((1, 1)), np.array([1.0]))
 
@@ -53,7 +53,7 @@ def test_states_that_are_equilibria_by_construction_are_taken(seed: int) -> None
         ({"setpoint": [1.0, 0.0]}, {"protocol": "ack"}, "not with network.protocol"),
     ],
 )
-def test_a_mistaken_set_point_is_one_line(
+def test_an_invalid_set_point_is_refused_in_one_line(
     content: dict[str, Any], controller: dict[str, Any], more: dict[str, Any], why: str
 ) -> None:
     content["controller"] = controller
@@ -63,7 +63,7 @@ def test_a_mistaken_set_point_is_one_line(
     assert "\n" not in str(raised.value)
 
 
-def test_the_loop_of_a_scenario_has_it(content: dict[str, Any]) -> None:
+def test_the_set_point_of_a_scenario_is_used_in_its_loop(content: dict[str, Any]) -> None:
     content["controller"] = {"setpoint": [2.0, 0.0]}
     scenario = validate(content, "here")
     loop = loop_of(resolve(scenario))

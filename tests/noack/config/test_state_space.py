@@ -36,11 +36,11 @@ def systems() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", systems())
-def test_a_system_of_scipy_or_a_tuple_is_a_model(name: str) -> None:
+def test_a_scipy_system_or_a_tuple_is_accepted_as_a_model(name: str) -> None:
     assert model_of(systems()[name], K) == EXPECTED
 
 
-def test_a_system_of_python_control_is_a_model_with_its_names() -> None:
+def test_a_python_control_system_is_accepted_with_its_signal_names() -> None:
     assert model_of(control_object(), K) == EXPECTED
     named = control_object(states=["angle", "rate"], inputs=["torque"], outputs=["a", "r"])
     model = model_of(named, K)
@@ -48,7 +48,7 @@ def test_a_system_of_python_control_is_a_model_with_its_names() -> None:
     assert model_of(named, K, state_names=["p", "q"]).state_names == ("p", "q")
 
 
-def test_a_gain_of_lqr_is_of_the_opposite_sign_and_refused_as_it_is() -> None:
+def test_a_gain_with_the_sign_of_lqr_is_refused() -> None:
     control = pytest.importorskip("control")
     gain, _, _ = control.lqr(control_object(), np.eye(2), np.eye(1))
     with pytest.raises(CallerError, match=r"K x does not stabilise .*; u = -K x does: give -K"):
@@ -57,7 +57,7 @@ def test_a_gain_of_lqr_is_of_the_opposite_sign_and_refused_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat"])
-def test_what_is_saved_is_read_back(suffix: str, tmp_path: Path) -> None:
+def test_a_saved_system_is_read_back(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"plant{suffix}"
     save_model(path, signal.StateSpace(A, B, C, D), K)
     found = read_matrices(NamedFile(path.name, tmp_path))
@@ -83,9 +83,7 @@ def test_what_is_saved_is_read_back(suffix: str, tmp_path: Path) -> None:
         ((A * np.nan, B), K, "A: a matrix of finite numbers is needed"),
     ],
 )
-def test_what_is_no_such_system_is_refused_in_one_line(
-    system: Any, gain: Any, expected: str
-) -> None:
+def test_an_invalid_system_is_refused_in_one_line(system: Any, gain: Any, expected: str) -> None:
     with pytest.raises(CallerError) as refused:
         model_of(system, gain)
     assert expected in str(refused.value)
@@ -98,7 +96,7 @@ def test_a_discrete_time_system_of_python_control_is_refused() -> None:
         model_of(control.ss(A, B, C, D, True), K)
 
 
-def test_a_file_of_another_kind_or_place_is_refused(tmp_path: Path) -> None:
+def test_a_wrong_file_type_or_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"must end in \.npz"):
         save_model(tmp_path / "plant.csv", (A, B))
     with pytest.raises(CallerError, match="cannot be written"):

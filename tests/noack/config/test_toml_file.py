@@ -1,4 +1,4 @@
-"""A settings file is bounded before it is parsed: in size, in depth, in what is said of it."""
+"""A settings file is checked before it is parsed: its size, depth and key length are bounded."""
 
 import os
 import subprocess
@@ -26,14 +26,14 @@ def key(parts: int, part: str = "a", dot: str = ".") -> str:
 
 LONG = key(MOST + 1)
 TRICKY = [
-    '"""a"b""c\\""""',  # ends in a quotation mark of its own
+    '"""a"b""c\\""""',  # ends in an escaped or extra quotation mark
     '"""\n#\n\\"""\n"""',
     "'''it's ''it'''''",
     '"\\"#\\\\"',
     "'\\'",
     '""',
 ]
-"""Strings that end where a careless reader does not see it."""
+"""Strings with an end that a simple parser misses."""
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ TRICKY = [
     ],
 )
 def test_long_key_is_refused_before_it_is_parsed(text: str) -> None:
-    tomllib.loads(text)  # it is TOML
+    tomllib.loads(text)  # the text is valid TOML
     with pytest.raises(CallerError, match=rf"^here: a key has more than {MOST} parts$"):
         toml_file.parsed(text, "here")
 
@@ -66,7 +66,7 @@ def test_long_key_is_refused_before_it_is_parsed(text: str) -> None:
         "x = [" + "0.5, " * 1000 + "]",
     ],
 )
-def test_whatever_else_has_dots_is_none(text: str) -> None:
+def test_dots_outside_keys_are_not_taken_for_a_long_key(text: str) -> None:
     assert toml_file.parsed(text, "here") == tomllib.loads(text)
 
 
@@ -81,8 +81,8 @@ def test_whatever_else_has_dots_is_none(text: str) -> None:
         "'''\\" * 10**5,
     ],
 )
-def test_what_is_none_is_seen_in_linear_time(text: str) -> None:
-    """Quadratic time would be that of 10¹² steps, beyond the test's own limit."""
+def test_text_without_long_keys_is_checked_in_linear_time(text: str) -> None:
+    """Quadratic time would need 10¹² steps and exceed the test's time limit."""
     with pytest.raises(CallerError, match=r"^here: not valid TOML"):
         toml_file.parsed(text, "here")
 
@@ -140,30 +140,32 @@ def test_hostile_files_take_little_memory(tmp_path: Path) -> None:
         (f"x = {'9' * 20_000}", "an integer is too large"),
     ],
 )
-def test_depth_and_digits_are_one_line(tmp_path: Path, read, text: str, wrong: str) -> None:  # type: ignore[no-untyped-def]
+def test_too_much_depth_or_too_many_digits_give_one_line(
+    tmp_path: Path, read, text: str, wrong: str
+) -> None:  # type: ignore[no-untyped-def]
     path = tmp_path / "file.toml"
     path.write_text(text)
     with pytest.raises(CallerError, match=f"^[^\n]*file.toml: {wrong}[^\n]*$"):
         read(path)
 
 
-def test_set_key_is_bounded() -> None:
+def test_the_key_of_a_setting_has_a_maximum_length() -> None:
     content: dict[str, object] = {}
     put(content, key(MOST), 1, "--set")
     with pytest.raises(CallerError, match=r"^--set: the key has more than 32 parts$"):
         put(content, key(MOST + 1), 1, "--set")
 
 
-def test_many_mistakes_are_counted() -> None:
+def test_the_number_of_further_mistakes_is_given() -> None:
     with pytest.raises(CallerError) as caught:
         validate({f"a{i}": 0 for i in range(10_000)}, "here")
     lines = str(caught.value).splitlines()
     assert len(lines) == 51
-    assert lines[-1] == "here: 9956 more mistakes"  # 6 that are needed are missing, too
+    assert lines[-1] == "here: 9956 more mistakes"  # 6 required keys are missing, too
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "fifo"])
-def test_named_file_is_a_regular_one(tmp_path: Path, name: str) -> None:
+def test_only_regular_files_are_read(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / "fifo")
     file = NamedFile(name, tmp_path, "run.toml: network.loss")
     with pytest.raises(CallerError, match=r"cannot be read: not a regular file$"):
@@ -177,7 +179,7 @@ class _Named(BaseModel):
     note: str = ""
 
 
-def test_missing_file_names_files_of_its_kind_only(tmp_path: Path) -> None:
+def test_a_missing_file_suggests_only_files_of_its_type(tmp_path: Path) -> None:
     (tmp_path / "one.toml").write_text("name = 'one'\nmore = 1")
     (tmp_path / "pyproject.toml").write_text("[project]\nname = 'other'")
     (tmp_path / "broken.toml").write_text("name = ")

@@ -34,7 +34,7 @@ def test_simulated_time_is_wall_time_times_speed(speed: float, wall_ns: int) -> 
     clock = RunClock(EPOCH_NS, speed, wall)
     wall.now_ns = EPOCH_NS + wall_ns
     exact = Fraction(speed) * wall_ns
-    # Rounded down to a nanosecond, after one rounding of a product good to 2⁻⁵³.
+    # Rounded down to a nanosecond, after one product with a relative error of 2⁻⁵³.
     assert abs(clock.now_ns() - exact) <= 1 + exact / 2**53
 
 
@@ -57,7 +57,7 @@ def test_the_computed_wait_ends_at_the_deadline(speed: float, wall_ns: int, t_ns
     wait_s = clock.wall_s_until(t_ns)
     assert (wait_s > 0) == (t_ns > wall_ns * Fraction(speed)) or abs(wait_s) < 1e-9
     wall.now_ns += round(wait_s * 1e9)
-    # To half a nanosecond of wall time, and to the rounding of times of up to 10¹⁵ ns.
+    # Within half a nanosecond of wall time plus the rounding of times of up to 10¹⁵ ns.
     assert abs(clock.now_ns() - t_ns) <= 2 + speed
 
 

@@ -1,4 +1,4 @@
-"""Where compiled code is kept, and what happens where it cannot be."""
+"""Where compiled code is stored, and the behaviour when it cannot be stored."""
 
 import errno
 import fcntl
@@ -32,7 +32,7 @@ def kept_at(function: Any) -> object:
     return function._cache.cache_path
 
 
-def test_other_sources_have_another_folder(home: Path) -> None:
+def test_changed_sources_use_another_folder(home: Path) -> None:
     other = home / "other.py"
     other.write_text("None")
     folders = {cache_folder("netem", sources) for sources in (SOURCES, [*SOURCES, other], SOURCES)}
@@ -72,7 +72,7 @@ def test_a_second_process_waits_for_the_compilation_and_uses_the_cache(home: Pat
         )  # fmt: skip
         assert later.stdout is not None
         assert later.stdout.readline() == "began\n"
-        # What the other compiles meanwhile, without asking for the lock that we hold.
+        # This replaces the other process's compilation; it does not take the lock held here.
         numba.config.CACHE_DIR = str(folder)
         assert numba.njit(doubled, cache=True)(21) == 42
     assert later.communicate(timeout=60)[0] == "1\n"
@@ -95,7 +95,8 @@ def test_without_a_home_there_is_no_cache(home: Path, monkeypatch: pytest.Monkey
     assert cache_folder("netem", SOURCES) is None
     function = compiler(None)(doubled)
     assert function(21) == 42
-    assert kept_at(function) is None  # numba has no place of its own for it, with older rules
+    # numba, under its older rules, has no location of its own for it either
+    assert kept_at(function) is None
 
 
 def test_a_cache_folder_of_another_user_is_not_used(
@@ -132,7 +133,7 @@ def test_ctrl_c_waits_for_the_compiler(home: Path) -> None:
     assert folder is not None
     function = compiler(folder)(doubled)
     going_on: list[str] = []
-    compile_once = function.compile.__closure__[0].cell_contents  # what the lock surrounds
+    compile_once = function.compile.__closure__[0].cell_contents  # the code inside the lock
 
     def interrupted(signature: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
@@ -143,6 +144,6 @@ def test_ctrl_c_waits_for_the_compiler(home: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         function(21)
     assert going_on
-    assert function(21) == 42  # without compiling anew
+    assert function(21) == 42  # without recompiling
     assert len(going_on) == 1
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -1,4 +1,4 @@
-"""What a person reads of an error, whatever it quotes."""
+"""Error messages are printable single lines, whatever text they quote."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +12,7 @@ def test_quoted_text_is_one_printable_line(text: str) -> None:
     assert printable(text) == text or not text.isprintable()
 
 
-def test_an_error_moves_no_cursor_and_rings_no_bell() -> None:
+def test_control_characters_in_an_error_are_escaped() -> None:
     assert str(CallerError("key = \x1b[2J\x07é\ud800")) == "key = \\x1b[2J\\x07é\\ud800"
 
 
@@ -20,5 +20,5 @@ def test_each_mistake_has_a_line() -> None:
     assert str(CallerError("a: wrong\nb: \twrong")) == "a: wrong\nb: \\twrong"
 
 
-def test_a_foreign_error_becomes_one_line() -> None:
+def test_an_error_of_another_library_becomes_one_line() -> None:
     assert one_line(ValueError("Couldn't read:\n  no data\n")) == "Couldn't read: no data"

@@ -20,7 +20,7 @@ from noack.core.linear_systems import (
 )
 
 ROUNDING = 1e-13
-"""A few hundred operations, each good to 2⁻⁵³."""
+"""A few hundred operations, each with a relative error of 2⁻⁵³."""
 
 STEPS_NS = [1, 1_000, 2_000_000, 333_333_333, 1_000_000_000, 60_000_000_000]
 
@@ -40,7 +40,7 @@ def systems(draw: st.DrawFn) -> tuple[Matrix, Matrix]:
 
 
 @pytest.mark.parametrize("dt_ns", STEPS_NS)
-def test_the_double_integrator_moves_as_newton_says(dt_ns: int) -> None:
+def test_the_double_integrator_is_discretised_as_its_closed_form(dt_ns: int) -> None:
     dt = dt_ns * 1e-9
     model = double_integrator({})
     Ad, Bd = discretise(model.A, model.B, dt_ns)
@@ -66,9 +66,9 @@ def test_an_oscillator_turns_by_its_angle(dt_ns: int) -> None:
     )
 
 
-def test_a_singular_matrix_that_is_not_nilpotent_is_no_special_case() -> None:
+def test_a_singular_matrix_that_is_not_nilpotent_is_discretised_as_its_closed_form() -> None:
     v, w, dt = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -1.0]), 0.7
-    A, rate = np.outer(v, w), float(w @ v)  # A² = rate · A, so its series can be summed
+    A, rate = np.outer(v, w), float(w @ v)  # A² = rate · A gives the series a closed form
     B = np.array([[1.0, 0.0], [0.0, 2.0], [-1.0, 1.0]])
     Ad, Bd = discretise(A, B, 700_000_000)
     grown = math.expm1(rate * dt)
@@ -112,7 +112,7 @@ def test_transitions_form_a_group(G: Matrix, s_ns: int, t_ns: int) -> None:
 def test_volumes_grow_with_the_trace(G: Matrix, dt_ns: int) -> None:
     """Liouville's formula: det e^{Gt} = e^{t tr G}."""
     Phi = transition(G, dt_ns)
-    scale = np.linalg.norm(Phi) ** len(G)  # of the terms that make up the determinant
+    scale = np.linalg.norm(Phi) ** len(G)  # relative to the terms that make up the determinant
     grown = math.exp(float(np.trace(G)) * dt_ns * 1e-9)
     assert np.linalg.det(Phi) == pytest.approx(grown, abs=1e-13 * scale)
 
@@ -143,7 +143,7 @@ def test_propagators_keep_their_own_matrices() -> None:
     assert held(state, state, 10**9) == pytest.approx(1.0, rel=ROUNDING)
 
 
-def test_no_time_and_no_dynamics_change_nothing() -> None:
+def test_zero_time_and_zero_dynamics_leave_the_state_unchanged() -> None:
     state, G = np.array([0.1, -0.0]), np.array([[0.3, 1.0], [-2.0, 0.4]])
     assert Propagator(G)(state, 0).tobytes() == state.tobytes()
     assert HeldInputPropagator(G, G)(state, state, 0).tobytes() == state.tobytes()
@@ -152,7 +152,7 @@ def test_no_time_and_no_dynamics_change_nothing() -> None:
 
 @given(arrays(np.float64, st.integers(1, 64), elements=st.floats(-1e100, 1e100)))
 def test_the_norm_is_the_hypotenuse(vector: np.ndarray) -> None:
-    # Squares of entries below 1e-154 underflow; they count for nothing beside 1e-150.
+    # Squares of entries below 1e-154 underflow; they are negligible relative to 1e-150.
     assert norm(vector) == pytest.approx(math.hypot(*vector), rel=1e-14, abs=1e-150)
 
 
@@ -162,7 +162,7 @@ def test_the_abscissa_is_the_largest_real_part() -> None:
     assert spectral_abscissa(matrix) == pytest.approx(-0.5, rel=ROUNDING)
 
 
-def test_row_norms_are_numpys_where_squares_are_numbers() -> None:
+def test_row_norms_equal_numpys_where_squares_do_not_overflow() -> None:
     rows = np.random.default_rng(1).normal(size=(100, 5)) * np.logspace(-130, 130, 100)[:, None]
     assert row_norms(rows).tobytes() == np.linalg.norm(rows, axis=1).tobytes()
 
@@ -174,7 +174,7 @@ def test_row_norms_neither_overflow_nor_vanish(size: float) -> None:
     np.testing.assert_allclose(row_norms(rows), expected, rtol=1e-12)
 
 
-def test_row_norms_of_what_is_not_finite_are_not_finite() -> None:
+def test_row_norms_of_non_finite_rows_are_not_finite() -> None:
     with np.errstate(invalid="ignore"):
         found = row_norms(np.array([[np.inf, 1.0], [np.nan, 1.0], [1.0, 0.0]]))
     np.testing.assert_array_equal(found, [np.inf, np.nan, 1.0])

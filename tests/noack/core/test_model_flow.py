@@ -1,4 +1,4 @@
-"""The models' flow about set-points that change, against the flow of deviations by hand."""
+"""The models' flow with changing set-points, against the flow of the deviations by hand."""
 
 import numpy as np
 import pytest

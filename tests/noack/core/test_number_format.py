@@ -24,7 +24,7 @@ from noack.core.number_format import plus_minus
         (math.nan, 1.0, "nan"),
     ],
 )
-def test_a_mean_has_the_places_that_its_interval_leaves(
+def test_a_mean_has_as_many_digits_as_its_interval_supports(
     mean: float, halfwidth: float, written: str
 ) -> None:
     assert plus_minus(mean, halfwidth) == written

@@ -16,12 +16,12 @@ names = st.lists(st.text("abc/", max_size=4), min_size=1, max_size=4)
 def test_a_stream_is_fixed_by_its_seed_and_name(seed: int, name: list[str]) -> None:
     first, again = stream(seed, *name), stream(seed, *name)
     other = stream(seed, "something", "else")
-    other.random(100)  # drawing from one leaves the others alone
+    other.random(100)  # drawing from one does not change the others
     assert first.random(20).tobytes() == again.random(20).tobytes()
 
 
-def test_a_stream_is_the_documented_one() -> None:
-    """NumPy's PCG64DXSM, seeded by the seed and a hash of the name: the same everywhere, always."""
+def test_a_stream_is_the_documented_generator() -> None:
+    """NumPy's PCG64DXSM, seeded by the seed and a hash of the name; the same on every machine."""
     digest = hashlib.blake2b(b"netem\0update\0loss\0" + b"0", digest_size=16).digest()
     key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
     by_hand = np.random.PCG64DXSM(np.random.SeedSequence(2, spawn_key=key))
@@ -29,8 +29,8 @@ def test_a_stream_is_the_documented_one() -> None:
     np.testing.assert_array_equal(found.random_raw(5), by_hand.random_raw(5))
 
 
-def test_the_numbers_of_published_runs_stay_the_same() -> None:
-    """Written down once: a scenario's seeds must mean the same draws in every later version."""
+def test_the_random_numbers_are_the_same_in_every_version() -> None:
+    """The expected numbers are constants: a seed gives the same draws in every version."""
     found = stream(2, "netem", "update", "loss", "0").random(3)
     assert found.tolist() == [0.676940330421062, 0.34315593350369966, 0.8542103866233243]
 
@@ -48,15 +48,17 @@ def test_neighbouring_streams_are_uncorrelated() -> None:
     assert np.abs(correlation).max() < 5 / np.sqrt(20_000)  # five standard errors
 
 
-def test_a_nameless_stream_or_a_negative_seed_is_refused() -> None:
+def test_an_empty_stream_name_or_a_negative_seed_is_refused() -> None:
     with pytest.raises(ValueError, match="needs a name"):
         stream(0)
     with pytest.raises(ValueError, match="non-negative"):
         stream(-1, "a")
 
 
-def test_a_streams_key_is_the_seed_sequences_own() -> None:
-    """Two words of what seeds the stream of the same name; written down once, like its numbers."""
+def test_a_streams_key_is_the_seed_sequences_state() -> None:
+    """Two words of the state that seeds the stream of the same name; the expected values are
+    constants.
+    """
     digest = hashlib.blake2b(b"netem\0a\0loss", digest_size=16).digest()
     key = [int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4)]
     words = np.random.SeedSequence(2, spawn_key=key).generate_state(2)
@@ -73,7 +75,7 @@ def test_other_seeds_and_names_have_other_keys() -> None:
         stream_key(0)
 
 
-def test_rows_of_a_table_are_the_same_whichever_are_asked_for() -> None:
+def test_a_row_of_a_table_does_not_depend_on_the_requested_rows() -> None:
     whole = words(7, "a", "table", rows=range(100), width=6)
     assert whole.shape == (100, 6)
     for rows in (range(1), range(37, 41), range(99, 100)):
@@ -86,13 +88,13 @@ def test_rows_of_a_table_are_the_same_whichever_are_asked_for() -> None:
         assert (whole != other).all()
 
 
-def test_a_table_is_the_generators_own_sequence() -> None:
+def test_a_table_equals_the_generators_sequence() -> None:
     low, high = stream_key(7, "t")
     sequence = np.random.Generator(np.random.Philox(key=low | high << 32)).random(40)
     np.testing.assert_array_equal(uniforms(7, "t", rows=range(10), width=4).ravel(), sequence)
 
 
-def test_many_keys_are_the_keys_one_by_one() -> None:
+def test_keys_computed_together_equal_single_keys() -> None:
     seeds = [0, 1, 2**32 - 1, 2**32, 2**64 - 1, *range(7, 2**63, 2**58)]
     for path in (("netem", "a", "loss"), ("b",)):
         keys = stream_keys(np.array(seeds, np.uint64), *path)

@@ -1,4 +1,4 @@
-"""What holds for every kind of plant that has a shipped scenario."""
+"""Properties of every kind of plant that has a shipped scenario."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_names_and_dimensions_agree(name: str, overrides: list[str]) -> None:
 
 
 @pytest.mark.parametrize(("name", "overrides"), list(cases()))
-def test_the_same_inputs_give_the_same_bits(name: str, overrides: list[str]) -> None:
+def test_the_same_inputs_give_bit_identical_states(name: str, overrides: list[str]) -> None:
     scenario = scenario_of(name, overrides)
     inputs = 0.01 * np.random.default_rng(1).normal(size=(STEPS, scenario.model.dimensions[1]))
     first = motion(scenario, inputs)
@@ -74,7 +74,7 @@ def row(kind: str, settings: type[PlantSettings]) -> str:
     return f"| `{kind}` | {summary} | {states} | {inputs} | {scenario} |"
 
 
-def test_the_table_of_kinds_is_the_registrys() -> None:
+def test_the_documented_kinds_are_those_of_the_registry() -> None:
     text = (ROOT / "docs/plants.md").read_text()
     for kind, settings in PLANTS.items():
         assert row(kind, settings) in text

@@ -1,4 +1,4 @@
-"""Systems that are not linear: their laws, and that a plant repeats them bit for bit."""
+"""Nonlinear systems: their physical laws, and bit-exact repetition."""
 
 import math
 
@@ -41,7 +41,7 @@ def test_a_free_cart_pole_keeps_its_energy_and_its_momentum() -> None:
     np.testing.assert_allclose(momentum, momentum[0], atol=1e-8)
 
 
-def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
+def test_energy_changes_by_the_work_of_force_and_friction() -> None:
     settings = CartPoleSettings(kind="cart_pole")
     force, h_ns = 0.7, 500_000
     states = run(
@@ -54,14 +54,16 @@ def test_work_is_done_by_the_force_and_taken_by_the_friction() -> None:
 
 
 def test_its_linearisation_has_the_poles_of_the_literature() -> None:
-    """Open loop, by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041, 5.5651."""
+    """Open-loop poles by the Control Tutorials for MATLAB and Simulink: 0, -0.1428, -5.6041,
+    5.5651.
+    """
     A, B = linearise(lambda x0: OdeSystem(CartPoleSettings(kind="cart_pole").equations(), x0), 4, 1)
     poles = np.sort(np.linalg.eigvals(A).real)
     np.testing.assert_allclose(poles, [-5.6041, -0.1428, 0.0, 5.5651], atol=1e-4)
     np.testing.assert_allclose(B[:, 0], [0.0, 1.8182, 0.0, -4.5455], atol=1e-4)
 
 
-def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
+def test_the_integration_agrees_with_another_solver() -> None:
     def pendulum(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         return float(z[1]), -math.sin(float(z[0])) + float(v[0]) * math.cos(3 * t)
 
@@ -74,7 +76,7 @@ def test_an_integration_is_as_exact_as_another_solver_makes_it() -> None:
     np.testing.assert_allclose(states[-1], exact.y[:, -1], atol=1e-6)
 
 
-def test_the_same_steps_give_the_same_bits_whatever_was_integrated_before() -> None:
+def test_a_step_does_not_depend_on_earlier_integrations() -> None:
     first = OdeSystem(
         CartPoleSettings(kind="cart_pole").equations(), np.array([0.1, 0.0, 0.2, 0.0])
     )
@@ -89,7 +91,7 @@ def test_the_same_steps_give_the_same_bits_whatever_was_integrated_before() -> N
     assert run(second, [0.3, -0.1, 2.0] * 20).tobytes() == expected.tobytes()
 
 
-def test_what_cannot_be_integrated_is_nan_from_then_on() -> None:
+def test_the_state_is_nan_after_a_failed_integration() -> None:
     def blows_up(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
         return (float(z[0]) ** 2,)
 
@@ -99,7 +101,7 @@ def test_what_cannot_be_integrated_is_nan_from_then_on() -> None:
     assert np.isnan(states[12:]).all()
 
 
-def test_what_a_derivative_raises_is_divergence_if_it_is_of_arithmetic_and_else_raised() -> None:
+def test_arithmetic_errors_in_a_derivative_count_as_divergence_others_are_raised() -> None:
     def broken(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float]:
         if t > 0.003:
             raise [OverflowError, KeyError][int(v[0])]("far")

@@ -1,4 +1,4 @@
-"""The DC motor against its published transfer function, and stiction against another solver."""
+"""The DC motor against its published transfer function; stiction against another solver."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ from noack.plants.dc_motor import DcMotor, DcMotorSettings
 
 H_NS = 2_000_000
 INDUCTANCES = (2.75e-6, 1e-3, 0.05, 0.5)
-"""With the last two, speed and current oscillate."""
+"""The last two values make speed and current oscillate."""
 
 
 def settings(**given: Any) -> DcMotorSettings:
@@ -51,7 +51,7 @@ def test_the_linearisation_has_the_published_frequency_response() -> None:
 
 
 def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: float) -> np.ndarray:
-    """The same law by an implicit integrator with events: turning forward, backward, stuck."""
+    """The same law by an implicit integrator with events: forward, backward, at standstill."""
     J, b, L = motor.inertia_kg_m2, motor.friction_n_m_s, motor.inductance_h
     K, R, T_c = motor.torque_constant_n_m_per_a, motor.resistance_ohm, motor.coulomb_friction_n_m
     t_s, x = 0.0, x.copy()
@@ -79,7 +79,7 @@ def reference(motor: DcMotorSettings, x: np.ndarray, voltage: float, end_s: floa
 
 
 @pytest.mark.parametrize("inductance_h", INDUCTANCES)
-def test_friction_and_stiction_are_another_solvers(inductance_h: float) -> None:
+def test_friction_and_stiction_agree_with_another_solver(inductance_h: float) -> None:
     motor = settings(inductance_h=inductance_h, coulomb_friction_n_m=1e-3)
     system, expected = DcMotor(motor, np.array([0.0, 5.0, 0.0])), np.array([0.0, 5.0, 0.0])
     stuck = 0
@@ -88,10 +88,11 @@ def test_friction_and_stiction_are_another_solvers(inductance_h: float) -> None:
         expected = reference(motor, expected, voltage, 5e-3)
         np.testing.assert_allclose(system.x, expected, rtol=1e-7, atol=1e-8)
         stuck += system.x[1] == 0.0
-    assert stuck or inductance_h > 1e-3  # slow currents do not let it stop for a whole step
+    # With a large inductance, the current changes too slowly for a stop of a whole step.
+    assert stuck or inductance_h > 1e-3
 
 
-def test_the_shaft_sticks_up_to_the_coulomb_torque_and_no_further() -> None:
+def test_the_shaft_sticks_exactly_up_to_the_coulomb_torque() -> None:
     limit_v = 4.0 * 1e-3 / 0.0274  # R T_c / Kt
     for factor, moves in ((0.999, False), (1.001, True)):
         motor = DcMotor(settings(coulomb_friction_n_m=1e-3), np.zeros(3))
@@ -115,5 +116,5 @@ def test_energy_is_conserved() -> None:
     assert supplied == pytest.approx(losses + 1e-3 * angle[-1] + stored, rel=1e-6)
 
 
-def test_a_state_that_is_not_finite_stays_so() -> None:
+def test_a_non_finite_state_stays_non_finite() -> None:
     assert np.isnan(motion(DcMotor(settings(), np.zeros(3)), [np.nan, 0.0])[1:]).all()

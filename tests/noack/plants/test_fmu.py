@@ -1,4 +1,4 @@
-"""FMUs as plants, of FMI 2 and 3: against other integrators, and with all that may be wrong."""
+"""FMUs as plants, FMI 2 and 3: against other integrators, and invalid FMUs."""
 
 import fcntl
 import math
@@ -56,17 +56,17 @@ X0 = np.array([1.0, -0.5])
 
 
 @VERSIONS
-def test_a_linear_fmu_is_the_linear_system(version: int, tmp_path: Path) -> None:
+def test_a_linear_fmu_moves_like_the_linear_system(version: int, tmp_path: Path) -> None:
     parameters = {"mu": 0.3, "k": 4.0, "linear": True}
     system = FmuSystem(settings(build(tmp_path, version), parameters=parameters), X0)
     A, B = np.array([[0.0, 1.0], [-4.0, -0.3]]), np.array([[0.0], [1.0]])
     exact = run(LinearSystem(A, B, X0, step_ns=H_NS), INPUTS)
-    # Runge and Kutta's error of order 4 over steps of 125 µs is far below.
+    # The error of the fourth-order Runge-Kutta method with steps of 125 µs is far below.
     np.testing.assert_allclose(run(system, INPUTS), exact, atol=1e-11)
 
 
 @VERSIONS
-def test_van_der_pol_is_what_another_integrator_makes_of_it(version: int, tmp_path: Path) -> None:
+def test_van_der_pol_agrees_with_another_integrator(version: int, tmp_path: Path) -> None:
     def van_der_pol(t: float, z: np.ndarray, v: np.ndarray) -> tuple[float, float]:
         return float(z[1]), 2.0 * (1.0 - z[0] ** 2) * z[1] - z[0] + v[0]
 
@@ -96,8 +96,8 @@ def test_its_linearisation_is_that_of_its_equations(version: int, tmp_path: Path
 
 
 @VERSIONS
-def test_an_operating_point_is_where_x_and_u_are_zero(version: int, tmp_path: Path) -> None:
-    """At x0 = 2 the spring pulls with k x0 = 6, which the input holds."""
+def test_x_and_u_are_deviations_from_the_operating_point(version: int, tmp_path: Path) -> None:
+    """At x0 = 2 the spring force is k x0 = 6; the operating input balances it."""
     loaded = settings(
         build(tmp_path, version), parameters={"k": 3.0, "linear": True},
         operating_state=(2.0, 0.0), operating_input=(6.0,),
@@ -111,7 +111,7 @@ def test_an_operating_point_is_where_x_and_u_are_zero(version: int, tmp_path: Pa
 
 @VERSIONS
 @pytest.mark.parametrize(("status", "said"), [(2, "discard"), (3, "error"), (4, "fatal")])
-def test_a_step_that_fails_says_why_once(
+def test_a_failed_step_is_reported_once_with_the_reason(
     version: int, status: int, said: str, tmp_path: Path
 ) -> None:
     parameters = {"fail_at_s": 0.02, "fail_status": status}
@@ -124,7 +124,7 @@ def test_a_step_that_fails_says_why_once(
     assert "\n" not in text
 
 
-def test_an_fmu_that_wants_to_end_has_failed(tmp_path: Path) -> None:
+def test_an_fmu_that_requests_termination_has_failed(tmp_path: Path) -> None:
     parameters = {"fail_at_s": 0.02, "fail_status": -1}
     system = FmuSystem(settings(build(tmp_path, 3), parameters=parameters), X0)
     with pytest.raises(SystemFailedError, match="wants the simulation to end"):
@@ -132,7 +132,7 @@ def test_an_fmu_that_wants_to_end_has_failed(tmp_path: Path) -> None:
 
 
 @VERSIONS
-def test_a_warning_is_no_failure_and_noise_is_not_heard(
+def test_a_warning_is_not_a_failure_and_fmu_output_is_suppressed(
     version: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     system = FmuSystem(settings(build(tmp_path, version), parameters={"noisy": True}), X0)
@@ -180,7 +180,7 @@ def test_settings_that_do_not_fit_the_fmu_are_refused_in_one_line(
 
 
 @VERSIONS
-def test_other_variables_may_set_the_start(version: int, tmp_path: Path) -> None:
+def test_start_values_may_be_set_by_other_variables(version: int, tmp_path: Path) -> None:
     loaded = settings(
         build(tmp_path, version),
         initial_variables=("x0_at_the_start", "x1"),
@@ -212,7 +212,7 @@ def test_fmus_that_cannot_be_run_are_refused_in_one_line(
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"PK\x05\x06" + bytes(18), bytes(1000)])
-def test_what_is_no_fmu_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+def test_an_invalid_fmu_file_is_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "garbage.fmu"
     path.write_bytes(content)
     with pytest.raises(CallerError, match="is no FMU of FMI 2 or 3") as refused:
@@ -221,7 +221,7 @@ def test_what_is_no_fmu_is_refused_in_one_line(content: bytes, tmp_path: Path) -
 
 
 @VERSIONS
-def test_a_changed_fmu_is_not_run(version: int, tmp_path: Path) -> None:
+def test_an_fmu_changed_after_loading_is_not_run(version: int, tmp_path: Path) -> None:
     path = build(tmp_path, version)
     loaded = settings(path)
     path.write_bytes(path.read_bytes() + b"\0")
@@ -243,7 +243,7 @@ def test_without_fmpy_one_line_says_what_to_install(
         FmuSystem(loaded, X0)
 
 
-def test_what_is_unpacked_goes_with_the_system_or_its_process(
+def test_unpacked_files_are_removed_with_the_system_or_its_process(
     tmp_path: Path, own_folder_for_temporary_files: Path
 ) -> None:
     system = FmuSystem(settings(build(tmp_path, 2)), X0)
@@ -265,7 +265,7 @@ def test_what_is_unpacked_goes_with_the_system_or_its_process(
     assert not list(own_folder_for_temporary_files.iterdir())
 
 
-def test_the_next_removes_what_a_killed_process_left_and_nothing_else(
+def test_only_folders_left_by_killed_processes_are_removed(
     tmp_path: Path, own_folder_for_temporary_files: Path
 ) -> None:
     left, used, other = (

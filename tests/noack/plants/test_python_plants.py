@@ -1,4 +1,4 @@
-"""Classes of the user's own as plants."""
+"""User classes as plants."""
 
 import math
 import sys
@@ -61,7 +61,7 @@ def made(folder: Path, code: str, name: str, **more: Any) -> PythonSystem:
     return PythonSystem(settings(folder, code, name, **more), X0, 1)
 
 
-def test_a_derivative_is_integrated(tmp_path: Path) -> None:
+def test_a_user_derivative_is_integrated(tmp_path: Path) -> None:
     """A pendulum keeps its energy."""
     system = made(tmp_path, PENDULUM, "Pendulum", parameters={"g": 4.0})
     for step in range(1000):
@@ -72,7 +72,7 @@ def test_a_derivative_is_integrated(tmp_path: Path) -> None:
     assert abs(angle - 0.3) > 0.01
 
 
-def test_a_state_of_its_own_is_mapped_and_recorded(tmp_path: Path) -> None:
+def test_a_plants_internal_state_is_mapped_and_recorded(tmp_path: Path) -> None:
     code = """
         import numpy as np
 
@@ -100,7 +100,7 @@ def test_a_state_of_its_own_is_mapped_and_recorded(tmp_path: Path) -> None:
     assert system.z[2] == pytest.approx(1.0)
 
 
-def test_a_class_may_step_by_itself_and_spoils_nobodys_numbers(tmp_path: Path) -> None:
+def test_a_class_may_define_its_own_step_and_cannot_change_the_loops_arrays(tmp_path: Path) -> None:
     system = made(tmp_path, STEPPING, "Stepping", on_record=("t", "dt", "u"))
     u = np.array([2.0])
     system.advance(u, 5 * H_NS, H_NS)
@@ -113,7 +113,7 @@ def test_a_class_may_step_by_itself_and_spoils_nobodys_numbers(tmp_path: Path) -
     assert system.x[1] == pytest.approx(8e-3)
 
 
-def test_a_shipped_system_is_a_plant_by_entry_point_and_by_module(
+def test_a_plant_is_found_by_entry_point_and_by_module(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "installed_plants.py").write_text(dedent(PENDULUM))
@@ -161,7 +161,9 @@ def test_a_shipped_system_is_a_plant_by_entry_point_and_by_module(
          "AttributeError: 'P' object has no attribute 'x'"),
     ],
 )  # fmt: skip
-def test_what_is_no_plant_is_refused_in_one_line(code: str, expected: str, tmp_path: Path) -> None:
+def test_an_object_that_is_not_a_plant_is_refused_in_one_line(
+    code: str, expected: str, tmp_path: Path
+) -> None:
     with np.errstate(all="raise"), pytest.raises(CallerError) as refused:
         made(tmp_path, code, "P")
     assert expected in str(refused.value)
@@ -170,7 +172,7 @@ def test_what_is_no_plant_is_refused_in_one_line(code: str, expected: str, tmp_p
 
 
 @pytest.mark.parametrize("kind", ["derivative", "advance"])
-def test_what_it_raises_later_is_a_failure_that_names_class_and_place(
+def test_an_exception_in_a_step_is_a_failure_that_names_class_and_line(
     kind: str, tmp_path: Path
 ) -> None:
     code = """
@@ -211,7 +213,7 @@ def test_a_shape_that_changes_later_is_a_failure(tmp_path: Path) -> None:
         system.advance(np.zeros(1), 0, H_NS)
 
 
-def test_a_changed_file_is_not_executed(tmp_path: Path) -> None:
+def test_a_file_changed_after_loading_is_not_executed(tmp_path: Path) -> None:
     loaded = settings(tmp_path, PENDULUM, "Pendulum")
     (tmp_path / "mine.py").write_text("raise SystemExit('executed')")
     with pytest.raises(CallerError, match="has changed: its SHA-256 is"):
@@ -228,7 +230,7 @@ def test_a_changed_file_is_not_executed(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_equations_that_cannot_be_followed_have_not_diverged(
+def test_a_failed_integration_is_not_reported_as_divergence(
     slope: str, expected: str, tmp_path: Path
 ) -> None:
     code = f"""
@@ -264,7 +266,7 @@ def test_a_state_that_escapes_has_diverged(tmp_path: Path) -> None:
         ("sys.exit(3)", "SystemExit: 3"),
     ],
 )
-def test_what_is_no_derivative_is_refused(returned: str, expected: str, tmp_path: Path) -> None:
+def test_an_invalid_derivative_is_refused(returned: str, expected: str, tmp_path: Path) -> None:
     code = f"""
         import sys
 
@@ -278,7 +280,7 @@ def test_what_is_no_derivative_is_refused(returned: str, expected: str, tmp_path
     assert expected in str(failed.value)
 
 
-def test_a_derivative_cannot_write_into_what_it_is_given(tmp_path: Path) -> None:
+def test_a_derivative_cannot_modify_its_arguments(tmp_path: Path) -> None:
     code = """
         class P:
             def derivative(self, t_s, z, u):

@@ -1,4 +1,4 @@
-"""Vehicles: CommonRoad's equations, and what they are to the loop."""
+"""Vehicles: CommonRoad's equations, and their states, inputs and outputs in the loop."""
 
 import math
 from importlib import import_module
@@ -40,7 +40,7 @@ def steered(system: OdeSystem, angles: list[float]) -> np.ndarray:
 
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("model", ["single_track", "drift", "multi_body"])
-def test_a_vehicle_starts_where_x_says(model: str, car: str) -> None:
+def test_a_vehicle_starts_in_the_state_x(model: str, car: str) -> None:
     system = OdeSystem(settings(model=model, parameters=car).equations(), X0)
     np.testing.assert_allclose(system.x, X0, rtol=1e-12)
     assert len(system.z) == len(settings(model=model).internal_names)
@@ -53,8 +53,8 @@ def test_the_lateral_velocity_of_a_kinematic_vehicle_follows_from_its_yaw_rate()
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_the_lane_goes_by_as_the_lane_models_have_it(model: str) -> None:
-    """Ẏ_g = V − v ψ and ψ̇ = r, of small angles."""
+def test_the_lane_position_agrees_with_the_lane_model(model: str) -> None:
+    """Ẏ_g = V − v ψ and ψ̇ = r, for small angles."""
     system = OdeSystem(
         settings(model=model, speed_m_per_s=15.0).equations(), np.array([0.0, 0.0, 0.01, 0.0])
     )
@@ -69,8 +69,8 @@ def test_the_lane_goes_by_as_the_lane_models_have_it(model: str) -> None:
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_a_single_track_is_near_straight_running_what_the_textbook_says(car: str) -> None:
-    """Riekert and Schunck's matrices, from the library's masses, axles and tyres."""
+def test_the_linearised_single_track_model_is_the_textbooks(car: str) -> None:
+    """Riekert and Schunck's matrices, computed from the library's masses, axles and tyres."""
     p, v = parameters(car), 18.0
     per_weight = -p.tire.p_ky1 * p.m * 9.81 / (p.a + p.b)
     model = single_track_lane(
@@ -83,10 +83,10 @@ def test_a_single_track_is_near_straight_running_what_the_textbook_says(car: str
         lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
     )
     np.testing.assert_allclose(A, model.A, atol=2e-3)
-    np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not quite settled
+    np.testing.assert_allclose(B, model.B, rtol=1e-3, atol=2e-3)  # the servo has not fully settled
 
 
-def test_the_named_model_is_the_bmws() -> None:
+def test_the_named_model_is_that_of_the_bmw() -> None:
     chosen = settings()
     A, B = linearise(
         lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
@@ -97,8 +97,8 @@ def test_the_named_model_is_the_bmws() -> None:
 
 
 @pytest.mark.parametrize("model", ["kinematic", "multi_body"])
-def test_of_a_vehicle_whose_x_is_no_state_there_is_no_linearisation(model: str) -> None:
-    """A kinematic one has fewer states, a multi-body rolls as fast as it turns."""
+def test_a_vehicle_has_no_linearisation_if_x_is_not_its_state(model: str) -> None:
+    """A kinematic vehicle has fewer states; a multi-body vehicle rolls as fast as it turns."""
     chosen = settings(model=model)
     A, B = linearise(
         lambda x0: OdeSystem(chosen.equations(), x0), 4, 1, settling_s=chosen.settling_s
@@ -111,10 +111,10 @@ def test_of_a_vehicle_whose_x_is_no_state_there_is_no_linearisation(model: str) 
     ("kinematic", "ks", 1e-7), ("single_track", "st", 1e-7), ("drift", "std", 1e-5),
     ("multi_body", "mb", 1e-4),
 ])  # fmt: skip
-def test_it_moves_as_another_solver_moves_the_librarys_equations(
+def test_the_motion_agrees_with_another_solver_of_the_librarys_equations(
     model: str, library: str, atol: float
 ) -> None:
-    """An implicit one of stiff equations, over a lane change and with the servo written out."""
+    """An implicit solver for stiff equations, over a lane change, with the servo written out."""
     chosen, p = settings(model=model, friction=1.0), parameters("bmw_320i")
     system = OdeSystem(chosen.equations(), X0)
     name = f"vehicle_dynamics_{library}"
@@ -132,7 +132,7 @@ def test_it_moves_as_another_solver_moves_the_librarys_equations(
     np.testing.assert_allclose(system.z, z, atol=atol * max(1.0, np.abs(z).max()))
 
 
-def test_the_wheels_turn_as_fast_and_as_far_as_the_vehicle_lets_them() -> None:
+def test_steering_is_limited_to_the_vehicles_rate_and_angle() -> None:
     limits = parameters("bmw_320i").steering
     system = OdeSystem(settings(speed_m_per_s=2.0, steering_s=0.01).equations(), np.zeros(4))
     steered(system, [2.0] * 500)
@@ -141,7 +141,7 @@ def test_the_wheels_turn_as_fast_and_as_far_as_the_vehicle_lets_them() -> None:
     assert system.z[2] == pytest.approx(limits.max, rel=1e-6)
 
 
-def test_on_ice_a_car_that_is_steered_hard_turns_less() -> None:
+def test_a_car_turns_less_on_ice() -> None:
     yaw = [
         steered(
             OdeSystem(settings(model="drift", friction=friction).equations(), np.zeros(4)),
@@ -152,13 +152,13 @@ def test_on_ice_a_car_that_is_steered_hard_turns_less() -> None:
     assert 0 < yaw[1] < 0.5 * yaw[0]
 
 
-def test_a_truck_has_a_trailer() -> None:
+def test_a_truck_is_simulated_with_its_trailer() -> None:
     truck = settings(model="kinematic", parameters="truck", speed_m_per_s=10.0)
     system = OdeSystem(truck.equations(), np.zeros(4))
     steered(system, [0.05] * 1000)
     assert truck.internal_names[-1] == "hitch_angle"
     assert math.isfinite(system.z[-1])
-    assert system.z[-1] < -0.01  # it follows on the inside
+    assert system.z[-1] < -0.01  # the trailer follows on the inside of the curve
 
 
 def test_the_same_steps_give_the_same_bits() -> None:
@@ -169,7 +169,7 @@ def test_the_same_steps_give_the_same_bits() -> None:
     assert runs[0].tobytes() == runs[1].tobytes()
 
 
-def test_a_vehicle_is_not_asked_to_go_faster_than_it_can() -> None:
+def test_a_speed_above_the_vehicles_maximum_is_refused() -> None:
     with pytest.raises(CallerError, match=r"maximum speed of a truck is 22\.22 m/s"):
         OdeSystem(
             settings(model="kinematic", parameters="truck", speed_m_per_s=30.0).equations(),

@@ -1,4 +1,4 @@
-"""The library's equations, compiled or not, are the library's equations."""
+"""The equations, compiled or not, give the library's values."""
 
 from typing import Any
 
@@ -19,12 +19,13 @@ def parameters(car: int) -> Any:
 
 
 def states(model: str, p: Any) -> np.ndarray:
-    """States on the road and off it: as one starts, slow, spinning, sliding, tilted."""
+    """States of normal and extreme driving: at the start, slow, spinning, sliding, tilted."""
     random = np.random.default_rng(7)
     core = [0.0, 1.0, 0.02, 15.0, 0.1, 0.2, 0.01]
     start = library(f"init_{model}")(core, p) if model in ("std", "mb") else core[: WIDTHS[model]]
     tried = np.array(start) + random.normal(size=(40, WIDTHS[model])) * 0.05
-    tried[:10, 3] = random.uniform(-0.2, 0.2, 10)  # slower than 0.1 m/s it is a kinematic model
+    # below 0.1 m/s the library uses a kinematic model
+    tried[:10, 3] = random.uniform(-0.2, 0.2, 10)
     if model == "mb":
         tried[5:20, 23:27] *= -1.0  # wheels do not spin backwards
     found: np.ndarray = tried
@@ -33,7 +34,7 @@ def states(model: str, p: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("model", WIDTHS)
-def test_they_say_what_the_library_says(model: str, car: int) -> None:
+def test_the_equations_give_the_librarys_values(model: str, car: int) -> None:
     p = parameters(car)
     rates, dynamics = equations(model, p), library(f"vehicle_dynamics_{model}")
     said = 0
@@ -42,7 +43,7 @@ def test_they_say_what_the_library_says(model: str, car: int) -> None:
             before = z.copy()
             try:
                 expected = dynamics(z.tolist(), list(inputs), p)
-            except ZeroDivisionError:  # of a wheel that stands still
+            except ZeroDivisionError:  # for a wheel at standstill
                 with pytest.raises(ZeroDivisionError):
                     rates(z, *inputs)
             else:
@@ -53,12 +54,12 @@ def test_they_say_what_the_library_says(model: str, car: int) -> None:
 
 
 @pytest.mark.parametrize(("model", "is_compiled"), [("st", False), ("std", True), ("mb", True)])
-def test_those_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
+def test_equations_with_tyres_are_compiled(model: str, is_compiled: bool) -> None:
     assert (compiled.compiled_dynamics(model) is not None) == is_compiled
     assert compiled.is_compiled(model)
 
 
-def test_they_take_the_parameters_that_they_are_given() -> None:
+def test_the_given_parameters_are_used() -> None:
     slippery, grippy = parameters(2), parameters(2)
     slippery.tire.p_dy1 *= 0.1
     z = states("std", grippy)[-1]
@@ -70,7 +71,7 @@ def test_they_take_the_parameters_that_they_are_given() -> None:
     )
 
 
-def test_what_cannot_be_compiled_is_run_as_it_is(
+def test_equations_that_cannot_be_compiled_are_run_in_python(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def dynamics(z: Any, inputs: Any, p: Any) -> Any:
@@ -86,7 +87,7 @@ def test_what_cannot_be_compiled_is_run_as_it_is(
     assert told[-1].startswith("noack: warning: the vehicle's equations stay slow")
 
 
-def test_they_are_compiled_before_a_run_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_equations_are_compiled_once_before_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[str] = []
     monkeypatch.setattr(compiled, "compiled_dynamics", made.append)
     monkeypatch.setattr(compiled, "is_compiled", lambda model: model == "st")

@@ -9,19 +9,19 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 
 
-def test_every_table_has_an_owner_in_the_loop() -> None:
+def test_every_table_is_written_by_one_process_of_the_loop() -> None:
     assert set(tables(1, 1, acknowledged=True)) == set(OWNER)
     assert set(tables(1, 1)) == set(OWNER) - {SENSOR_ACKNOWLEDGEMENT}
     assert set(OWNER.values()) == set(LOOP_ROLES)
 
 
 def test_the_recorded_head_of_a_datagram_is_its_whole_header() -> None:
-    """So that the record tells which update was dropped, though the network reads no payload."""
+    """The record shows which update was dropped, although the network does not read payloads."""
     assert wire_format.HEADER_BYTES == PACKET_HEAD_BYTES
     assert tables(1, 1)[NETEM_PACKET]["head"].itemsize == PACKET_HEAD_BYTES
 
 
-def test_rows_have_as_many_entries_as_the_loop() -> None:
+def test_rows_have_the_vector_lengths_of_the_loop() -> None:
     for n, m in ((1, 1), (4, 2), (64, 3)):
         for table, dtype in tables(n, m, acknowledged=True, predictive=True).items():
             for column in dtype.names or ():
@@ -30,7 +30,7 @@ def test_rows_have_as_many_entries_as_the_loop() -> None:
                 assert shape == expected, (table, column)
 
 
-def test_every_row_tells_its_input_and_its_times() -> None:
+def test_every_row_has_its_input_number_and_times() -> None:
     for dtype in tables(2, 1, acknowledged=True).values():
         assert dtype.names is not None
         assert dtype.names[:4] == ("input", "sequence", "t_ns", "now_ns")

@@ -1,4 +1,4 @@
-"""Every datagram here is built by :func:`datagram`, from ``docs/wire.md`` and not from the code."""
+""":func:`datagram` builds every datagram here from ``docs/wire.md``, independently of the code."""
 
 import hashlib
 import itertools
@@ -49,7 +49,7 @@ def datagram(
     t_ns: int = 0,
     key: bytes = KEY,
 ) -> bytes:
-    """A datagram by the table of ``docs/wire.md``, with a right tag under ``key``."""
+    """A datagram by the table of ``docs/wire.md``, with a valid tag under ``key``."""
     content = b"".join(
         [
             magic,
@@ -73,7 +73,9 @@ def new_decoder(flow: int = 2, dimension: int = 3, run_id: int = RUN) -> Decoder
 def assert_rejected(
     decoder: Decoder, data: bytes, reason: Rejection, *, from_peer: bool = True
 ) -> None:
-    """The datagram is rejected for that reason, is counted once, and leaves no other trace."""
+    """The datagram is rejected for that reason and counted once; the decoder is otherwise
+    unchanged.
+    """
     accepted, rejected = decoder.accepted, dict(decoder.rejected)
     assert decoder.decode(data, from_peer=from_peer) is None
     counted = {key: n - rejected[key] for key, n in decoder.rejected.items() if n != rejected[key]}
@@ -157,7 +159,7 @@ def test_encoded_messages_decode_unchanged(
 
 
 def reason_by_offset(offset: int) -> Rejection:
-    """Which test a changed byte fails first, by the table of the layout."""
+    """The first test that a changed byte fails, by the table of the layout."""
     if offset < 3:
         return Rejection.VERSION  # magic and version
     if offset == 3:
@@ -173,7 +175,7 @@ def reason_by_offset(offset: int) -> Rejection:
 def test_any_flipped_bit_is_rejected(values: list[float], sequence: int, t_ns: int) -> None:
     decoder = new_decoder(dimension=len(values))
     data = datagram(values, sequence=sequence, t_ns=t_ns)
-    stride = 1 if len(values) <= 3 else 7  # of the longer ones every seventh bit
+    stride = 1 if len(values) <= 3 else 7  # every seventh bit of the longer ones
     for bit in range(0, 8 * len(data), stride):
         damaged = bytearray(data)
         damaged[bit // 8] ^= 1 << bit % 8
@@ -198,7 +200,7 @@ def test_a_vector_of_another_dimension_is_rejected(
     decoder = new_decoder(dimension=len(expected))
     if len(sent) != len(expected):
         assert_rejected(decoder, datagram(sent), Rejection.LENGTH)
-        # Of the right size, but with a header that says otherwise.
+        # The size is right; the header states another dimension.
         assert_rejected(decoder, datagram(expected, dimension=len(sent)), Rejection.LENGTH)
     assert decoder.decode(datagram(expected)) is not None
 
@@ -222,7 +224,7 @@ def test_other_keys_runs_flows_and_versions_are_rejected(
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=40))
 def test_only_newer_datagrams_are_accepted(arrivals: list[int]) -> None:
     decoder, newest = new_decoder(), -1
-    for sequence in arrivals:  # in any order, some twice
+    for sequence in arrivals:  # in any order, some repeated
         data = datagram([float(sequence), 0.0, 0.0], sequence=sequence)
         if sequence > newest:
             message = decoder.decode(data)
@@ -242,13 +244,14 @@ def test_infinities_and_nans_are_rejected(
     damaged = list(values)
     damaged[data.draw(st.integers(0, len(values) - 1))] = bad
     assert_rejected(decoder, datagram(damaged, sequence=5), Rejection.NOT_FINITE)
-    assert decoder.decode(datagram(values, sequence=5)) is not None  # its number is not used up
+    # its sequence number is still usable
+    assert decoder.decode(datagram(values, sequence=5)) is not None
 
 
 @pytest.mark.parametrize(
     ("number", "accepted"), [(2**40, True), (2**63 - 1, True), (2**63, False), (2**64 - 1, False)]
 )
-def test_no_sequence_number_is_accepted_that_no_record_could_hold(
+def test_a_sequence_number_beyond_the_records_range_is_rejected(
     number: int, accepted: bool
 ) -> None:
     decoder = new_decoder()
@@ -259,7 +262,7 @@ def test_no_sequence_number_is_accepted_that_no_record_could_hold(
     message = decoder.decode(data)
     assert message is not None
     assert np.int64(message.sequence) == number
-    # It does not wrap: what comes after the last of all is old.
+    # The number does not wrap: everything after the last number is old.
     assert_rejected(decoder, datagram([0.0, 0.0, 0.0], sequence=0), Rejection.STALE)
 
 
@@ -267,7 +270,7 @@ def test_no_sequence_number_is_accepted_that_no_record_could_hold(
     ("t_ns", "accepted"),
     [(0, True), (10**16, True), (2**62 - 1, True), (2**62, False), (-1, False), (-(2**63), False)],
 )
-def test_no_time_is_accepted_that_no_run_has(t_ns: int, accepted: bool) -> None:
+def test_a_time_outside_the_range_of_runs_is_rejected(t_ns: int, accepted: bool) -> None:
     decoder = new_decoder()
     data = datagram([0.0, 0.0, 0.0], t_ns=t_ns)
     if accepted:
@@ -290,7 +293,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize("first", range(len(FAULTS)))
-def test_of_several_faults_the_first_in_order_is_counted(first: int) -> None:
+def test_only_the_first_of_several_faults_is_counted(first: int) -> None:
     decoder = new_decoder()
     assert decoder.decode(datagram([0.0, 0.0, 0.0], sequence=8)) is not None
     reason, fault = FAULTS[first]
@@ -310,7 +313,7 @@ def test_random_bytes_never_raise_and_are_never_accepted(data: st.DataObject) ->
         st.binary(max_size=700)
         | st.binary(min_size=72, max_size=72)  # of the right size
         | st.binary(max_size=700).map(lambda tail: b"NA\1\2\3\0\0\0" + tail)
-        # A right header, anything behind it.
+        # A valid header, then random bytes.
         | st.binary(min_size=40, max_size=40).map(lambda tail: datagram([0.0] * 3)[:32] + tail)
     )
     assert decoder.decode(junk) is None
@@ -322,7 +325,7 @@ def test_random_bytes_never_raise_and_are_never_accepted(data: st.DataObject) ->
 
 @given(st.binary(max_size=40))
 def test_a_header_is_read_from_whatever_begins_like_one(head: bytes) -> None:
-    """The network emulator keeps 32 bytes of each datagram, of any program."""
+    """The network emulator records the first 32 bytes of each datagram, of any program."""
     header = read_header(b"NA" + head)
     assert (header is None) == (len(head) < 30)
     if not head.startswith(b"NA"):
@@ -354,13 +357,13 @@ def test_a_key_has_32_bytes(size: int) -> None:
         Decoder(Flow.UPDATE, 3, RUN, bytes(size))
 
 
-def test_the_reserved_bytes_are_covered_by_the_tag_but_mean_nothing() -> None:
+def test_the_reserved_bytes_are_covered_by_the_tag_and_otherwise_ignored() -> None:
     data = datagram([1.0, 2.0, 3.0], reserved=0xFFFF)
     assert_rejected(new_decoder(), data[:6] + b"\0\0" + data[8:], Rejection.TAG)
     assert new_decoder().decode(data) is not None
 
 
-def test_a_decoded_vector_is_the_receivers_own() -> None:
+def test_a_decoded_vector_does_not_share_memory_with_the_datagram() -> None:
     data = datagram([1.0, 2.0, 3.0])
     message = new_decoder().decode(data)
     assert message is not None

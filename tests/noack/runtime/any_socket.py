@@ -1,4 +1,4 @@
-"""A process's socket in the loop, and whoever sends to it."""
+"""A process's socket in the loop, and its senders."""
 
 import select
 import socket
@@ -20,7 +20,7 @@ def opened() -> socket.socket:
 
 
 class Ear:
-    """A sensor's socket, which hears measurements of two entries from ``peer``."""
+    """A sensor's socket, which receives measurements of two entries from ``peer``."""
 
     def __init__(self, peer: socket.socket, endpoint: socket.socket | None = None) -> None:
         self._endpoint = bind(0, "port") if endpoint is None else endpoint
@@ -38,7 +38,7 @@ class Ear:
         return Message(Flow.MEASUREMENT, sequence, sequence, np.array([1.0, 2.0]))
 
     def turns(self, most: int) -> list[int]:
-        """Do as the loop does, at most so often; return the sequence numbers of what was heard."""
+        """Call the socket as the loop does, at most ``most`` times; return the sequence numbers."""
         heard = []
         for _ in range(most):
             readable, _, _ = select.select(self.channel.watched, (), (), 0)

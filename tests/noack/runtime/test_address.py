@@ -1,4 +1,4 @@
-"""Addresses as people write them."""
+"""Addresses in text form."""
 
 import socket
 
@@ -30,7 +30,7 @@ def test_addresses_survive_formatting_and_parsing(host: object, port: int) -> No
         ("192.0.2.1:9000", ("::1", 1), ("192.0.2.1", 9000)),
     ],
 )
-def test_a_missing_host_is_the_loopback_of_the_same_family(
+def test_a_missing_host_means_loopback_of_the_same_family(
     text: str, like: Address | None, address: Address
 ) -> None:
     assert parse_address(text, "here", like) == address

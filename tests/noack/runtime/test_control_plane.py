@@ -1,4 +1,4 @@
-"""The control plane's door: who has the run's key comes in, over loopback, and nobody else."""
+"""Access to the control plane: only over loopback, and only with the run's key."""
 
 import hashlib
 import json
@@ -51,7 +51,7 @@ def coordinator(ticket: Ticket) -> Iterator[Coordinator]:
 
 
 def shown_by(stranger: str, ticket: Ticket) -> dict[str, str]:
-    """What a stranger shows at the door."""
+    """The credentials that a connection without the key presents."""
     own = secret_of(ticket)
     secrets = {
         "wrong password": SessionSecret(own.user, "0" * len(own.password)),
@@ -77,7 +77,7 @@ def test_a_connection_without_the_secret_is_refused(
 def test_a_refused_session_neither_sends_nor_receives(
     coordinator: Coordinator, ticket: Ticket
 ) -> None:
-    """Sessions that stay open and try again and again, as zenoh's do by default."""
+    """The refused sessions stay open and reconnect repeatedly, as zenoh's do by default."""
     strangers = []
     for stranger in STRANGERS:
         more = {"connect/exit_on_failure": False, "connect/timeout_ms": 0, "mode": "peer"}
@@ -111,7 +111,7 @@ def test_a_refused_session_neither_sends_nor_receives(
                 key = plant.key(what, "plant")
                 asked.append(session.get(key, FifoChannel(4), payload=HELLO, timeout=0.3))
         plant.publish_telemetry_blocking("plant_step", b"{}", b"own")
-        # What comes after it on the same way: when that has arrived, so has all that was before.
+        # A later message on the same path: once it has arrived, all earlier ones have arrived, too.
         wait_for(lambda: (sample := batches.try_recv()) is not None and _is_own(sample))
         coordinator.poll()
         assert batches.try_recv() is None
@@ -121,7 +121,7 @@ def test_a_refused_session_neither_sends_nor_receives(
         assert coordinator.progress() is None
         assert plant.stop_requested() is None
         assert plant.persisted() is None
-        for channel in (*received, *lives):  # each hears itself, and nobody else
+        for channel in (*received, *lives):  # each receives its own messages only
             while (sample := channel.try_recv()) is not None:
                 assert sample.payload.to_bytes() in (b"", b"evil")
                 assert sample.payload.to_bytes() or "alive/sensor" in str(sample.key_expr)
@@ -137,7 +137,7 @@ def _is_own(sample: zenoh.Sample) -> bool:
 
 
 def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) -> None:
-    """Whoever has taken a dead coordinator's port, without knowing the key."""
+    """Another process has taken a dead coordinator's port and does not have the key."""
     secret = secret_of(ticket)._asdict()
     shown = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
     more = {"connect/timeout_ms": 200, **shown}
@@ -149,7 +149,7 @@ def test_a_process_refuses_an_endpoint_without_authentication(ticket: Ticket) ->
         zenoh.open(config)
 
 
-def test_the_secret_is_the_documented_one(ticket: Ticket) -> None:
+def test_the_secret_is_derived_as_documented(ticket: Ticket) -> None:
     known = ticket._replace(run_id=0x0123456789ABCDEF, key=bytes(range(32)))
     password = hashlib.blake2b(
         b"the control plane's password", key=bytes(range(32)), digest_size=32
@@ -157,7 +157,7 @@ def test_the_secret_is_the_documented_one(ticket: Ticket) -> None:
     assert secret_of(known) == ("0123456789abcdef", password)
 
 
-def test_the_secret_follows_from_the_key_and_does_not_tell_it(ticket: Ticket) -> None:
+def test_the_secret_is_derived_from_the_key_and_does_not_reveal_it(ticket: Ticket) -> None:
     secret = secret_of(ticket)
     assert secret == secret_of(ticket)
     assert ticket.key.hex() not in secret.password
@@ -173,14 +173,14 @@ def test_the_coordinator_listens_on_loopback_only(coordinator: Coordinator, tick
     assert not any(c.laddr.port in (7446, 7447) for c in own)  # zenoh's scouting, its default port
 
 
-def test_no_zenoh_is_opened_but_with_a_secret() -> None:
+def test_every_zenoh_session_needs_a_secret() -> None:
     root = Path(noack.__file__).parents[1]
     rooms = ("noack", "netem", "cosim", "plant_server", "sensor_node", "controller_node")
     files = [file for room in rooms for file in (root / room).rglob("*.py")]
     assert [file.name for file in files if "zenoh.open" in file.read_text()] == ["zenoh_session.py"]
 
 
-def test_the_password_is_on_no_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
+def test_the_password_is_not_stored_on_disk_and_no_pipe_stays_open(ticket: Ticket) -> None:
     own = psutil.Process()
     before = [file.path for file in own.open_files()], pipes()
     with open_session(ticket.endpoint, secret_of(ticket), listen=True):
@@ -272,7 +272,9 @@ def test_a_request_is_sent_again_when_its_answer_was_lost(
 def test_a_launched_process_connects_again_until_it_is_admitted(
     ticket: Ticket, monkeypatch: pytest.MonkeyPatch, launched: bool
 ) -> None:
-    """A connection over which nothing is answered stays so; a person is told of it instead."""
+    """A connection without answers does not recover; a process started by a person reports it
+    instead.
+    """
     tries: list[FakePlane] = []
 
     class Silent(FakePlane):
@@ -300,13 +302,13 @@ def test_a_launched_process_connects_again_until_it_is_admitted(
 
 
 def meet(plane: ControlPlane) -> None:
-    """Wait until a process knows that there is a coordinator."""
+    """Wait until a process has found the coordinator."""
     everyone = plane.key("alive", COORDINATOR, "*")
     wait_for(lambda: any(one.ok for one in plane.session.liveliness().get(everyone)))
 
 
 def test_a_short_loss_of_the_coordinator_is_tolerated(ticket: Ticket) -> None:
-    """As when the machine did not run one end of a connection for a lease."""
+    """The machine did not run one end of the connection for longer than a lease."""
     first = Coordinator(ticket)
     with ControlPlane(ticket, "plant") as plant:
         meet(plant)
@@ -340,7 +342,7 @@ def test_an_admission_request_waits_for_a_coordinator_to_come_back(ticket: Ticke
 def test_a_missing_answer_does_not_name_the_process_twice(
     ticket: Ticket, coordinator: Coordinator
 ) -> None:
-    """So that nobody reads ``noack sensor: sensor: no answer``."""
+    """The message must not read ``noack sensor: sensor: no answer``."""
     with (
         ControlPlane(ticket, "sensor") as plane,
         pytest.raises(PeerError, match=r"^no answer to 'nothing'"),

@@ -1,4 +1,4 @@
-"""Ctrl-C while a program is being imported ends it with status 130, and nothing is printed."""
+"""Ctrl-C during the imports ends a program with status 130 and without output."""
 
 import subprocess
 import sys

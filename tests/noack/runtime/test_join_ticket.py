@@ -1,4 +1,4 @@
-"""Tickets: what is one, that what is none keeps the key to itself, and one a session."""
+"""Tickets: their format, errors that do not reveal the key, and one ticket per session."""
 
 import json
 from concurrent.futures import ThreadPoolExecutor
@@ -52,20 +52,20 @@ def test_an_invalid_ticket_gives_one_line_without_the_key(
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", f'{{"key": "{KEY}"', "[" * 100_000])
-def test_neither_is_other_text(text: str) -> None:
+def test_text_that_is_not_a_ticket_gives_an_error_without_the_key(text: str) -> None:
     with pytest.raises(CallerError) as caught:
         loads(text)
     assert KEY[:8] not in str(caught.value)
 
 
 @pytest.mark.parametrize("left_behind", [False, True])
-def test_of_many_concurrent_runs_of_a_session_one_succeeds(
+def test_exactly_one_of_many_concurrent_runs_opens_a_session(
     fields: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left_behind: bool
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     ticket, at_once = loads(json.dumps(fields)), 8
     together = Barrier(at_once)
-    if left_behind:  # by one that was killed
+    if left_behind:  # left by a process that was killed
         with published(ticket, "lab") as path:
             text = path.read_text()
         path.write_text(text)

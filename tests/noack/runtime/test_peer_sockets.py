@@ -1,4 +1,4 @@
-"""Strangers' datagrams: kept apart by the kernel, looked at within bounds, counted."""
+"""Datagrams from unknown sources: separated by the kernel, read within bounds, counted."""
 
 import socket
 import sys
@@ -18,7 +18,7 @@ BEGUN, OVER = "flood:", "the flood is over:"
 
 
 def looked_at(watch: FloodWatch, came: int) -> int:
-    """Let as many come as ``came``; return how many nobody looked at."""
+    """Pass ``came`` datagrams; return how many were not read."""
     looked = min(came, watch.left)
     watch.left -= looked
     return came - looked
@@ -34,7 +34,7 @@ def test_a_few_datagrams_from_unknown_sources_are_no_flood() -> None:
 
 def test_a_flood_is_logged_once_and_its_end_with_the_drops() -> None:
     watch, dropped, lines = FloodWatch(), 7, []
-    assert watch.next_interval(dropped) is not None  # what was dropped before counts as the first
+    assert watch.next_interval(dropped) is not None  # the drops before the flood count as the first
     watch = FloodWatch()
     for _ in range(100):
         dropped_now = looked_at(watch, 5000)
@@ -49,7 +49,7 @@ def test_a_flood_is_logged_once_and_its_end_with_the_drops() -> None:
     while (line := watch.next_interval(dropped)) is None:
         calm += 1
     assert line == f"{OVER} the kernel dropped {dropped} datagrams from unknown sources"
-    assert 10 <= calm <= 40  # between half a second and two
+    assert 10 <= calm <= 40  # between half a second and two seconds
     assert watch.left == IN_AN_INTERVAL
 
 
@@ -74,8 +74,8 @@ def test_moderate_traffic_does_not_prolong_a_flood() -> None:
     assert looked_at(watch, IN_AN_INTERVAL // 2) == 0
 
 
-def test_floods_without_end_do_not_make_lines_without_end() -> None:
-    """One that pauses just long enough to be over, for a day."""
+def test_repeated_floods_log_a_bounded_number_of_lines() -> None:
+    """A flood that pauses just long enough to end, repeated for a day."""
     watch, dropped, lines = FloodWatch(), 0, 0
     for _ in range(24 * 3600 * 20):
         dropped += 0 if watch.is_flood else 1000
@@ -150,8 +150,8 @@ def test_a_peer_is_read_before_unknown_sources(stack: ExitStack) -> None:
 
 
 @needs_linux
-def test_work_between_two_looks_at_the_clock_is_bounded(stack: ExitStack) -> None:
-    """A forged address gets junk to where the peer's datagrams are; here the peer sends it."""
+def test_work_between_two_clock_readings_is_bounded(stack: ExitStack) -> None:
+    """Forged sources put junk into the peer's socket; here the peer itself sends the junk."""
     peer = stack.enter_context(opened())
     ear = stack.enter_context(closing(Ear(peer)))
     for _ in range(100):
@@ -161,7 +161,7 @@ def test_work_between_two_looks_at_the_clock_is_bounded(stack: ExitStack) -> Non
 
 
 def test_datagrams_before_the_peer_sockets_are_read_first(stack: ExitStack) -> None:
-    """Who takes another's place in a run is sent to before it can know by whom."""
+    """A restarted process receives datagrams before it has a socket per peer."""
     peer = stack.enter_context(opened())
     endpoint = stack.enter_context(bind(0, "port"))
     encoder, early = Encoder(RUN_ID, KEY), 2 * IN_AN_INTERVAL

@@ -1,4 +1,4 @@
-"""The real-time loop beside a socket that never falls silent."""
+"""The real-time loop with a socket that always has datagrams."""
 
 import os
 import time
@@ -15,7 +15,7 @@ STEPS = 200
 
 
 class Ticker:
-    """A machine that is due every millisecond."""
+    """A machine with a deadline every millisecond."""
 
     def __init__(self) -> None:
         self.served = 0
@@ -32,7 +32,7 @@ class Ticker:
 
 
 class Flooded:
-    """A channel on which there is always something, and never a message."""
+    """A channel that always has datagrams and never a valid message."""
 
     def __init__(self, readable: int, clock: RunClock, ticker: Ticker) -> None:
         self.watched = (readable,)
@@ -45,7 +45,7 @@ class Flooded:
     def receive(self, readable: int) -> None:
         assert readable == self.watched[0]
         self.looks += 1
-        # What was due at the look before has been served since.
+        # Counts a deadline that was due at the last read and has not been served since.
         self.passed_over += self._overdue is not None and self._overdue == self._ticker.served
         due_ns = self._ticker.next_deadline_ns()
         is_due = due_ns is not None and self._clock.now_ns() >= due_ns
@@ -59,7 +59,7 @@ class Flooded:
 
 
 class Log:
-    """Takes what the loop hands over."""
+    """Receives the loop's output."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -81,11 +81,11 @@ def always_readable() -> Iterator[int]:
     os.close(into)
 
 
-def test_deadlines_are_served_between_looks_at_junk(always_readable: int) -> None:
+def test_deadlines_are_served_while_junk_arrives(always_readable: int) -> None:
     clock, ticker, log = RunClock(time.monotonic_ns()), Ticker(), Log()
     channel = Flooded(always_readable, clock, ticker)
     run_loop(ticker, channel, clock, log, end_ns=STEPS * PERIOD_NS, stop=lambda: False)
-    assert ticker.served > 0  # and all of them, where nothing else keeps the machine busy
+    assert ticker.served > 0  # and all of them, if nothing else uses the processor
     assert channel.looks > 0
     assert channel.passed_over == 0
     assert set(log.lines) == {"tended"}

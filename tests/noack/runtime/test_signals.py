@@ -10,7 +10,7 @@ from noack.core.errors import ExitStatus
 from noack.runtime.signals import Signals
 
 
-def test_a_signal_is_noted_once_however_often_it_is_passed_on() -> None:
+def test_a_signal_forwarded_several_times_counts_once() -> None:
     with Signals().handled() as signals:
         for _ in range(3):
             os.kill(os.getpid(), signal.SIGINT)

@@ -27,7 +27,7 @@ def numbers(first: int, end: int) -> bytes:
     return np.arange(first, end, dtype="<i8").tobytes()
 
 
-def test_batches_come_back_as_they_were_written(tmp_path: Path) -> None:
+def test_batches_are_read_back_unchanged(tmp_path: Path) -> None:
     batches = [(0, b"abc"), (3, b""), (3, bytes(10_000)), (2**64 - 1, b"x")]
     spool(tmp_path / "spool", "recorder", "plant_step", *batches)
     assert list(read_chunks(tmp_path / "spool", "plant_step")) == batches
@@ -56,7 +56,7 @@ def test_an_incomplete_chunk_is_ignored(tmp_path: Path) -> None:
         assert list(read_chunks(tmp_path, "plant_step")) == batches[: int(size >= 16 + 5)]
 
 
-def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
+def test_tables_and_writers_are_stored_separately(tmp_path: Path) -> None:
     spool(tmp_path, "recorder", "step", (0, b"a"))
     spool(tmp_path, "recorder", "step_more", (0, b"b"))
     spool(tmp_path, "plant", "step", (1, b"c"))
@@ -70,7 +70,7 @@ def test_tables_and_writers_are_kept_apart(tmp_path: Path) -> None:
 def test_rows_spooled_twice_are_merged(
     tmp_path_factory: pytest.TempPathFactory, cuts_a: list[int], cuts_b: list[int]
 ) -> None:
-    """The recorder kept the first rows, the process all of them, cut into other batches."""
+    """The recorder stored the first rows, the process all rows, in batches of other sizes."""
     folder = tmp_path_factory.mktemp("spool")
     for writer, cuts, end in (("recorder", cuts_a, 13), ("plant", cuts_b, 20)):
         edges = sorted({0, end, *(cut for cut in cuts if cut < end)})
@@ -80,7 +80,7 @@ def test_rows_spooled_twice_are_merged(
     assert rows["input"].tolist() == list(range(20))
 
 
-def test_a_folder_that_cannot_be_written_is_the_machines_error(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_an_environment_error(tmp_path: Path) -> None:
     writer = SpoolWriter(tmp_path / "spool", "recorder")
     (tmp_path / "spool").rmdir()
     with pytest.raises(MachineError, match=r"spool: the record cannot be written: .*No such file"):
@@ -88,12 +88,12 @@ def test_a_folder_that_cannot_be_written_is_the_machines_error(tmp_path: Path) -
 
 
 def test_a_full_disk_is_reported_by_the_batch_that_does_not_fit(tmp_path: Path) -> None:
-    """Not by the next one: there may be none, and what follows would be read as rows."""
+    """The next batch may never come, and its rows would follow an incomplete chunk."""
     resource = pytest.importorskip("resource")
     writer = SpoolWriter(tmp_path, "recorder")
     writer.append("step", 0, bytes(100))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # as if the disk had 34 bytes left
+    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))  # the disk has room for 34 more bytes
     try:
         with pytest.raises(MachineError, match=r"the record cannot be written: File too large$"):
             writer.append("step", 100, bytes(100))
@@ -144,7 +144,7 @@ def test_files_that_are_deleted_meanwhile_are_noticed(tmp_path: Path, what: str)
         path.unlink()
         if what == "replaced":
             path.write_bytes(b"")
-    writer.append("step", 3, b"de")  # the system takes it: nobody will find it
+    writer.append("step", 3, b"de")  # the write succeeds, but the file has no name
     with pytest.raises(MachineError, match=r"/step\.recorder: was deleted or moved"):
         writer.require_present()
     writer.close()

@@ -17,7 +17,7 @@ BATCH = 256
 
 
 class Wire:
-    """Keeps what is published; forgets some of it when told to."""
+    """Stores the published messages; loses some when told to."""
 
     def __init__(self) -> None:
         self.batches: list[tuple[str, int, int, bytes]] = []
@@ -72,7 +72,7 @@ def test_batches_number_every_row_in_order(actions: list[bool | None]) -> None:
 
 
 def test_a_full_batch_publishes_all_tables() -> None:
-    """So that a reader that merges tables never waits for one of them."""
+    """A reader that merges tables never waits for one of them."""
     wire = Wire()
     buffer = TelemetryBuffer(TABLES, wire)
     buffer.append(Record("two", row(0)))
@@ -166,7 +166,7 @@ def test_lost_batches_are_sent_again_during_the_run() -> None:
         if number % 10 == 9:
             buffer.flush()
     sent = len(wire.batches)
-    confirmed.append({"one": [(0, 50)]})  # what is not there may be under way
+    confirmed.append({"one": [(0, 50)]})  # a missing batch may be in flight
     buffer.flush()
     assert len(wire.batches) == sent
     for number in range(300, 310):
@@ -208,7 +208,7 @@ def test_the_oldest_batch_is_dropped_at_the_memory_limit(
         buffer.append(Record("one", row(number)))
         if number % 10 == 9:
             buffer.flush()
-    assert len(wire.batches) == 4  # published all the same
+    assert len(wire.batches) == 4  # published anyway
     buffer.resend({"one": [(0, 40)]}, again)
     assert [first for _, first, _, _ in again.batches] == [20, 30]
 

@@ -1,4 +1,4 @@
-"""Random loops in exact continuous time, as the paper has them: not sampled, delayed or held."""
+"""Random loops in exact continuous time, as in the paper: no sampling, no delay, no held input."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -20,7 +20,7 @@ _MOST_EVENTS = 3000
 
 
 class Observed(NamedTuple):
-    """A run, looked at: at all events just before the reset, and densely in between."""
+    """A sampled run: at all events just before the reset, and densely in between."""
 
     run: ContinuousRun
     samples: Samples
@@ -40,7 +40,7 @@ def loop_of(system: System) -> LoopMatrices:
 
 
 def observe(system: System, horizon_s: float, seed: int, samples: int = 400) -> Iterator[Observed]:
-    """Runs with several patterns of losses: all that may be lost, none, every other, at random."""
+    """Runs with several loss patterns: the maximum, none, every other update, random."""
     loop = loop_of(system)
     trigger = DecayingTrigger(system.beta, system.alpha, weight=loop.weight)
     continuous = ContinuousLoop(loop, trigger)
@@ -58,7 +58,7 @@ def observe(system: System, horizon_s: float, seed: int, samples: int = 400) -> 
 
 
 def _looked_at(run: ContinuousRun, t_s: Vector) -> Samples:
-    """At the given times and, before the resets, at the events."""
+    """The signals at the given times and at the events, before their resets."""
     dense, before = run.at(t_s), run.before
     if not before:
         return dense

@@ -1,4 +1,4 @@
-"""Random lossy loops, simulated exactly and many at a time; independent of the project's machines.
+"""Random lossy loops, simulated exactly and many at a time; independent of the project's code.
 
 Every signal is propagated by matrix exponentials on a grid finer than every period of the loop.
 """
@@ -40,15 +40,15 @@ class System:
     sample_steps: int
     """Steps between two tests of the trigger."""
     delay_steps: int
-    """Most steps that an update is under way."""
+    """Maximum delay of an update in steps."""
     hold_steps: int
-    """Steps between two inputs; 0: the plant feels K x_c at all times."""
+    """Steps between two inputs; 0: the plant applies K x_c continuously."""
     lag_steps: int
-    """Steps by which an input is late."""
+    """Delay of an input in steps."""
 
     @property
     def conditions(self) -> NetworkConditions:
-        """What the certificate may presuppose of :func:`simulate`."""
+        """The conditions of :func:`simulate` that the certificate may assume."""
         steps = Steps(self)
         applied_input = steps.delay + (steps.hold - 1 + steps.lag if steps.hold else 0)
         sampling_s = self.sample_steps * self.step_s
@@ -79,7 +79,7 @@ class Worst(NamedTuple):
     inter_event_s: float
 
     def shares(self, certified: Constants, beta: float) -> dict[str, float]:
-        """Observed over certified; a bound that stands is at most 1."""
+        """Observed values over certified bounds; a valid bound gives at most 1."""
         assert certified.inter_event_s is not None
         return {
             "sensor error": self.sensor_error / (certified.overshoot * beta),
@@ -92,7 +92,7 @@ class Worst(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """The largest of all runs, (STEPS,) each, and the shortest time between two events."""
+    """The maximum over all runs, (STEPS,) each, and the shortest inter-event time."""
 
     sensor_error: Reals
     """‖e_s‖_W before a reset."""
@@ -108,17 +108,17 @@ class Trace(NamedTuple):
 
 
 def times_s(system: System) -> Reals:
-    """Of the steps, (STEPS,)."""
+    """Times of the steps, (STEPS,)."""
     return np.arange(STEPS) * system.step_s
 
 
 class Plants(NamedTuple):
-    """Plants between which each run switches as it likes."""
+    """Plants between which each run switches arbitrarily."""
 
     pool: list[tuple[Matrix, Matrix]]
     """(A, B) of each."""
     which: NDArray[np.int64]
-    """(runs, STEPS) the plant of each run in each step."""
+    """(runs, STEPS) the index of each run's plant in each step."""
 
 
 def simulate(
@@ -129,14 +129,14 @@ def simulate(
     floor: float = 0.0,
     plants: Plants | None = None,
 ) -> Trace:
-    """All runs at once.
+    """Simulate all runs at once.
 
     Args:
         system: the loop.
-        delivered: (runs, events) what the network lets through.
-        delays: (runs, events) steps that each update is under way.
-        floor: of the trigger's threshold.
-        plants: instead of the system's own.
+        delivered: (runs, events) whether the network delivers the update.
+        delays: (runs, events) delay of each update in steps.
+        floor: floor of the trigger's threshold.
+        plants: replace the system's own plant.
     """
     runs, n, K, W = len(delivered), len(system.A), system.K.T, system.weight.T
     steps = Steps(system)
@@ -144,7 +144,7 @@ def simulate(
     model = [_Propagators(system, A, B) for A, B in pool]
     x = np.tile(system.x0, (runs, 1))
     x_s, x_c = x.copy(), x.copy() if system.known_start else np.zeros_like(x)
-    # An update under way is kept as what it will be when it arrives; 0 in ``arrives`` is none.
+    # An update in flight is stored as its value on arrival; 0 in ``arrives`` means no update.
     arriving, arrives = np.zeros((runs, steps.delay + 1, n)), np.zeros((runs, steps.delay + 1), int)
     newest, events, last_event = np.zeros(runs, int), np.zeros(runs, int), np.zeros(runs, int)
     synchronised = np.full(runs, system.known_start)
@@ -204,7 +204,7 @@ class Steps:
 
 
 class _Propagators:
-    """Over one step, transposed, for rows of states."""
+    """Propagators over one step, transposed, for states as rows."""
 
     def __init__(self, system: System, A: Matrix, B: Matrix) -> None:
         (n, m), step_s = B.shape, system.step_s
@@ -217,7 +217,7 @@ class _Propagators:
         self.late = np.array([expm(system.H * step_s * k).T for k in range(system.delay_steps + 1)])
 
     def advance(self, x: Reals, x_c: Reals, u: Reals, feels: Flags, *, held: bool) -> Reals:
-        """x of all runs, a step later; u = K x_c moves on unless it is held."""
+        """x of all runs one step later; u = K x_c changes with x_c unless it is held."""
         if held:
             return np.concatenate([x, u], axis=1) @ self.held
         together = np.concatenate([x, x_c], axis=1) @ self.both
@@ -225,7 +225,9 @@ class _Propagators:
 
 
 def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[np.int64]]:
-    """Patterns of losses, at most M−1 in a row: hostile ones, and random ones of every severity."""
+    """Loss patterns with at most M − 1 consecutive losses: worst cases, and random ones of every
+    rate.
+    """
     events = STEPS // system.sample_steps + 2
     lost = rng.uniform(size=(RUNS, events)) < rng.uniform(size=(RUNS, 1)) ** 0.5
     lost[0] = True
@@ -243,7 +245,7 @@ def networks(rng: np.random.Generator, system: System) -> tuple[Flags, NDArray[n
 
 @st.composite
 def systems(draw: st.DrawFn, **fixed: Any) -> System:
-    """Loops of every kind; ``fixed`` holds some of the drawn numbers."""
+    """Loops of every kind; ``fixed`` replaces some of the drawn values."""
 
     def choose(name: str, strategy: st.SearchStrategy[Any]) -> Any:
         return fixed[name] if name in fixed else draw(strategy)

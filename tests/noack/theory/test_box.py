@@ -1,4 +1,4 @@
-"""Tries to break box certificates: plants anywhere in the box, at its corners, changing as they go.
+"""Tries to break box certificates with plants anywhere in the box, at its corners, and switching.
 
 Broken copies of the bounds have to be caught by the same check.
 """
@@ -29,7 +29,7 @@ seeds = st.integers(0, 2**32)
 
 
 class Case(NamedTuple):
-    """A loop whose plant is its model, and how far the true plant may be from it."""
+    """A loop in which plant and model are equal, and the distance of the true plant from them."""
 
     system: System
     halfwidth_A: Matrix
@@ -51,7 +51,7 @@ class Case(NamedTuple):
         return solve(plant.error, plant, conditions or self.system.conditions, level)
 
     def plants(self, rng: np.random.Generator) -> list[tuple[Matrix, Matrix]]:
-        """Corners of the box, and what is inside."""
+        """Plants at corners and inside the box."""
         found = []
         for kind in range(POOL):
             shares = [rng.uniform(-1, 1, half.shape) for half in self[1:]]
@@ -78,7 +78,7 @@ def cases(draw: st.DrawFn, size: float | None = None, **fixed: Any) -> Case:
 
 
 def exceeded(case: Case, certified: Constants, seed: int) -> list[str]:
-    """The bounds that some run exceeds: plants that stay, plants that switch, now and then."""
+    """The bounds that some run exceeds, for constant plants, fast switching and rare switching."""
     rng = np.random.default_rng(seed)
     often = rng.uniform(size=(RUNS, 1)) ** 3
     often[: RUNS // 3] = 0.0
@@ -103,7 +103,7 @@ def test_no_plant_in_the_box_exceeds_a_bound(case: Case, seed: int) -> None:
 
 
 class NoMistakes(BoxGains):
-    """Forgets that the plant's mistakes part it from the models."""
+    """Ignores that the plant's deviation separates the plant from the models."""
 
     @property
     def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
@@ -111,14 +111,14 @@ class NoMistakes(BoxGains):
 
 
 class MistakesOfTheStartOnly(BoxGains):
-    """Leaves the mistakes' own feedback out: w that follows from w."""
+    """Ignores the feedback of the deviation: w that results from w."""
 
     def _mistakes_of(self, coordinates: Vector) -> Vector:
         return np.asarray(self._halfwidths @ coordinates)
 
 
 class OnlyTheStateIsUncertain(BoxGains):
-    """Forgets B̃."""
+    """Ignores B̃."""
 
     @property
     def _halfwidths(self) -> Matrix:  # type: ignore[override]
@@ -134,7 +134,7 @@ class HalfTheBox(BoxGains):
 
 
 class TheModelIsThePlant(BoxGains):
-    """No mistake ever reaches the state."""
+    """Ignores the effect of the deviation on the state."""
 
     @property
     def states(self) -> dict[Output, Coefficients]:  # type: ignore[override]
@@ -143,7 +143,7 @@ class TheModelIsThePlant(BoxGains):
 
 
 class FeltFromTheStart(BoxGains):
-    """Forgets that there is no input at first."""
+    """Ignores that there is no input at first."""
 
     def start_up(self, start_s: float) -> tuple[float, Mapping[Output, float]]:
         return super().start_up(0.0)
@@ -192,7 +192,7 @@ def test_a_broken_copy_is_caught(mutant: str) -> None:
 @settings(SEARCH, max_examples=12)
 @given(cases(), st.floats(0.01, 0.5), seeds)
 def test_before_the_start_every_plant_falls_freely(case: Case, share: float, seed: int) -> None:
-    """p = −Kx then, of every plant in the box; and so do those that change."""
+    """p = −Kx before the first input, for every plant in the box, constant or switching."""
     system, rng = case.system, np.random.default_rng(seed)
     start_s = share / float(np.linalg.norm(system.A, 2))
     bound, _ = case.gains().start_up(start_s)
@@ -247,11 +247,11 @@ def test_a_scalar_box_is_as_large_as_it_can_be(alpha: float, share_of_A: float) 
         certified = found.certify(NetworkConditions(2))
         margin = whole * (1 - size)
         pushed = (1.0 + found.halfwidth_B.item()) * certified.input_error
-        start = x0 * whole / margin  # its mistakes are those of a state that never falls
-        # The enclosures' 0.5 %, and that they take start and push apart.
+        start = x0 * whole / margin  # bound for a state that does not decay
+        # The enclosures' 0.5 %, and the separate bounds of start and push.
         assert certified.state == pytest.approx(start + pushed / margin, rel=0.15)
         assert certified.state >= (start + pushed / margin) * (1 - 1e-9)
-        # w of the state and of the input that goes with it.
+        # w of the state and of the corresponding input.
         state, push = certified.state, certified.input_error
         mistake = found.halfwidth_A.item() * state + found.halfwidth_B.item() * (-k * state + push)
         assert certified.mismatch == pytest.approx(mistake, rel=1e-3)
@@ -286,7 +286,8 @@ def test_a_larger_box_never_has_smaller_bounds(case: Case, share: float) -> None
     found = smaller.certify()
     for name in ("delta", "overshoot", "input_error", "state", "mismatch"):
         assert getattr(found, name) <= getattr(larger, name) * (1 + 5e-3)
-    # Where an event takes longer than anything in the loop lasts, δ is as coarse as its grid.
+    # Where the inter-event time exceeds all other durations of the loop, δ is as coarse as its
+    # grid.
     longest_s = 5 / case.system.alpha
     least_s = min(larger.inter_event_s or 0.0, longest_s)
     assert (found.inter_event_s or 0.0) >= least_s * (1 - 0.02)

@@ -1,4 +1,5 @@
-"""Tries to break the certificates: random loops, random and hostile networks, no bound exceeded.
+"""Tries to break the certificates: random loops, random and worst-case networks; no bound is
+exceeded.
 
 The same check is then given broken copies of the certificates, and has to catch each of them.
 """
@@ -15,11 +16,11 @@ from noack.theory.certificate import Constants, Level, VoidError, solve
 from noack.theory.gains import Coefficients, ErrorGains, Output, PlantGains
 from tests.noack.theory.loops import RUNS, System, networks, simulate, systems
 
-# Simulation and enclosure both round; each by less than this.
+# Simulation and enclosure are both rounded; each error is below this.
 ROUNDING = 1 + 1e-9
 
 LOOPS, LOOPS_PER_FAMILY = 320, 9
-"""Times RUNS = 25, these are more than 10,000 simulated runs."""
+"""Times RUNS = 25: more than 10,000 simulated runs."""
 
 SEARCH = settings(deadline=None, suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 
@@ -47,7 +48,7 @@ def test_no_certified_bound_is_ever_exceeded(system: System, seed: int) -> None:
     assert exceeded(system, certified(system), seed) == []
 
 
-def test_there_are_enough_runs() -> None:
+def test_the_checks_cover_more_than_ten_thousand_runs() -> None:
     assert (LOOPS + LOOPS_PER_FAMILY * len(MUTANTS)) * RUNS >= 10_000
 
 
@@ -88,21 +89,21 @@ class NoMismatch(PlantGains):
 
 
 class OnlyTheFirstMoment(ErrorGains):
-    """Takes ‖C W^{−1}‖, the value at τ = 0, for the supremum over τ."""
+    """Uses ‖C W^{−1}‖, the value at τ = 0, instead of the supremum over τ."""
 
     def missing(self, output: Output, events: int, spacing_s: float) -> float:
         return events * self.now(output)
 
 
 class OnlyTheNewest(ErrorGains):
-    """Counts one missing event, however many there are."""
+    """Counts one missing event, whatever their number."""
 
     def missing(self, output: Output, events: int, spacing_s: float) -> float:
         return super().missing(output, min(events, 1), spacing_s)
 
 
 class ThresholdStandsStill(ErrorGains):
-    """Forgets that an old error is compared with a threshold that has fallen since."""
+    """Ignores that an old error was bounded by an earlier, larger threshold."""
 
     @property
     def scaled_H(self) -> np.ndarray:  # type: ignore[override]
@@ -144,7 +145,7 @@ MUTANTS: dict[str, tuple[Callable[[System], Constants], dict[str, Any]]] = {
 
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_no_bound_is_exceeded_where_a_broken_copy_s_would_be(mutant: str) -> None:
-    """Loops in which one thing matters above all."""
+    """Loops in which one effect dominates."""
     _, where = MUTANTS[mutant]
 
     @settings(SEARCH, max_examples=LOOPS_PER_FAMILY)

@@ -35,7 +35,7 @@ seeds = st.integers(0, 2**32)
 
 
 def scenario(system: System, *, mode: str = "model", **changes: Any) -> Scenario:
-    """The system's matrices; rates play no part where conditions are given."""
+    """The system's matrices; the rates have no effect where conditions are given."""
     model = system.H - system.B @ system.K if mode == "model" else system.A
     content: dict[str, Any] = {
         "name": "random", "horizon_s": 1.0, "mode": mode,
@@ -55,7 +55,7 @@ def scenario(system: System, *, mode: str = "model", **changes: Any) -> Scenario
 
 
 def exceeded(system: System, certificate: ScenarioCertificate, trace: Trace) -> list[str]:
-    """The envelopes that some run leaves at some step, and the distance of events."""
+    """The envelopes that some run exceeds at some step, and the inter-event time."""
     t_s = times_s(system)
     bounds = {
         "e_s": (trace.sensor_error, certificate.sensor_error(t_s)),
@@ -84,21 +84,23 @@ def standing(certificate: ScenarioCertificate) -> ScenarioCertificate:
 @settings(SEARCH, max_examples=12)
 @given(systems(), st.floats(0.01, 0.9), seeds)
 def test_a_run_across_the_floor_exceeds_no_bound(system: System, share: float, seed: int) -> None:
-    """t_ε anywhere in the run: what is missing, felt or growing there belongs to both phases."""
+    """t_ε lies anywhere in the run: missing updates, inputs and growth concern both phases."""
     floor = system.beta * math.exp(-system.alpha * share * STEPS * system.step_s)
     certificate = certify(scenario(system, trigger={"floor": floor}), system.conditions)
     standing(certificate)
     first, late = certificate.constants, certificate.floor_constants
     assert first is not None
     assert late is not None
-    # An event of the first phase that is missing in the second is as far from the others.
+    # An event of the first phase may still be missing in the second.
     assert (late.inter_event_s or 0.0) <= (first.inter_event_s or 0.0)
     assert certificate.floor_from_s == pytest.approx(share * STEPS * system.step_s)
     assert exceeded(system, certificate, run(system, seed, floor)) == []
 
 
 def late_start(mansd: int = 0) -> System:
-    """ẋ = u, u = −x_c, from far away: until the plant feels its input, x_s runs away from x."""
+    """ẋ = u, u = −x_c, from a large x(0): until the plant applies its first input, x_s diverges
+    from x.
+    """
     one = np.ones((1, 1))
     return System(
         A=0 * one, B=one, K=-one, H=-one, weight=one, x0=np.array([1000.0]), alpha=0.25, beta=1.0,
@@ -118,7 +120,9 @@ def test_a_floor_may_begin_before_the_plant_feels_its_input(
 
 
 def test_an_event_of_the_start_may_be_missing_long_after() -> None:
-    """The error at the first event is the start's, many thresholds high, and lost for good."""
+    """The error at the first event comes from the start, exceeds the threshold many times, and is
+    never delivered.
+    """
     system = late_start(mansd=3)
     for floor in (0.999, 0.99, 0.9, 0.5):
         certificate = certify(scenario(system, trigger={"floor": floor}), system.conditions)
@@ -133,8 +137,8 @@ def test_an_event_of_the_start_may_be_missing_long_after() -> None:
         assert exceeded(system, certificate, trace) == []
 
 
-def test_a_loop_without_events_has_a_floor_all_the_same() -> None:
-    """An exact model, nothing lost: no event ever; the time between two knows no end."""
+def test_a_loop_without_events_has_bounds_at_the_floor() -> None:
+    """Exact model, no losses: no events, so the inter-event time is infinite."""
     content = scenario(
         System(
             A=np.array([[0.0, 1.0], [0.0, 0.0]]), B=np.array([[0.0], [1.0]]),
@@ -149,7 +153,7 @@ def test_a_loop_without_events_has_a_floor_all_the_same() -> None:
     assert certificate.floor_constants is not None
 
 
-def test_the_floor_s_own_bounds_do_not_decay_and_begin_where_it_does() -> None:
+def test_bounds_at_the_floor_are_constant_from_its_beginning_on() -> None:
     system = late_start()
     certificate = certify(scenario(system, trigger={"floor": 0.5}), system.conditions)
     late, from_s = certificate.floor_constants, certificate.floor_from_s
@@ -163,11 +167,11 @@ def test_the_floor_s_own_bounds_do_not_decay_and_begin_where_it_does() -> None:
     assert after == later == pytest.approx(late.delta * 0.5)
 
 
-# --- where α is not below the decay rates, and in zero-order hold ---------------------------------
+# --- α above the decay rates, and zero-order hold -----------------------------------------------
 
 
 def too_fast(system: System, factor: float) -> System:
-    """The same loop with a threshold that falls faster than the models and A + BK decay."""
+    """The same loop with a threshold that decays faster than the models and A + BK."""
     closed = system.A + system.B @ system.K
     rate = min(-spectral_abscissa(system.H), -spectral_abscissa(closed))
     return System(**{**system.__dict__, "alpha": factor * rate})
@@ -195,7 +199,7 @@ def test_where_alpha_is_too_large_bounds_fall_more_slowly(
 def test_where_alpha_is_too_large_a_floor_keeps_events_apart(
     system: System, share: float, seed: int
 ) -> None:
-    """A floor above β, too, is one."""
+    """A floor above β is a floor, too."""
     system = too_fast(system, 1.5)
     floor = share * system.beta
     certificate = standing(certify(scenario(system, trigger={"floor": floor}), system.conditions))
@@ -208,7 +212,7 @@ def test_where_alpha_is_too_large_a_floor_keeps_events_apart(
 @settings(SEARCH, max_examples=12)
 @given(systems(hold_steps=1), st.sampled_from([0.0, 0.3, 1.5]), seeds)
 def test_a_hold_is_bounded(system: System, share: float, seed: int) -> None:
-    """H = 0; the plant is the closed loop that the models of the drawn system had."""
+    """H = 0; the plant is the drawn system's closed-loop model."""
     held = System(**{**system.__dict__, "H": np.zeros_like(system.H)})
     floor = share * system.beta
     certificate = standing(
@@ -223,7 +227,7 @@ def test_a_hold_is_bounded(system: System, share: float, seed: int) -> None:
 
 
 def test_a_hold_under_the_papers_conditions_misses_m_thresholds() -> None:
-    """‖e_c‖ ≤ Mβ: what was missed stays missed, all of it at most β."""
+    """‖e_c‖ ≤ Mβ: each of at most M missing jumps stays and is at most β."""
     resolved = resolve(load(ROOT / "scenarios/lane_following.toml", ['mode="zoh"']))
     constants = certify(resolved, ideal_conditions(resolved)).constants
     assert constants is not None
@@ -241,7 +245,8 @@ HARDER = ("dropouts", "sampling_s", "delay_s", "hold_s", "start_s")
 def test_harder_conditions_never_have_better_bounds(
     system: System, harder: str, share: float
 ) -> None:
-    """More dropouts, rarer tests, longer delay, older input, later start; the grid of tests stays.
+    """More dropouts, a lower test rate, longer delay, older input, later start; the same grid of
+    tests.
 
     δ is searched for to a thousandth and enclosed to a hundredth.
     """
@@ -260,11 +265,11 @@ def test_harder_conditions_never_have_better_bounds(
     assert (found.inter_event_s or 0.0) >= min(hard.inter_event_s or 0.0, longest_s) * 0.98
 
 
-# --- the scenario's side of it --------------------------------------------------------------------
+# --- certificates of scenarios -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["lane_following", "lane_weighted", "unstable_pendulum"])
-def test_a_certificate_survives_json(name: str) -> None:
+def test_a_certificate_is_unchanged_by_json(name: str) -> None:
     resolved = resolve(load(ROOT / f"scenarios/{name}.toml"))
     for conditions in (
         ideal_conditions(resolved),
@@ -295,7 +300,7 @@ def test_a_certificate_survives_json(name: str) -> None:
                 assert written == {**assumption._asdict(), "verdict": str(assumption.verdict)}
 
 
-def test_there_is_a_box_certificate_where_there_is_a_box() -> None:
+def test_a_scenario_with_a_box_has_a_box_certificate() -> None:
     resolved = resolve(load(ROOT / "scenarios/lane_following.toml"))
     conditions = ideal_conditions(resolved)
     own, box = certify(resolved, conditions), certify_box(resolved, conditions)
@@ -310,7 +315,7 @@ def test_there_is_a_box_certificate_where_there_is_a_box() -> None:
     assert certify_box(resolved.model_copy(update={"plant": plain}), conditions) is None
 
 
-def test_a_void_certificate_says_why_and_bounds_nothing() -> None:
+def test_a_void_certificate_gives_the_reason_and_no_bounds() -> None:
     resolved = resolve(
         load(
             ROOT / "scenarios/lane_following.toml",
@@ -334,7 +339,7 @@ def test_a_void_certificate_says_why_and_bounds_nothing() -> None:
     assert "not below 1" in slow.void
 
 
-def test_verdicts_of_the_assumptions() -> None:
+def test_the_assumptions_are_checked_for_the_scenario() -> None:
     resolved = resolve(load(ROOT / "scenarios/lane_following.toml"))
     found = certify(resolved, NetworkConditions(4, 0.002, 0.002, 0.004, 0.005, 0.004))
     verdicts = [assumption.verdict for assumption in found.assumptions]
@@ -368,7 +373,7 @@ def test_the_lane_example_in_a_weight_from_any_lyapunov_function() -> None:
 
 
 @pytest.mark.parametrize("beta", [1e-300, 1e-310, 5e-324])
-def test_a_threshold_that_no_time_is_short_enough_for_takes_few_looks(
+def test_a_threshold_without_an_inter_event_time_is_rejected_in_few_steps(
     beta: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks, growth = 0, ErrorGains.growth

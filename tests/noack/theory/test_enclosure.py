@@ -44,7 +44,7 @@ def stiff(rng: Rng, n: int) -> Matrix:
 
 
 def defective(rng: Rng, n: int) -> Matrix:
-    """One Jordan block."""
+    """A single Jordan block."""
     return turned(rng, np.diag(np.ones(n - 1), 1) - rng.uniform(0.3, 1.0) * np.eye(n))
 
 
@@ -55,7 +55,7 @@ def non_normal(rng: Rng, n: int) -> Matrix:
 
 
 def ringing(rng: Rng, n: int) -> Matrix:
-    """Hardly damped oscillations."""
+    """Lightly damped oscillations."""
     skew = rng.normal(size=(n, n)) * 5
     return np.asarray(skew - skew.T - rng.uniform(0.05, 0.3) * np.eye(n))
 
@@ -79,12 +79,12 @@ def cases(draw: st.DrawFn, kind: str) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def values(C: Matrix, G: Matrix, D: Matrix, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """‖C e^{Gt} D‖, each time anew."""
+    """‖C e^{Gt} D‖, each time from a new matrix exponential."""
     return np.asarray(np.linalg.norm(C @ expm(G * t_s[:, None, None]) @ D, 2, axis=(1, 2)))
 
 
 def times(G: Matrix, end_s: float) -> NDArray[np.float64]:
-    """Dense for the fast modes and for the slow ones."""
+    """Times that are dense for the fast modes and for the slow ones."""
     fast = float(np.abs(np.linalg.eigvals(G)).max())
     return np.unique(
         np.concatenate([np.geomspace(1e-3 / fast, end_s, 250), np.linspace(0.0, end_s, 400)])
@@ -96,18 +96,18 @@ def cell_of(kernel: KernelBounds, t_s: NDArray[np.float64]) -> NDArray[np.int64]
 
 
 def peak(kernel: KernelBounds, C: Matrix, G: Matrix, D: Matrix) -> float:
-    """The largest value where the enclosure has its own."""
+    """The largest value in the interval where the enclosure has its own maximum."""
     cell = int(kernel.highest.argmax())
     return float(values(C, G, D, np.linspace(*kernel.edges_s[cell : cell + 2], 50)).max())
 
 
-# The enclosure's own inflation covers rounding; what is left is that of the reference.
+# The enclosure covers its own rounding; the remaining difference is the reference's.
 ROUNDING = 1 - 1e-10
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
-    """Cell by cell, beyond the grid, and from any time on; the supremum within 1 %."""
+    """Cell by cell, beyond the grid, and from any time on; the supremum is within 1 %."""
 
     @settings(max_examples=12)
     @given(cases(kind))
@@ -120,7 +120,7 @@ def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -
         on_grid = t_s < grid_s
         highest = kernel.highest[cell_of(kernel, t_s[on_grid])]
         assert (highest >= found[on_grid] * ROUNDING).all()
-        # What is as small as the rounding of the reference says nothing.
+        # Values as small as the reference's rounding are not compared.
         assert (kernel.sups(t_s) + 1e-13 * found.max() >= found * ROUNDING).all()
         assert (np.diff(kernel.sups(t_s)) <= 0).all()
         assert kernel.sup() == kernel.sups(np.zeros(1))[0] == kernel.highest.max()
@@ -131,7 +131,7 @@ def test_no_value_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_integral_is_above_its_enclosure_and_the_enclosure_is_tight(kind: str) -> None:
-    """Cell by cell, by Gauss's formula, which knows ‖C e^{Gτ} d‖ of a vector d to 1e-8 there."""
+    """Cell by cell, against Gauss's formula, which gives ‖C e^{Gτ} d‖ for a vector d to 1e-8."""
     points, weights = np.polynomial.legendre.leggauss(4)
 
     @settings(max_examples=5)
@@ -159,8 +159,8 @@ def test_the_integral_of_one_mode_is_its_closed_form() -> None:
             assert kernel.sups(np.array([after / rate]))[0] >= 6 * math.exp(-after)
 
 
-def test_the_tail_alone_bounds_what_is_beyond_any_grid() -> None:
-    """A grid that ends while everything still moves."""
+def test_the_tail_bounds_all_times_beyond_the_grid() -> None:
+    """The grid ends before any mode has decayed."""
     for kind, make in KINDS.items():
         G, D = make(np.random.default_rng(4), 4), np.eye(4)
         whole = response(G, D)
@@ -185,7 +185,7 @@ def test_the_tail_alone_bounds_what_is_beyond_any_grid() -> None:
 def test_over_a_finite_time_growing_systems_are_enclosed_too(
     n: int, seed: int, reach: float, cells: int, grows: bool
 ) -> None:
-    """However coarse the grid: with 100 time constants in a single cell, the bound is far off."""
+    """On any grid: if a cell spans 100 time constants, the bound is valid but far off."""
     rng = np.random.default_rng(seed)
     G, D, C = (rng.normal(size=(n, n)) for _ in range(3))
     if not grows:
@@ -197,15 +197,17 @@ def test_over_a_finite_time_growing_systems_are_enclosed_too(
     found = values(C, G, D, t_s)
     assert (kernel.highest[np.minimum(cell_of(kernel, t_s), cells - 1)] >= found * ROUNDING).all()
     expected = float(np.trapezoid(found, t_s))
-    error = 1e-4 if reach <= 10 else 0.05  # of 200 trapezoids over the fastest turns of F
+    error = 1e-4 if reach <= 10 else 0.05  # of 200 trapezoids over the fastest rotations of F
     assert kernel.integral_on_grid() >= expected * (1 - error)
     if reach <= cells / 16:
         assert kernel.sup_on_grid() <= 1.01 * found.max()
-    assert kernel.tail_highest == kernel.tail_area == math.inf  # nobody asked
+    assert kernel.tail_highest == kernel.tail_area == math.inf  # not requested
 
 
-def test_a_fast_mode_costs_a_coarse_grid_little_if_all_decays() -> None:
-    """10 cells for 1000 time constants of the fast mode, which Taylor's formula cannot reach."""
+def test_a_fast_decaying_mode_hardly_loosens_a_coarse_grid() -> None:
+    """10 cells for 1000 time constants of the fast mode, for which Taylor's formula does not
+    converge.
+    """
     G = np.array([[-1.0, 1.0], [0.0, -1e4]])
     kernel = response_until(G, np.eye(2), 0.1, 10).through(np.eye(2))
     assert kernel.sup_on_grid() < 20_000
@@ -213,8 +215,8 @@ def test_a_fast_mode_costs_a_coarse_grid_little_if_all_decays() -> None:
     assert slow.sup_on_grid() <= 1.0001
 
 
-def test_a_hump_within_a_single_cell_is_seen() -> None:
-    """t⁷e^{−t}/7! has no derivative at 0 up to the sixth; at the cell's end it is over."""
+def test_a_maximum_within_a_single_cell_is_enclosed() -> None:
+    """The first six derivatives of t⁷e^{−t}/7! at 0 are 0; it decays within the cell."""
     G = np.diag(np.ones(7), 1) - np.eye(8)
     C, D = np.eye(8)[:1], np.eye(8)[:, -1:]
     for until_s in (10.0, 40.0):
@@ -226,7 +228,7 @@ def test_a_hump_within_a_single_cell_is_seen() -> None:
 @settings(max_examples=12)
 @given(st.integers(0, 2**32), st.integers(1, 5), st.integers(1, 3))
 def test_the_rounding_of_a_product_is_covered(seed: int, n: int, columns: int) -> None:
-    """Of factors whose terms cancel, against rational numbers: nothing is known of such a norm."""
+    """Products with cancelling terms, against rational numbers."""
     rng = np.random.default_rng(seed)
     C = rng.normal(size=(2, n)) * 10.0 ** rng.uniform(-8, 8, n)
     Y = rng.normal(size=(n, columns)) / np.abs(C[:1]).T
@@ -250,14 +252,14 @@ def test_a_system_that_does_not_decay_is_refused() -> None:
 
 
 def test_a_system_that_decays_only_to_rounding_is_refused() -> None:
-    """A Jordan block of ten whose eigenvalues rounding moves by more than they are from 0."""
+    """A Jordan block of ten; rounding moves its eigenvalues by more than their distance from 0."""
     Q = np.linalg.qr(np.random.default_rng(1).normal(size=(10, 10)))[0]
     for margin, why in ((1e-3, "grows at"), (0.1, "no Lyapunov function")):
         triangular = np.diag(np.ones(9), 1) - margin * np.eye(10)
         with pytest.raises(NotDecayingError, match=why):
             response(Q @ triangular @ Q.T, np.eye(10))
     triangular = np.diag(np.ones(9), 1) - 1e-3 * np.eye(10)
-    # As it is written, its eigenvalues are exact, and so is what it grows to: t⁹e^{−t/1000}/9!.
+    # As written, its eigenvalues are exact, and so is its maximum: t⁹e^{−t/1000}/9!.
     peak = 9e3**9 / math.factorial(9) * math.exp(-9)
     assert 1.0 <= response(triangular, np.eye(10)).through(np.eye(10)).sup() / peak < 1.001
 
@@ -311,7 +313,7 @@ def exactly(C: Matrix, G: Matrix, D: list[list[Decimal]], t_s: float) -> float:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("condition", [1.0, 1e4, 1e8, 1e11])
 def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condition: float) -> None:
-    """‖W e^{Gτ} W⁻¹‖ for a W in which errors of 1e-16 grow by the condition of W."""
+    """‖W e^{Gτ} W⁻¹‖ for a W that amplifies errors of 1e-16 by its condition number."""
     rng = np.random.default_rng(11)
     n = 3
     U, V = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
@@ -327,7 +329,7 @@ def test_rounding_is_covered_where_weights_are_ill_conditioned(kind: str, condit
         assert kernel.sups(np.array([t_s]))[0] >= exact
 
 
-def test_a_rank_is_found_and_kept() -> None:
+def test_the_rank_of_a_factor_is_detected_and_preserved() -> None:
     rng = np.random.default_rng(3)
     for rank in range(1, 5):
         matrix = rng.normal(size=(5, rank)) @ rng.normal(size=(rank, 4))
@@ -343,16 +345,16 @@ def test_a_rank_is_found_and_kept() -> None:
     assert not R.any()
 
 
-def test_what_neither_grows_nor_decays() -> None:
+def test_a_constant_system_is_enclosed() -> None:
     kernel = constant_kernel(2.5)
     np.testing.assert_array_equal(kernel.sups(np.array([0.0, 0.3, 1.0, 1e9])), [2.5] * 4)
     assert kernel.integral() == math.inf
 
 
-def test_many_states_take_little_memory_and_their_bounds_hold() -> None:
+def test_many_states_take_little_memory_and_are_enclosed() -> None:
     n = 40
     rng = np.random.default_rng(2)
-    modes = np.diag(-np.logspace(-2, 3, n))  # on so few cells the slowest modes are far from over
+    modes = np.diag(-np.logspace(-2, 3, n))  # with so few cells the slowest modes have not decayed
     generator = modes + np.triu(rng.normal(size=(n, n)), 1) * 0.01
     everything = np.eye(n)
     followed = response(generator, everything)

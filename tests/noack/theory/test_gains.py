@@ -1,4 +1,6 @@
-"""Gains of a loop against dense sampling: never below, and not far above; and what solves them."""
+"""Gains of a loop against dense sampling: never below, not far above; and the inequalities they
+solve.
+"""
 
 import math
 
@@ -41,7 +43,7 @@ def all_times(G: Matrix) -> NDArray[np.float64]:
 
 
 def outputs_of(system: System) -> dict[Output, Matrix]:
-    """Through which x and e_c are looked at, written with K itself."""
+    """The outputs that measure x and e_c, written with K itself."""
     H, K = system.H, system.K
     return {
         Output.STATE: np.eye(len(H)),
@@ -67,7 +69,7 @@ def test_missing_events_count_what_they_may_have_grown_to(
         sampled = [values[t_s >= j * spacing_s].max(initial=0.0) for j in range(events)]
         found = error.missing(output, events, spacing_s)
         assert found >= sum(sampled) * ROUNDING
-        # Sampling misses where a supremum begins, and what is beyond twelve time constants.
+        # Sampling misses the start of a supremum and all times beyond twelve time constants.
         assert found <= 1.03 * sum(sampled) + 1e-3 * values.max()
         exact = float(np.linalg.norm(C @ inverse, 2))
         assert exact * ROUNDING <= error.now(output) <= exact * (1 + 1e-9)
@@ -76,7 +78,9 @@ def test_missing_events_count_what_they_may_have_grown_to(
 @settings(SEARCH)
 @given(systems(), st.floats(0.01, 3.0))
 def test_an_input_that_is_not_of_now_is_wrong_by_no_more(system: System, reach: float) -> None:
-    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: models behind and, of a late plant, ahead."""
+    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: the input is older or, for a late plant, newer than
+    x_c.
+    """
     error, _ = gains(system)
     hold_s = reach / float(np.linalg.norm(system.H, 2))
     ages_s = np.linspace(-hold_s, hold_s, 81)
@@ -90,7 +94,7 @@ def test_an_input_that_is_not_of_now_is_wrong_by_no_more(system: System, reach: 
         )  # fmt: skip
         found = error.hold_remainder(longest_s)
         assert found >= sampled * ROUNDING
-        # ½σ² sup‖KH²e^{−Hs}W⁻¹‖ is the integral's bound: its values all of one direction.
+        # ½σ² sup‖KH²e^{−Hs}W⁻¹‖ bounds the integral; its values need not point in one direction.
         assert found <= (1.6 if longest_s < 0.5 / np.linalg.norm(system.H, 2) else 12) * sampled
     assert error.hold_remainder(0.0) == 0.0
 
@@ -101,7 +105,7 @@ def test_the_state_is_at_most_its_free_part_and_gain_times_the_push(system: Syst
     _, plant = gains(system)
     G = system.A + system.B @ system.K + system.alpha * np.eye(len(system.A))
     t_s = all_times(G)
-    # p = K … acts through the range of K only.
+    # p = K … acts only through the range of K.
     U = np.linalg.svd(system.K, full_matrices=False)[0][:, : np.linalg.matrix_rank(system.K)]
     for output, (free, gain) in plant.states.items():
         C = outputs_of(system)[output]
@@ -110,14 +114,14 @@ def test_the_state_is_at_most_its_free_part_and_gain_times_the_push(system: Syst
         assert free <= 1.01 * sampled.max() + 1e-12
         pushed = norms(C, G, system.B @ U, t_s)
         area = float(np.trapezoid(pushed, t_s))
-        assert gain >= area * (1 - 1e-2)  # of 800 trapezoids over curves that turn
+        assert gain >= area * (1 - 1e-2)  # of 800 trapezoids over curves that rotate
         assert gain <= 1.03 * area + 1e-12
 
 
 @settings(SEARCH)
 @given(systems(), st.floats(0.01, 1.0))
 def test_before_the_start_the_plant_falls_freely(system: System, reach: float) -> None:
-    """x = e^{At}x(0) and p = −Kx; afterwards the push has moved x by what is added."""
+    """x = e^{At}x(0) and p = −Kx; afterwards the push has moved x by the added term."""
     _, plant = gains(system)
     start_s = reach / float(np.linalg.norm(system.A, 2) + 1e-9)
     error, added = plant.start_up(start_s)
@@ -151,7 +155,7 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
     rng = np.random.default_rng(5)
     E = system.A + system.B @ system.K - system.H
     for kernel, D in ((growth.mismatch, E), (growth.input_error, system.B @ system.K)):
-        # Any signal v of the bounded size that the kernel goes with: ‖D v‖ in units of ‖D v‖.
+        # Any bounded signal v that the kernel may act on: ‖D v‖ in units of ‖D v‖.
         v = rng.normal(size=(len(system.H), 1))
         size = float(np.linalg.norm(D @ v)) if kernel is growth.mismatch else float(
             np.linalg.norm(system.K @ v)
@@ -163,7 +167,7 @@ def test_growth_between_two_tests(system: System, reach: float) -> None:
 @settings(SEARCH)
 @given(systems())
 def test_the_constants_solve_the_inequalities(system: System) -> None:
-    """Each bound is what the others make it, as certificate.py's head has it, with equality."""
+    """Each bound satisfies its equation in the head of certificate.py with equality."""
     conditions, (error, plant) = system.conditions, gains(system)
     try:
         found = system.certify(conditions)
@@ -210,7 +214,7 @@ def test_the_first_passage_is_that_of_the_volterra_equation(
     level = system.beta
     found_s = first_passage_s(plant, level, mismatch, push, own)
     longest_s = 6 * slow_s(system.H + system.alpha * np.eye(len(system.H)))
-    assume(found_s < longest_s)  # not where hardly anything is left to push
+    assume(found_s < longest_s)  # skipped where the push is almost 0
     G, W = system.H + system.alpha * np.eye(len(system.H)), system.weight
     E = system.A + system.B @ system.K - system.H
     U = np.linalg.svd(system.K, full_matrices=False)[0][:, : np.linalg.matrix_rank(system.K)]
@@ -220,18 +224,18 @@ def test_the_first_passage_is_that_of_the_volterra_equation(
     step_s = float(t_s[1])
     from_x, from_p = norms(W, G, L, t_s), norms(W, G, system.B @ U, t_s)
     rho = np.zeros(steps + 1)
-    for k in range(1, steps + 1):  # the trapezoidal rule, whose ρ(0) is 0
+    for k in range(1, steps + 1):  # the trapezoidal rule, with ρ(0) = 0
         fixed = np.trapezoid(from_x[: k + 1] * mismatch + from_p[: k + 1] * push, dx=step_s)
         echo = float(from_p[1:k] @ rho[k - 1 : 0 : -1]) + 0.5 * from_p[0] * rho[k - 1]
         rho[k] = max(fixed + own * step_s * echo, rho[k - 1])
     passed_s = float(np.interp(level, rho, t_s)) if rho[-1] > level else math.inf
-    # Never later than the equation's own solution, and hardly earlier.
+    # Never later than the equation's solution, and hardly earlier.
     assert found_s <= passed_s * (1 + 1e-2)
     assert passed_s < math.inf
     assert found_s >= 0.95 * passed_s
 
 
-def test_without_mismatch_or_push_nothing_is_ever_passed() -> None:
+def test_without_mismatch_or_push_the_threshold_is_never_reached() -> None:
     system = System(
         A=np.array([[-2.0]]), B=np.array([[1.0]]), K=np.array([[0.0]]), H=np.array([[-2.0]]),
         weight=np.eye(1), x0=np.ones(1), alpha=1.0, beta=0.1, known_start=True, mansd=0,
@@ -242,7 +246,7 @@ def test_without_mismatch_or_push_nothing_is_ever_passed() -> None:
     found = system.certify(NetworkConditions(0))
     assert found.inter_event_s is not None
     assert found.inter_event_s >= 1e6
-    # ρ = π'(1 − e^{−t}): never beyond π', and ln 2 to the half of it.
+    # ρ = π'(1 − e^{−t}): never above π', and half of it at ln 2.
     assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) == pytest.approx(math.log(2), rel=0.01)
     assert first_passage_s(plant, 0.5, 0.0, 1.0, 0.0) <= math.log(2)
     assert first_passage_s(plant, 1.01, 0.0, 1.0, 0.0) > 4

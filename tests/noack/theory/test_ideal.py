@@ -1,4 +1,4 @@
-"""Certificates under the paper's conditions against its loop in exact continuous time."""
+"""Certificates under the paper's conditions, against its loop in exact continuous time."""
 
 import dataclasses
 
@@ -29,12 +29,12 @@ def certified(system: System, dropouts: int | None = None) -> Constants:
 
 
 def shares(system: System, constants: Constants, seed: int) -> dict[str, float]:
-    """The largest share of each bound that some run uses; beyond 1, it is exceeded."""
+    """The largest share of each bound that a run uses; above 1, the bound is exceeded."""
     found = dict.fromkeys(("e_s", "e_c", "x", "x_W", "p", "inter-event time"), 0.0)
     speed = float(np.abs(np.linalg.eigvals(system.H)).max())
     for run, samples in observe(system, 12.0 / speed, seed):
         growth = np.exp(system.alpha * samples.t_s)
-        # Who does not know x(0) has nothing in common with the sensor before event 0, at t = 0.
+        # With an unknown x(0), sensor and controller agree only from event 0, at t = 0, on.
         known = np.ones(len(growth), bool)
         if not system.known_start:
             known[len(growth) - len(run.before)] = False
@@ -64,7 +64,7 @@ def test_no_bound_is_exceeded_in_continuous_time(system: System, seed: int) -> N
 
 
 def test_no_bound_is_exceeded_where_there_are_many_events_and_all_are_nearly_reached() -> None:
-    """With a plant far from its model the runs come close to every bound."""
+    """The plant is far from its model, so the runs come close to every bound."""
     largest: dict[str, float] = {}
 
     @settings(SEARCH, max_examples=15)
@@ -96,7 +96,7 @@ def test_one_dropout_forgotten_is_caught() -> None:
 
 
 def test_too_long_an_inter_event_time_is_caught() -> None:
-    """δ is as long as it can be, but for a fifth."""
+    """δ is within a fifth of the largest possible value."""
 
     def caught(case: tuple[System, int]) -> bool:
         system, seed = case

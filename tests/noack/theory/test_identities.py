@@ -15,7 +15,7 @@ def histories(draw: st.DrawFn) -> list[tuple[int, int | None]]:
     """(time since the last event, sequence number received then or None) of successive events."""
     steps = []
     for sequence in range(draw(st.integers(1, 12))):
-        received = draw(st.none() | st.integers(0, sequence))  # late packets as well
+        received = draw(st.none() | st.integers(0, sequence))  # includes packets out of order
         steps.append((draw(st.integers(0, 400_000_000)), received))
     return steps
 
@@ -42,11 +42,11 @@ def test_the_sum_is_the_sum_of_the_propagated_jumps(
     expected = np.zeros(3)
     for then_ns, e_s in jumps[newest + 1 :]:
         expected += expm(H * (t_ns - then_ns) * 1e-9) @ e_s
-    # Twelve terms of at most twelve roundings, some 1e-15 each, grown by no more than this.
+    # Twelve terms with at most twelve roundings of about 1e-15 each, and their maximum growth.
     np.testing.assert_allclose(missed.total(), expected, atol=1e-12 * GROWTH)
 
 
-def test_nothing_missed_is_nothing() -> None:
+def test_the_sum_is_zero_without_missing_events() -> None:
     missed = ModelDifference(H)
     missed.advance_to(10**9)
     assert missed.total().tolist() == [0.0, 0.0, 0.0]

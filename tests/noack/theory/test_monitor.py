@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32)
 
 
 class Moment(NamedTuple):
-    """A measurement: what the monitor is told, and what e_c is."""
+    """A measurement: the monitor's arguments, and the true e_c."""
 
     t_ns: int
     e_s: Vector
@@ -34,7 +34,7 @@ class Moment(NamedTuple):
 
 
 class History(NamedTuple):
-    """A run of the two models beside a plant that moves as it likes."""
+    """A run of the two models with an arbitrary plant trajectory."""
 
     H: Matrix
     weight: Matrix
@@ -43,7 +43,7 @@ class History(NamedTuple):
 
 @st.composite
 def histories(draw: st.DrawFn) -> History:
-    """x moves at random, events happen at random, updates arrive late, out of order or never.
+    """Random motion of x, random events, updates that arrive late, out of order or never.
 
     The models are moved here by their own update laws; (I1) is not used.
     """
@@ -107,7 +107,7 @@ def test_both_bounds_are_the_explicit_sums(history: History, alpha: float, floor
 @settings(max_examples=40)
 @given(histories())
 def test_the_identity_bounds_the_error_whatever_happens(history: History) -> None:
-    """No trigger, no plant, no network is presupposed."""
+    """No assumption on trigger, plant or network."""
     trigger = DecayingTrigger(1e-3, 1.0, 0.0, history.weight)
     largest = 0.0
     for moment, found in zip(history.moments, follow(history, trigger), strict=True):
@@ -116,8 +116,8 @@ def test_the_identity_bounds_the_error_whatever_happens(history: History) -> Non
         assert error <= found.identity + 1e-12 * max(largest, 1.0)
 
 
-def test_a_single_missing_event_leaves_nothing_to_lose() -> None:
-    """One term: the triangle inequality is an equality, right after the reset."""
+def test_the_bound_is_exact_with_a_single_missing_event() -> None:
+    """With one term, the triangle inequality is an equality right after the reset."""
     history = History(
         np.array([[-1.0, 2.0], [0.0, -3.0]]), np.eye(2),
         [Moment(0, np.array([3.0, 4.0]), 0, -1, np.array([3.0, 4.0]))],
@@ -128,7 +128,7 @@ def test_a_single_missing_event_leaves_nothing_to_lose() -> None:
 
 
 def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
-    """The largest share of eq:LossEv3 that ‖e_c‖ uses; the first few missing events left out."""
+    """The largest share of eq:LossEv3 that ‖e_c‖ uses; the first missing events are left out."""
     H, alpha, beta, W = system.H, system.alpha, system.beta, system.weight
     trigger = DecayingTrigger(beta, alpha, 0.0, W)
     speed, largest = float(np.abs(np.linalg.eigvals(H)).max()), 0.0
@@ -151,7 +151,7 @@ def in_continuous_time(system: System, seed: int, forgotten: int) -> float:
                 elif left_out < forgotten:
                     left_out += 1
                     continue
-            # At the time of an event itself, samples show what is after the reset.
+            # The sample at an event shows the values after the reset.
             bounds = monitor.sample(t_ns, e_s, event, received)
             if system.known_start or received >= 0:
                 share = float(np.linalg.norm(W @ e_c)) / bounds.printed
@@ -167,7 +167,7 @@ TO_THE_NANOSECOND = 1 + 1e-6
 @settings(SEARCH, max_examples=12)
 @given(systems(), seeds)
 def test_the_printed_bound_holds_in_the_papers_loop(system: System, seed: int) -> None:
-    """eq:LossEv3, for a trigger that watches always; there, the identity's is the smaller one."""
+    """eq:LossEv3, for a continuous trigger; there, the bound of the identity is the smaller one."""
     assert in_continuous_time(system, seed, 0) <= TO_THE_NANOSECOND
 
 
@@ -180,7 +180,7 @@ def test_a_missing_event_left_out_is_caught() -> None:
     )
 
 
-def test_under_a_hold_every_missing_event_counts_one_threshold() -> None:
+def test_each_missing_event_adds_one_threshold_under_a_hold() -> None:
     trigger = DecayingTrigger(1.0, math.log(2.0))
     monitor = ErrorMonitor(np.zeros((2, 2)), trigger)
     for second in range(4):
@@ -192,8 +192,8 @@ def test_under_a_hold_every_missing_event_counts_one_threshold() -> None:
     assert found.identity == pytest.approx(1 / 16 + 1 / 8)
 
 
-def test_thousands_of_missing_events_are_summed_as_few_are() -> None:
-    """Over them all the closed form: equal jumps, of age 0, 1, … steps, each decayed by its age."""
+def test_thousands_of_missing_events_are_summed_exactly() -> None:
+    """Against the closed form: equal jumps of age 0, 1, … steps, each decayed by its age."""
     H, step_ns, jump, count = np.array([[-2.0]]), 1_000_000, np.array([0.5]), 3000
     monitor = ErrorMonitor(H, DecayingTrigger(0.25, 1.0))
     for k in range(count):

@@ -1,4 +1,4 @@
-"""What the network's delays mean for the conditions that certificates presuppose."""
+"""The network's delays in the conditions that certificates assume."""
 
 from typing import Any
 
@@ -24,14 +24,16 @@ from noack.theory.run_conditions import nominal_conditions
         ((Rate(rate_bps=1_200_000, queue=10),), 0.1, False),
     ],
 )
-def test_the_longest_delay(impairments: tuple[Any, ...], longest_s: float, bounded: bool) -> None:
+def test_the_longest_delay_of_a_network_follows_from_its_settings(
+    impairments: tuple[Any, ...], longest_s: float, bounded: bool
+) -> None:
     settings = LinkSettings(impairments=impairments)
     assert settings.longest_delay_s == pytest.approx(longest_s, rel=1e-12)
     assert settings.delay_is_bounded is bounded
 
 
 @pytest.mark.parametrize("late_periods", [0, 2])
-def test_updates_are_felt_later_by_the_networks_delay(
+def test_the_networks_delay_adds_to_the_delay_of_updates(
     content: dict[str, Any], late_periods: int
 ) -> None:
     at_once = nominal_conditions(resolve(validate(content, "here")), late_periods)
@@ -44,6 +46,6 @@ def test_updates_are_felt_later_by_the_networks_delay(
     )
     assert delayed.delay_s - at_once.delay_s == pytest.approx(0.03, abs=step_s + tick_s)
     assert delayed.delay_s >= 0.03 + late_periods * step_s
-    # The input's way does not lead through this network.
+    # The input does not pass through this network.
     assert delayed.hold_s == at_once.hold_s
     assert any("up to 30 ms" in assumption.why for assumption in assumptions(resolved))

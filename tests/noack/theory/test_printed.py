@@ -1,4 +1,4 @@
-"""The paper's bounds: recomputed from their formulas, and never exceeded where they are true."""
+"""The paper's bounds: recomputed from the formulas; never exceeded under their assumptions."""
 
 import math
 from dataclasses import replace
@@ -31,7 +31,7 @@ def norm(matrix: Matrix) -> float:
 
 
 def uniform_delta(system: System) -> float:
-    """Δ that holds for every run, from (I1)."""
+    """Δ of every run, from (I1)."""
     try:
         return system.certify(NetworkConditions(system.mansd)).delta
     except VoidError:
@@ -49,14 +49,14 @@ def of(system: System) -> tuple[LoopMatrices, Theorem2]:
 @settings(SEARCH, max_examples=4)
 @given(systems(weighted=False))
 def test_theorem_2_is_what_its_equations_say(system: System) -> None:
-    """Every quantity anew, from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
+    """Every quantity recomputed from eq:tau, eq:Htil and eq:normXt; F at t_i = 0 and far out."""
     loop, found = of(system)
     closed, alpha, bar = loop.A + loop.B @ loop.K, system.alpha, found.alpha_bar_per_s
     assert alpha < bar < -spectral_abscissa(closed)
     fast = float(np.abs(np.linalg.eigvals(closed)).max())
     t_s = np.concatenate([np.linspace(0, 20 / fast, 300), np.linspace(0, 20 / (bar - alpha), 300)])
     sampled = np.linalg.norm(expm((closed + bar * np.eye(loop.n)) * t_s[:, None, None]), 2, (1, 2))
-    # ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, and c hardly more than it must be.
+    # ‖e^{(A+BK)t}‖ ≤ c e^{−ᾱt}, and c is close to its smallest possible value.
     assert sampled.max() / ROUNDING <= found.c <= 1.01 * sampled.max()
     beta, delta, c = system.beta, found.delta, found.c
     BK, gap, x0 = norm(loop.B @ loop.K), bar - alpha, float(np.linalg.norm(system.x0))
@@ -79,7 +79,7 @@ def test_theorem_2_is_what_its_equations_say(system: System) -> None:
 @settings(SEARCH, max_examples=4)
 @given(systems(weighted=False))
 def test_no_other_decay_rate_gives_a_longer_inter_event_time(system: System) -> None:
-    """c and ᾱ are free: the best of a fine grid is not much better."""
+    """c and ᾱ are free parameters: the best of a fine grid is not much better."""
     loop, found = of(system)
     closed, x0 = loop.A + loop.B @ loop.K, float(np.linalg.norm(system.x0))
     slowest = -spectral_abscissa(closed)
@@ -98,7 +98,7 @@ def test_no_other_decay_rate_gives_a_longer_inter_event_time(system: System) -> 
 
 
 def test_where_f_bar_is_negative_the_time_is_that_of_the_far_future() -> None:
-    """From x(0) = 0, F grows with t_i, and its limit is what bounds it."""
+    """From x(0) = 0, F grows with t_i, and its limit determines the bound."""
     one = np.ones((1, 1))
     names = ("x",)
     loop = LoopMatrices(
@@ -115,12 +115,12 @@ def test_where_f_bar_is_negative_the_time_is_that_of_the_far_future() -> None:
     away = theorem_2(replace(loop, x0=np.array([100.0])), beta, alpha, delta)
     assert away is not None
     assert away.inter_event_s < found.inter_event_s
-    # Where the largest F is not at t_i = 0, taking it there would promise too much.
+    # Where the largest F is not at t_i = 0, using t_i = 0 would give too large a bound.
     at_0 = 0.2 * found.c * (0 - beta * delta * 3 / (bar - alpha)) / (2 + bar) + F / (2 + alpha)
     assert math.log(1 + beta / at_0) / (2 + bar) > found.inter_event_s
 
 
-def test_theorem_2_presupposes_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
+def test_theorem_2_requires_a_threshold_that_decays_more_slowly_than_the_loop() -> None:
     one = np.ones((1, 1))
     names = ("x",)
     loop = LoopMatrices(one, one, -3 * one, -2 * one, one, one, np.ones(1), None, names, names)
@@ -142,7 +142,7 @@ def test_theorem_2_is_never_exceeded_in_the_papers_loop(system: System, seed: in
 
 
 def stretches(run: ContinuousRun) -> list[list[int]]:
-    """The missed events between two deliveries, as far as the run goes."""
+    """The missed events between two deliveries, or to the end of the run."""
     found: list[list[int]] = []
     missed: list[int] = []
     for event, delivered in enumerate(run.delivered):
@@ -183,12 +183,12 @@ def deltas(system: System, run: ContinuousRun) -> tuple[list[float], Vector]:
 def test_theorem_1_is_never_exceeded_on_its_own_trajectory(
     system: System, seed: int, held: bool
 ) -> None:
-    """And Theorem 3, for a hold. δ̄_j is never shorter than the interval that it bounds."""
+    """Theorem 3, too, for a hold. δ̄_j is never shorter than the interval that it bounds."""
     if held:
         system = replace(system, H=np.zeros_like(system.H))
     speed = float(np.abs(np.linalg.eigvals(system.A + system.B @ system.K)).max())
     for run, _ in observe(system, 6.0 / speed, seed, samples=2):
-        if len(run.before) > 60:  # long enough runs are seen in other examples
+        if len(run.before) > 60:  # other examples contain runs that are long enough
             continue
         claimed, seen = deltas(system, run)
         assert (seen <= np.array(claimed) * ROUNDING).all()
@@ -215,9 +215,9 @@ def test_theorem_1_without_the_oldest_missed_event_is_caught() -> None:
 
 
 def test_the_longest_interval_is_exact_for_two_exponentials() -> None:
-    """‖x‖ = e^t and a model that falls like e^{−t/2}: γ = 1 is the best, and δ̄ = ln(1 + β)/1.5.
+    """‖x‖ = e^t and a model that decays like e^{−t/2}: γ = 1 is the best, and δ̄ = ln(1 + β)/1.5.
 
-    The trajectory is known as far as that only, so that no larger γ can be better.
+    The trajectory is only known up to that time, so no larger γ can be better.
     """
     beta, alpha = 0.5, 0.5
     end_s = math.log(1 + beta) / 1.5
@@ -225,7 +225,7 @@ def test_the_longest_interval_is_exact_for_two_exponentials() -> None:
     found = longest_interval_s(
         Interval(t_s, np.exp(t_s - 2), np.exp(-0.5 * (t_s - 2))), beta * math.exp(1.0), alpha, 0.5
     )
-    # γ is looked for on a grid of 10 per decade.
+    # γ is searched on a grid of 10 points per decade.
     assert found == pytest.approx(end_s, rel=0.05)
     assert found >= end_s * (1 - 1e-9)
     crossing = brentq(lambda t: math.exp(t) - math.exp(-t / 2) - beta * math.exp(-t / 2), 0, 2)
@@ -233,8 +233,8 @@ def test_the_longest_interval_is_exact_for_two_exponentials() -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 2.0])
-def test_the_slower_one_of_model_and_threshold_counts(alpha: float) -> None:
-    """δ̄ = ln((ζ + βe^{−αt_j})/η)/(γ + min(κ, α)), of the best γ on any grid."""
+def test_the_slower_of_model_and_threshold_determines_the_interval(alpha: float) -> None:
+    """δ̄ = ln((ζ + βe^{−αt_j})/η)/(γ + min(κ, α)), for the best γ on any grid."""
     beta, kappa, t_s = 0.2, 0.5, np.linspace(1.0, 1.4, 100)
     passed_s = t_s - 1.0
     x, model = 0.8 + passed_s, np.exp(-kappa * passed_s) * (1 + 0.3 * passed_s)
@@ -253,10 +253,10 @@ def test_a_trajectory_through_0_has_no_longest_interval() -> None:
     through = Interval(t_s, np.abs(t_s - 0.5), np.ones(11))
     assert longest_interval_s(through, 0.1, 0.5, 0.5) == math.inf
     assert theorem_1(-np.eye(1), 0.5, [math.inf]) == math.inf
-    assert theorem_1(-np.eye(1), 0.5, [1e6]) == math.inf  # no number holds e^{5e5}
+    assert theorem_1(-np.eye(1), 0.5, [1e6]) == math.inf  # e^{5e5} overflows
 
 
-def test_theorem_1_by_hand() -> None:
+def test_theorem_1_agrees_with_a_hand_calculation() -> None:
     """H = −1, or 0: 1 + Σ e^{αδ̃_k} sup e^{−τ}, the sup at τ = 0."""
     delays_s = [0.3, 0.5, 0.1]
     expected = 1 + sum(math.exp(0.7 * reach) for reach in (0.9, 0.6, 0.1))

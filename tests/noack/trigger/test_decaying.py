@@ -12,7 +12,7 @@ from noack.trigger.decaying import DecayingTrigger
 def test_the_threshold_decays_exponentially_from_beta(beta: float, alpha: float, t_ns: int) -> None:
     trigger = DecayingTrigger(beta, alpha)
     assert trigger.threshold(0) == beta
-    # The exponent, up to 600, carries its own rounding into the result.
+    # The exponent, up to 600, passes its rounding error on to the result.
     assert trigger.threshold(t_ns) == pytest.approx(
         beta * math.e ** (-alpha * t_ns / 1e9), rel=1e-12
     )

@@ -1,4 +1,4 @@
-"""What each policy's rule says, written down a second time, and what is known of it."""
+"""The rule of each policy, written a second time, and its known properties."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -38,7 +38,7 @@ FORM = np.array([
 
 vectors = st.lists(st.floats(-3, 3), min_size=2, max_size=2).map(np.array)
 Rule = Callable[[float, Vector, Vector, Vector], float]
-"""What is positive at an event, of t in s, x, e_s and the state at the last event, at t = 0."""
+"""Positive at an event; a function of t in s, x, e_s and the state at the last event (t = 0)."""
 
 STATIC: dict[str, tuple[Policy, Rule]] = {
     "decaying": (
@@ -100,7 +100,7 @@ def test_the_dynamic_rule_saves_and_spends(
 
 
 def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
-    """Girard (2015), Proposition: with any η ≥ 0, an event is also one of the rule w < 0."""
+    """Girard (2015), Proposition: with any η ≥ 0, each event also satisfies the rule w < 0."""
     rng = np.random.default_rng(1)
     for _ in range(200):
         trigger = Trigger(
@@ -113,7 +113,9 @@ def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
 
 
 def events_ms(policy: Policy, error: Callable[[int, int], float]) -> Iterator[int]:
-    """Events in the first second, measured each ms, of an error by the time since the last one."""
+    """Events in the first second, tested every ms, for an error given by the time since the last
+    event.
+    """
     trigger, last = Trigger(policy), 0
     trigger.start(0, np.ones(2))
     for t_ms in range(1, 1001):
@@ -135,7 +137,7 @@ def test_periodic_is_a_clock() -> None:
     assert list(events_ms(PeriodicTrigger(70 * MS), growing)) == list(range(70, 1001, 70))
 
 
-def test_a_deadline_breaks_silence_and_nothing_else() -> None:
+def test_a_deadline_only_adds_an_event_after_silence() -> None:
     rule = AbsoluteTrigger(0.1)  # after 71 ms of growth
     assert list(events_ms(DeadlineTrigger(rule, 200 * MS), silent)) == list(range(200, 1001, 200))
     assert list(events_ms(DeadlineTrigger(rule, 200 * MS), growing)) == list(
@@ -144,7 +146,7 @@ def test_a_deadline_breaks_silence_and_nothing_else() -> None:
     assert next(events_ms(DeadlineTrigger(rule, 50 * MS), growing)) == 50
 
 
-def test_a_dwell_time_delays_and_does_nothing_else() -> None:
+def test_a_dwell_time_only_delays_events() -> None:
     rule = AbsoluteTrigger(0.1)
     assert next(events_ms(rule, growing)) == 71
     assert list(events_ms(DwellTrigger(rule, 100 * MS), growing)) == list(range(100, 1001, 100))
@@ -153,7 +155,7 @@ def test_a_dwell_time_delays_and_does_nothing_else() -> None:
     assert list(events_ms(DwellTrigger(rule, 50 * MS), silent)) == []
 
 
-def test_periodic_event_triggering_looks_at_its_grid_only_and_has_a_heartbeat() -> None:
+def test_periodic_event_triggering_tests_on_its_grid_and_has_a_heartbeat() -> None:
     Q = np.diag([0.0, 0.0, 1.0, 1.0])
     assert list(events_ms(QuadraticTrigger(Q, 50 * MS, 0.01), growing)) == list(
         range(100, 1001, 100)
@@ -188,6 +190,6 @@ def test_a_self_triggered_error_stays_below_the_threshold(
         assert error(later) >= threshold(later) * (1 - 1e-6)
 
 
-def test_a_trigger_has_to_be_started() -> None:
+def test_a_trigger_must_be_started_before_use() -> None:
     with pytest.raises(RuntimeError, match="must be started"):
         Trigger(AbsoluteTrigger(1.0)).test(0, np.zeros(2), np.zeros(2))

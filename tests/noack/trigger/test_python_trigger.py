@@ -50,7 +50,9 @@ def events(record: RunRecord) -> list[int]:
 
 
 @pytest.mark.parametrize("protocol", ["none", "ack"])
-def test_a_class_that_sends_on_delta_runs_as_the_policy_does(tmp_path: Path, protocol: str) -> None:
+def test_a_send_on_delta_class_gives_the_same_run_as_the_policy(
+    tmp_path: Path, protocol: str
+) -> None:
     own = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     network = own.network.model_copy(update={"protocol": protocol})
     own = own.model_copy(update={"network": network})
@@ -81,14 +83,14 @@ def test_a_run_keeps_the_file_and_replays_with_it(tmp_path: Path) -> None:
         simulate(resolved)
 
 
-def test_a_sampled_campaign_draws_it(tmp_path: Path) -> None:
+def test_a_sampled_campaign_accepts_a_user_trigger(tmp_path: Path) -> None:
     resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     rows = SampledWork(in_virtual_time(resolved), 1, None, None, 0.5, 1000).run(range(2))
     assert (rows["status"] == OK).all()
     assert np.isfinite(rows["sup_e_c_scaled"]).all()
 
 
-def test_what_needs_a_rule_refuses_it_in_one_line(tmp_path: Path) -> None:
+def test_exact_and_batch_loops_refuse_a_user_trigger_in_one_line(tmp_path: Path) -> None:
     resolved = scenario(tmp_path, SEND_ON_DELTA, parameters="{delta=0.05}")
     for refuses in (continuous_loop_of, setting_of):
         with pytest.raises(CallerError, match="decides at measurements only") as refused:

@@ -1,4 +1,4 @@
-"""What holds of every policy, whichever files the folder of the policies has."""
+"""Properties of every policy file in the policies' folder."""
 
 import json
 from typing import Any
@@ -27,7 +27,7 @@ def scenario(content: dict[str, Any], settings: PolicySettings) -> Scenario:
 
 
 def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Times every 10 ms, and z = (x, e_s) on smooth curves whose error grows."""
+    """Times every 10 ms, and z = (x, e_s) on smooth curves with a growing error."""
     rng = np.random.default_rng(seed)
     t_ns = 10 * MS * np.arange(1, k + 1)
     phase, rate = rng.uniform(0, 6, 2 * N), rng.uniform(0.2, 3, 2 * N)
@@ -37,7 +37,9 @@ def samples(seed: int, k: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_a_table_gives_the_settings_back(content: dict[str, Any], name: str) -> None:
+def test_settings_are_unchanged_by_conversion_to_a_table(
+    content: dict[str, Any], name: str
+) -> None:
     made = scenario(content, EXAMPLES[name])
     assert made.trigger == EXAMPLES[name]
     assert made.trigger.policy == name
@@ -47,7 +49,7 @@ def test_a_table_gives_the_settings_back(content: dict[str, Any], name: str) -> 
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_many_measurements_at_once_give_the_event_that_they_give_one_by_one(
+def test_a_block_of_measurements_gives_the_same_event_as_single_ones(
     content: dict[str, Any], name: str, seed: int
 ) -> None:
     policy = policy_of(resolve(scenario(content, EXAMPLES[name])))
@@ -59,7 +61,8 @@ def test_many_measurements_at_once_give_the_event_that_they_give_one_by_one(
     decisions = (one_by_one.test(int(t), x[:N], x[N:]) for t, x in zip(t_ns, z, strict=True))
     expected = next((k for k, decision in enumerate(decisions) if decision.event), None)
     found = None
-    for begin in range(0, len(z), 32):  # in blocks: what is accumulated goes on
+    # in blocks: accumulated quantities continue from block to block
+    for begin in range(0, len(z), 32):
         block = slice(begin, begin + 32)
         k = at_once.first_event(t_ns[block], z[block, :N], z[block, N:])
         if k is not None:

@@ -1,4 +1,4 @@
-"""Send-on-area: live against a quadrature of its own, exact and batch against scipy."""
+"""Send-on-area: live against an independent quadrature, exact and batch against scipy."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ MS = 1_000_000
 W = np.array([[2.0, 0.5], [0.0, 1.0]])
 
 
-def test_a_live_sensor_sums_trapezoids_and_begins_again_at_an_event() -> None:
+def test_a_live_sensor_sums_trapezoids_and_restarts_at_an_event() -> None:
     trigger, x = Trigger(SendOnAreaTrigger(0.1, W)), np.ones(2)
     trigger.start(0, x)
     since_ms, area, last, events = 0, 0.0, 0.0, []
@@ -58,13 +58,13 @@ def integrated(run: ContinuousRun, weight: np.ndarray | None) -> np.ndarray:
     return np.array(areas)
 
 
-def test_exact_events_are_where_an_integrator_finds_the_area() -> None:
+def test_exact_events_agree_with_an_integrator() -> None:
     events = 0
     for seed in range(8):
         setting, draw = drawn(seed, 0.01)
         run = reference(setting, draw, 3000)
         areas = integrated(run, setting.trigger.weight)
-        first = 0 if setting.known_start else 1  # without a known start, event 0 is at t = 0
+        first = 0 if setting.known_start else 1  # with an unknown start, event 0 is at t = 0
         between = areas[: len(run.event_s) - first]
         np.testing.assert_allclose(between, 0.01, rtol=1e-8)
         assert (areas[len(between) :] <= 0.01 * (1 + 1e-8)).all()
@@ -73,7 +73,7 @@ def test_exact_events_are_where_an_integrator_finds_the_area() -> None:
 
 
 @pytest.mark.parametrize("dwell", [False, True])
-def test_a_batch_finds_the_events_of_the_exact_simulator(dwell: bool) -> None:
+def test_a_batch_has_the_events_of_the_exact_simulator(dwell: bool) -> None:
     events = 0
     for seed in range(6):
         setting, draw = drawn(seed, 0.01)

@@ -1,4 +1,4 @@
-"""Settings of the policies that no machine could follow, and where a mistake lies."""
+"""Policy settings that cannot be applied, and the key that the error names."""
 
 import math
 from typing import Any
@@ -35,7 +35,7 @@ def nested(rule: dict[str, Any]) -> dict[str, Any]:
         ),
     ],
 )
-def test_a_mistake_names_the_key_where_it_lies(
+def test_a_mistake_names_its_key(
     content: dict[str, Any], trigger: dict[str, Any], expected: str
 ) -> None:
     with pytest.raises(CallerError) as found:
@@ -44,6 +44,6 @@ def test_a_mistake_names_the_key_where_it_lies(
     assert "\n" not in str(found.value)
 
 
-def test_what_a_diverging_loop_saves_up_is_infinite_and_no_exception() -> None:
+def test_an_accumulated_quantity_that_overflows_is_infinite_and_raises_nothing() -> None:
     form = QuadraticForm(np.eye(2), np.zeros((0, 2)))
     assert form.values(np.array([[1e200, 0.0]])) == [math.inf]

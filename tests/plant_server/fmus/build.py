@@ -1,4 +1,4 @@
-"""Builds FMUs for tests: of C, with a model description that a test may change."""
+"""Builds FMUs for tests from C sources, with a model description that a test may change."""
 
 import inspect
 import shutil
@@ -29,7 +29,7 @@ _TYPES_3 = {"Real": "Float64", "Integer": "Int32"}
 
 
 def build(folder: Path, version: int, *, edit: tuple[str, str] | None = None) -> Path:
-    """Build the oscillator for an FMI version; ``edit`` replaces a text of its description."""
+    """Build the oscillator for an FMI version; ``edit`` replaces text of its model description."""
     fmpy = pytest.importorskip("fmpy")
     description = _description(version)
     if edit is not None:
@@ -46,7 +46,7 @@ def build(folder: Path, version: int, *, edit: tuple[str, str] | None = None) ->
 
 @cache
 def _compiled(version: int) -> bytes:
-    """The shared library, in which the functions that nobody calls fail."""
+    """The shared library; all functions that noack does not use fail."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler (cc) to build an FMU with")
