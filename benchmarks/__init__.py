@@ -1,1 +1,1 @@
-"""Benchmarks: each measures an alternative in the same run, so that noise hits both alike."""
+"""Benchmarks: each also measures an alternative in the same run, so that noise affects both."""

@@ -1,4 +1,4 @@
-"""A run of the lane example at speed 1 in which something happens to its processes."""
+"""A run of the lane example at speed 1 with a fault in one of its processes."""
 
 import tempfile
 import threading
@@ -22,7 +22,7 @@ from noack.core.linear_systems import Vector
 from noack.protocol.record_tables import CONTROLLER_STEP, PLANT_STEP, SENSOR_MEASUREMENT
 
 STEPS = {"plant": PLANT_STEP, "sensor": SENSOR_MEASUREMENT, "controller": CONTROLLER_STEP}
-"""The table of each process's steps."""
+"""Table of each process's steps."""
 _QUIET_S = 0.25
 """A process has recovered if no step was late for this time."""
 
@@ -31,7 +31,7 @@ Processes = Mapping[str, psutil.Process]
 
 
 class FaultedRun(NamedTuple, Generic[Outcome]):
-    """A run that has ended well."""
+    """A run with a fault that has completed."""
 
     record: RunRecord
     summary: Mapping[str, Any]
@@ -88,7 +88,7 @@ def faulted_run(
 
 
 def recovery_s(late_at_s: Vector, end_s: float) -> float:
-    """Time from a fault's end to the last late step that closely follows the one before.
+    """Return the time from a fault's end to the end of the sequence of late steps that follows it.
 
     Args:
         late_at_s: times of the late steps, ascending, (k,).
@@ -103,7 +103,7 @@ def recovery_s(late_at_s: Vector, end_s: float) -> float:
 
 
 def run_recovery_s(record: RunRecord, end_s: float) -> float:
-    """Longest :func:`recovery_s` of all processes; a step is late by more than a period."""
+    """Return the longest :func:`recovery_s` of all processes; late: by more than a period."""
     period_us = record.scenario.timing.plant_period_ns * 1e-3
     return max(
         recovery_s(

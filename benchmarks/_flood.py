@@ -1,8 +1,8 @@
-"""A flood: datagrams that nobody wants, at a rate or as many as go; a process of its own.
+"""A flood: a separate process sends unwanted datagrams, at a given rate or as fast as possible.
 
-``python -m benchmarks._flood --ports 47001 47002 --seconds 3`` prints, as JSON, when it began and
-ended on the monotonic clock, and how many it sent. They look like state updates of another run, and
-come from several ports in turn. The kernel takes many at once (sendmmsg) where it can.
+``python -m benchmarks._flood --ports 47001 47002 --seconds 3`` prints as JSON the times of start
+and end on the monotonic clock, and the number of datagrams. They are state updates of another run,
+sent from several ports in turn. One call sends many datagrams (sendmmsg) if the system supports it.
 """
 
 import argparse
@@ -27,11 +27,11 @@ _HEADER = struct.Struct("<2sBBHHQ")
 _CHUNK_S = 0.01
 
 Send = Callable[[int], int]
-"""Sends some datagrams, at most so many, one to each port in turn; returns how many."""
+"""Sends at most the given number of datagrams, to each port in turn; returns their number."""
 
 
 class Flood(NamedTuple):
-    """What was sent."""
+    """Result of a flood."""
 
     begun_s: float
     ended_s: float
@@ -39,7 +39,7 @@ class Flood(NamedTuple):
 
     @property
     def rate_hz(self) -> float:
-        """Datagrams a second."""
+        """Datagrams per second."""
         return self.sent / (self.ended_s - self.begun_s)
 
 
@@ -68,7 +68,7 @@ class _Message(ctypes.Structure):
 
 
 class _AtOnce:
-    """Sends with one call to the kernel."""
+    """Sends many datagrams with one system call."""
 
     def __init__(self, ports: Sequence[int], data: bytes) -> None:
         self._call = ctypes.CDLL(None, use_errno=True).sendmmsg
@@ -96,7 +96,7 @@ class _AtOnce:
 
 
 class _OneByOne:
-    """Sends where the system has no such call."""
+    """Sends one datagram per call, where sendmmsg is not available."""
 
     def __init__(self, ports: Sequence[int], data: bytes) -> None:
         self._ports = itertools.cycle(ports)
@@ -130,9 +130,9 @@ def flood(ports: Sequence[int], seconds: float, rate_hz: float | None) -> Flood:
     """Send to ports in turn.
 
     Args:
-        ports: where to.
-        seconds: how long.
-        rate_hz: datagrams a second in all; None is as many as go.
+        ports: destination ports.
+        seconds: duration.
+        rate_hz: total rate of datagrams; None: as fast as possible.
     """
     sent = 0
     with _sending(ports) as send:
@@ -147,7 +147,7 @@ def flood(ports: Sequence[int], seconds: float, rate_hz: float | None) -> Flood:
 
 
 def main() -> None:
-    """Flood, and say what was sent."""
+    """Run the flood and print the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--ports", type=int, nargs="+", required=True)
     parser.add_argument("--seconds", type=float, required=True)

@@ -1,8 +1,8 @@
-"""A bare UDP ping through a bare relay: what one-way latency costs in Python without noack.
+"""A bare UDP ping through a bare relay: the one-way latency of plain Python without noack.
 
-Three processes, as small as they can be: a sender that sleeps until each datagram is due, a relay
-with two sockets that receives and sends, and a receiver. Each blocks in ``recv``; the receiver
-takes the time right after it. A datagram shorter than a ping ends the next process.
+Three minimal processes: a sender that sleeps until each datagram is due, a relay with two sockets,
+and a receiver. Relay and receiver block in ``recv``; the receiver reads the clock right after it. A
+datagram shorter than a ping ends the next process.
 """
 
 import argparse
@@ -22,10 +22,10 @@ from benchmarks._report import MeasurementError
 from noack.runtime.real_time_settings import realtime
 
 PING_BYTES = 80
-"""As long as a state update with four states."""
+"""Size of a state update with four states."""
 FIFO_PRIORITY = 50
 PLACES = {"sender": 1, "relay": 2, "receiver": 3}
-"""The sensor's, the emulator's and the controller's places along the loop."""
+"""Positions of sensor, emulator and controller along the loop."""
 _STAMP = struct.Struct("<q")
 _END = b"end"
 _SETTLE_S = 0.3
@@ -44,9 +44,9 @@ def ping(count: int, period_s: float, *, asked: bool) -> Ping:
     """Send ``count`` datagrams, one every ``period_s``, through the relay.
 
     Args:
-        count: how many.
-        period_s: wall time between two.
-        asked: whether the processes ask for the real-time settings.
+        count: number of datagrams.
+        period_s: wall time between two datagrams.
+        asked: whether the processes request real-time settings.
 
     Raises:
         MeasurementError: a process failed.
@@ -113,7 +113,7 @@ def _send(out: socket.socket, count: int, period_s: float) -> None:
 
 
 def main() -> None:
-    """Be one of the three processes."""
+    """Run one of the three processes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("role", choices=["receiver", "relay", "sender"])
     parser.add_argument("--to", type=int, default=0, help="port of the next process")

@@ -1,7 +1,7 @@
-"""A peer of the relay benchmarks: a relay as one writes it with asyncio.
+"""A peer of the relay benchmarks: a straightforward asyncio relay.
 
 ``python -m benchmarks._relay_asyncio PORT [--delay-ms MS]`` forwards to PORT on loopback, each
-datagram MS later, and prints the port that it listens on.
+datagram MS later, and prints the port on which it listens.
 """
 
 import argparse
@@ -14,7 +14,7 @@ _SO_RCVBUFFORCE = 33
 
 
 class Forward(asyncio.DatagramProtocol):
-    """Sends what it gets through a connected endpoint, at once or later."""
+    """Forwards received datagrams through a connected endpoint, at once or after the delay."""
 
     def __init__(self, out: asyncio.DatagramTransport, delay_s: float) -> None:
         self._out = out

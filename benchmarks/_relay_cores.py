@@ -1,4 +1,4 @@
-"""Where and before whom the load and the relays run."""
+"""Cores and priorities of the load and the relays."""
 
 import os
 from collections.abc import Iterator
@@ -8,13 +8,13 @@ _CORES = sorted(os.sched_getaffinity(0))
 RELAY_CORE, LOAD_CORE = _CORES[0], _CORES[-1]
 
 BEFORE_OTHERS = 1
-"""The least SCHED_FIFO priority. The load and all relays alike have it, where it is granted, so
-that what else the machine does stays out of their comparison."""
+"""The lowest SCHED_FIFO priority. If permitted, the load and all relays have it, so that other
+programs of the machine do not affect their comparison."""
 
 
 @contextmanager
 def on_core(core: int) -> Iterator[None]:
-    """Keep the calling thread, and processes that it starts meanwhile, on one core."""
+    """Pin the calling thread, and processes that it starts within the context, to one core."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {core})
     try:
@@ -25,13 +25,13 @@ def on_core(core: int) -> Iterator[None]:
 
 @contextmanager
 def scheduled(priority: int) -> Iterator[bool]:
-    """SCHED_FIFO for the calling thread and processes that it starts meanwhile, if granted.
+    """Apply SCHED_FIFO to the calling thread and the processes that it starts, if permitted.
 
     Args:
         priority: the priority; :data:`BEFORE_OTHERS` is enough to work undisturbed.
 
     Yields:
-        Whether it was granted.
+        Whether it was permitted.
     """
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     try:

@@ -1,4 +1,4 @@
-"""Decisions of the pure link, without sockets, and an independent look at their runs of losses."""
+"""Decisions of the link without sockets, and an independent check of the loss bursts."""
 
 import functools
 from collections.abc import Callable
@@ -25,17 +25,17 @@ _SETTINGS = LinkSettings(impairments=(LossOf(loss=BernoulliLoss(probability=LOSS
 
 Fates = npt.NDArray[np.uint8]
 Decide = Callable[[int], Fates]
-"""Decides the next n datagrams of each flow, the flows in turn; fates of shape (n, flows)."""
+"""Decides for the next n datagrams of each flow, the flows in turn; returns fates (n, flows)."""
 
 _DELIVERED = np.zeros(256, bool)
 _DELIVERED[[Fate.DELIVERED, Fate.FORCED]] = True
 
 
 class LossRuns:
-    """Successive datagrams of a flow that were not delivered, counted from fates alone.
+    """Consecutive losses of each flow, counted from fates only.
 
     Args:
-        flows: how many flows there are.
+        flows: number of flows.
     """
 
     def __init__(self, flows: int) -> None:
@@ -45,7 +45,7 @@ class LossRuns:
         self.decisions = 0
 
     def add(self, fates: Fates) -> None:
-        """Take the next fates of each flow, shape (n, flows)."""
+        """Add the next fates of each flow, (n, flows)."""
         for row in ~_DELIVERED[fates]:
             self._runs = (self._runs + 1) * row
             self.longest = max(self.longest, int(self._runs.max()))
@@ -54,16 +54,16 @@ class LossRuns:
 
 
 def predicted_loss(probability: float, mansd: int) -> float:
-    """Share of datagrams lost with independent losses, at most ``mansd`` of them in a row.
+    """Return the loss rate of independent losses, at most ``mansd`` of them consecutive.
 
-    A cycle ends with each delivery; it has k losses before it with probability p^k (1 − p) for
-    k < m, and m with p^m, so that E[losses] / E[length] = p (1 − p^m) / (1 − p^(m+1)).
+    A cycle ends with a delivery. It has k losses with probability p^k (1 − p) for k < m, and m
+    losses with probability p^m, so that E[losses] / E[length] = p (1 − p^m) / (1 − p^(m+1)).
     """
     return probability * (1 - probability**mansd) / (1 - probability ** (mansd + 1))
 
 
 def plain(flows: int) -> Decide:
-    """Return the rules as simulation and replay run them, in plain Python."""
+    """Return the rules in plain Python, as simulation and replay run them."""
     link = Link(_SETTINGS, SEED, "relay", "forward")
 
     def decide(count: int) -> Fates:
@@ -77,7 +77,7 @@ def plain(flows: int) -> Decide:
 
 
 def compiled(flows: int) -> Decide:
-    """Return the rules as the fast relay runs them, compiled, a batch per call."""
+    """Return the compiled rules, as the fast relay runs them, one batch per call."""
     admit_compiled = compile_rule(admit_many)
     program = program_of(_SETTINGS, SEED, "relay", "forward")
     state = compiled_state(program, empty_state(program), flows, recent_width(program))

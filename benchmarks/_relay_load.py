@@ -1,7 +1,7 @@
 """The load of the relay benchmarks: ``load.c``, built with ``cc`` and called through ctypes.
 
-The calling process is sender and sink of every relay. Arrivals carry the kernel's receive stamps,
-so that they do not depend on when the sink is read.
+The calling process is sender and sink of every relay. Arrival times are the kernel's timestamps, so
+that they do not depend on the time at which the sink is read.
 """
 
 import ctypes
@@ -27,9 +27,9 @@ _SO_RCVBUFFORCE = 33
 _SO_TIMESTAMPNS = 35
 _SINK_BUFFER_BYTES = 64 * 1024 * 1024
 _KERNEL_BYTES = 1024
-"""More than a small datagram takes in a receive buffer."""
+"""Upper bound on the bytes of a receive buffer that a small datagram occupies."""
 _PATIENCE_NS = 300_000_000
-"""After so long without an arrival the rest of a burst is taken for lost."""
+"""After this time without an arrival, the rest of a burst counts as lost."""
 _PING_TIMEOUT_S = 0.2
 
 _INT, _LONG, _AT = ctypes.c_int, ctypes.c_int64, ctypes.c_void_p
@@ -46,12 +46,12 @@ Nanoseconds = npt.NDArray[np.int64]
 
 
 class Burst(NamedTuple):
-    """What became of a burst."""
+    """Result of a burst."""
 
     wall_s: float
-    """From the relay's going on to the last arrival."""
+    """Time from the relay's continuation to the last arrival."""
     decided: int
-    """Datagrams up to the last one that arrived: so many the relay has taken in and decided."""
+    """Datagrams up to the last one that arrived: the relay has received and decided these."""
     received: int
     """Datagrams that arrived."""
 
@@ -80,15 +80,15 @@ class Soak(ctypes.Structure):
     sent: int
     received: int
     next: int
-    """The number that would follow without a loss."""
+    """The number that would arrive next without a loss."""
     longest_gap: int
-    """Most successive datagrams that did not arrive."""
+    """Maximum number of consecutive datagrams that did not arrive."""
     disordered: int
-    """Arrivals behind a later one."""
+    """Arrivals after a later datagram."""
 
 
 class Built(NamedTuple):
-    """What was compiled for a benchmark."""
+    """The code compiled for a benchmark."""
 
     load: ctypes.CDLL
     relay: Path
@@ -96,7 +96,7 @@ class Built(NamedTuple):
 
 @contextmanager
 def built() -> Iterator[Built]:
-    """Compile the load and the C relay, for as long as the context lasts.
+    """Compile the load and the C relay; they exist within the context.
 
     Raises:
         MeasurementError: there is no C compiler, or it fails.
@@ -120,14 +120,14 @@ def built() -> Iterator[Built]:
 
 
 def sources(count: int) -> npt.NDArray[np.uint32]:
-    """``count`` loopback addresses (127.1.0.0 and on) as the C side takes them: network order."""
+    """``count`` loopback addresses (127.1.0.0 and on) in network byte order, for the C code."""
     return (np.uint32(0x7F010000) + np.arange(count, dtype=np.uint32)).astype(">u4").view(np.uint32)
 
 
 class Ends:
     """Both ends of a path through a relay: a sender connected to it, and the sink behind it.
 
-    Datagrams are numbered from 0 on over all that is sent.
+    All datagrams are numbered consecutively from 0.
 
     Args:
         load: the compiled load.
@@ -144,7 +144,7 @@ class Ends:
             self.sink.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SINK_BUFFER_BYTES)
         buffer_bytes = self.sink.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self.sink_holds = buffer_bytes // _KERNEL_BYTES
-        """So many datagrams can wait at the sink."""
+        """Number of datagrams that can wait at the sink."""
         self.sink.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         timeout = struct.pack("@ll", 0, round(_PING_TIMEOUT_S * 1e6))
         self.sink.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
@@ -152,11 +152,11 @@ class Ends:
 
     @property
     def sink_port(self) -> int:
-        """Where the relay sends to, on loopback."""
+        """The port on loopback to which the relay sends."""
         return int(self.sink.getsockname()[1])
 
     def connect(self, port: int) -> None:
-        """Send to this port of loopback from now on."""
+        """Send to this port on loopback from now on."""
         self.out.connect((LOOPBACK, port))
 
     def close(self) -> None:
@@ -171,13 +171,13 @@ class Ends:
         slack: int = 0,
         addresses: npt.NDArray[np.uint32] | None = None,
     ) -> Burst:
-        """Stop the relay, fill its receive buffer, let it go on, and see it empty the buffer.
+        """Stop the relay, fill its receive buffer, continue it, and wait until the buffer is empty.
 
         Args:
             relay: process id of the relay, a child of this process.
             count: datagrams to send.
-            slack: the burst may be over although so many of the last datagrams have not come.
-            addresses: send from these in turn, see :func:`sources`.
+            slack: the burst may end although this number of last datagrams have not arrived.
+            addresses: send from these in turn; see :func:`sources`.
         """
         found = _Burst()
         senders = (None, 0) if addresses is None else (addresses.ctypes.data, len(addresses))
@@ -189,7 +189,7 @@ class Ends:
         return found.result()
 
     def direct(self, count: int) -> tuple[Burst, float]:
-        """Send straight to the sink; also the CPU seconds that it took."""
+        """Send directly to the sink; also return the CPU time in seconds."""
         found, cpu_ns = _Burst(), ctypes.c_int64()
         self._call(
             "direct", self.sink.fileno(), self._first(count), count, DATAGRAM_BYTES, _PATIENCE_NS,
@@ -198,7 +198,7 @@ class Ends:
         return found.result(), cpu_ns.value * 1e-9
 
     def ping(self, count: int) -> Nanoseconds:
-        """One-way delays of datagrams sent one by one, ns; -1 for what did not come."""
+        """Return the one-way delays of datagrams sent one by one, ns; -1 for a missing one."""
         delays_ns = np.empty(count, np.int64)
         first = self._first(count)
         out = delays_ns.ctypes.data
@@ -206,7 +206,7 @@ class Ends:
         return delays_ns
 
     def pace(self, count: int, period_ns: int) -> Nanoseconds:
-        """One-way delays of datagrams sent every ``period_ns``, ns; -1 for what did not come."""
+        """Return the one-way delays of datagrams sent every ``period_ns``, ns; -1: missing."""
         departures_ns, arrivals_ns = np.empty(count, np.int64), np.full(count, -1, np.int64)
         first = self._first(count)
         self._call("pace", first, count, DATAGRAM_BYTES, period_ns, departures_ns.ctypes.data)

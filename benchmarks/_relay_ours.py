@@ -1,4 +1,4 @@
-"""Our relay as the benchmarks start it, and what it says when it ends."""
+"""Our relay as the benchmarks start it, and its totals."""
 
 import json
 import re
@@ -9,17 +9,17 @@ from typing import NamedTuple
 from benchmarks._report import MeasurementError
 
 READY = re.compile(r"noack netem: 127\.0\.0\.1:(\d+) →")
-"""What it says on standard error when it listens."""
+"""Its line on standard error when it listens."""
 
 
 @dataclass(frozen=True)
 class Ours:
-    """What is asked of our relay.
+    """Settings of our relay.
 
     Args:
         words: the impairments, in tc's words.
-        realtime: ask for the real-time settings.
-        segment: let neighbours of equal size leave as one message that the kernel cuts.
+        realtime: request real-time settings.
+        segment: send successive datagrams of equal size as one message, which the kernel segments.
         engine: which engine; None for the relay's own choice.
         way_back: keep a return path for each client.
     """
@@ -32,7 +32,7 @@ class Ours:
 
 
 class Totals(NamedTuple):
-    """What the relay counted until it ended."""
+    """The relay's final counts."""
 
     arrived: int
     forwarded: int
@@ -41,7 +41,7 @@ class Totals(NamedTuple):
 
 
 def command_of(ours: Ours, to: int) -> list[str]:
-    """The command line that listens on any port of loopback and sends to the port ``to`` of it."""
+    """Return the command line that listens on any port of loopback and sends to its port ``to``."""
     flags = {
         "--realtime": ours.realtime,
         "--segment": ours.segment,
@@ -58,13 +58,13 @@ def command_of(ours: Ours, to: int) -> list[str]:
 
 
 def totals_of(stdout: str) -> Totals:
-    """Read what the relay printed with ``--json``.
+    """Read the output of the relay with ``--json``.
 
     Raises:
-        MeasurementError: it is not what was expected.
+        MeasurementError: the output is not as expected.
     """
     try:
-        _, _, totals = stdout.partition("\n")  # the first line says that it is ready
+        _, _, totals = stdout.partition("\n")  # the first line reports that it is ready
         forward = json.loads(totals)["links"][0]["forward"]
         return Totals(
             arrived=forward["arrived"],

@@ -1,4 +1,4 @@
-"""The relays of the benchmarks, ours and the peers, as processes that a load can be put on."""
+"""The relays of the benchmarks, ours and the peers, as processes under load."""
 
 import re
 import shutil
@@ -23,12 +23,12 @@ from benchmarks._relay_ours import READY, Ours, Totals, command_of, totals_of
 from benchmarks._report import Figures, MeasurementError, Rounds
 
 BURST = 8000
-"""Datagrams in a burst, where the relay's receive buffer holds as many."""
+"""Datagrams in a burst, if the relay's receive buffer holds that many."""
 _PROBE = 20_000
 _LOSSY_SLACK = 16
-"""Successive datagrams that a relay that loses 5 % does not lose in a benchmark's time."""
+"""With 5 % loss, this number of consecutive losses does not occur within a benchmark."""
 _READY_S = 120.0
-"""Longest wait for a relay; ours may have to compile its engine first."""
+"""Maximum wait for a relay to listen; ours may have to compile its engine first."""
 _END_S = 30.0
 _PORT = re.compile(r"^(\d+)$")
 
@@ -38,9 +38,9 @@ class Kind:
     """A kind of relay.
 
     Args:
-        name: as in the tables.
-        command: from the sink's port and a free port to listen on, its command line.
-        says: where it says on which port it listens, and how; None if on the free one.
+        name: its name in the tables.
+        command: returns its command line for the sink's port and a free port to listen on.
+        says: where and how it reports its listening port; None if it is the given free port.
         lossy: whether it may lose datagrams.
     """
 
@@ -51,13 +51,13 @@ class Kind:
 
 
 def c_relay(built: Built, *, segment: bool = False) -> Kind:
-    """``relay.c``."""
+    """Return ``relay.c``."""
     name, words = ("C relay, segments", ["segment"]) if segment else ("C relay", [])
     return Kind(name, lambda to, _: [str(built.relay), str(to), *words])
 
 
 def socat(*, connected: bool = False) -> Kind | str:
-    """Socat one way, without a connected socket or with one; or why there is none."""
+    """Return socat, forward only, with or without a connected socket; or why it is missing."""
     program = shutil.which("socat")
     if program is None:
         return "socat is not installed (Debian: apt-get install socat)"
@@ -73,21 +73,21 @@ def socat(*, connected: bool = False) -> Kind | str:
 
 
 def asyncio_relay(delay_ms: float = 0.0) -> Kind:
-    """The relay of :mod:`benchmarks._relay_asyncio`."""
+    """Return the relay of :mod:`benchmarks._relay_asyncio`."""
     command = [sys.executable, "-m", "benchmarks._relay_asyncio", "--delay-ms", str(delay_ms)]
     return Kind("asyncio relay", lambda to, _: [*command, str(to)])
 
 
 def our_relay(name: str, ours: Ours, *, lossy: bool = True) -> Kind:
-    """``python -m netem``."""
+    """Return ``python -m netem``."""
     return Kind(name, lambda to, _: command_of(ours, to), ("stderr", READY), lossy)
 
 
 def figures_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> Figures:
-    """Return ``per_s``, datagrams received and decided, and ``cpu_us``, CPU time for each.
+    """Return ``per_s``, datagrams received and decided per second, and ``cpu_us`` per datagram.
 
     Raises:
-        MeasurementError: more is missing than the relay can have dropped.
+        MeasurementError: more datagrams are missing than the relay can have dropped.
     """
     if burst.decided < sent - slack or (slack == 0 and burst.received != sent):
         raise MeasurementError(f"{name}: of a burst of {sent} only {burst.received} arrived")
@@ -95,7 +95,7 @@ def figures_of(name: str, burst: Burst, sent: int, slack: int, cpu_s: float) -> 
 
 
 class Relay:
-    """A running relay with its ends."""
+    """A running relay with its sender and sink."""
 
     def __init__(self, kind: Kind, process: subprocess.Popen[str], ends: Ends) -> None:
         self.name = kind.name
@@ -106,11 +106,11 @@ class Relay:
         self._burst = 0
 
     def cpu_s(self) -> float:
-        """CPU time of all its threads so far, the kernel's work for it included."""
+        """CPU time of all its threads so far, including system time."""
         return self._scheduled_s(0)
 
     def waited_s(self) -> float:
-        """Time for which its threads could have worked so far, but others had their core."""
+        """Time so far in which its threads were ready to run, but other threads had their core."""
         return self._scheduled_s(1)
 
     def _scheduled_s(self, field: int) -> float:
@@ -118,7 +118,7 @@ class Relay:
         return sum(int(task.read_text().split()[field]) for task in tasks) * 1e-9
 
     def burst(self, addresses: npt.NDArray[np.uint32] | None = None) -> Figures:
-        """Let it work off one burst; the first time also find out how many its buffer holds.
+        """Send it one burst; the first time, also determine the capacity of its buffer.
 
         Args:
             addresses: send from these in turn; None for one sender.
@@ -133,7 +133,7 @@ class Relay:
         return figures_of(self.name, found, self._burst, self._slack, self.cpu_s() - before_s)
 
     def totals(self) -> Totals:
-        """End our relay as Ctrl-C does; what it counted."""
+        """End our relay as Ctrl-C does; return its totals."""
         self._process.send_signal(signal.SIGINT)
         try:
             stdout, _ = self._process.communicate(timeout=_END_S)
@@ -144,10 +144,10 @@ class Relay:
 
 @contextmanager
 def running(kind: Kind, built: Built) -> Iterator[Relay]:
-    """Run a relay on its core, between two ends.
+    """Run a relay on its core, between sender and sink.
 
     Raises:
-        MeasurementError: it does not begin to listen.
+        MeasurementError: it does not start to listen.
     """
     ends = Ends(built.load)
     chosen = _free_port()
@@ -168,13 +168,15 @@ def running(kind: Kind, built: Built) -> Iterator[Relay]:
 def start_all(
     kinds: Mapping[str, Kind | str], built: Built, stack: ExitStack, rounds: Rounds
 ) -> list[Relay]:
-    """Run relays until the stack ends, and return them; others are missing in the rounds.
+    """Start relays that run until the stack ends, and return them.
+
+    A relay that does not start is missing in the rounds.
 
     Args:
-        kinds: by name a kind of relay, or the reason why there is none.
+        kinds: kinds of relays by name, or the reason why there is none.
         built: the compiled load.
         stack: ends the relays.
-        rounds: gets the reasons.
+        rounds: receives the reasons for missing relays.
     """
     relays: list[Relay] = []
     for name, kind in kinds.items():
@@ -191,7 +193,7 @@ def start_all(
 def in_turn(
     relays: list[Relay], rounds: Rounds, measure: Callable[[Relay], Figures | None]
 ) -> None:
-    """Measure a round of each relay; one that fails is missing in the rounds from then on."""
+    """Measure one round of each relay; a relay that fails is missing from then on."""
     for relay in list(relays):
         try:
             figures = measure(relay)

@@ -1,4 +1,4 @@
-"""Rounds, rows, tables and JSON of the benchmarks, and the load of the machine meanwhile."""
+"""Rounds, rows, tables and JSON of the benchmarks, and the machine's other load."""
 
 import argparse
 import json
@@ -16,12 +16,12 @@ from rich.console import Console
 from rich.table import Table
 
 BUSY_SHARE = 0.1
-"""Other programs' share of all cores from which figures are called doubtful."""
+"""Figures are reported as doubtful if other programs used at least this share of all cores."""
 STEAL_SHARE = 0.01
-"""Share of all cores taken by the hypervisor from which figures are called doubtful."""
+"""Figures are reported as doubtful if the hypervisor took at least this share of all cores."""
 
 _TABLE_WIDTH = 130
-"""Of a table that does not go to a terminal."""
+"""Columns of a table, if the output is not a terminal."""
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
     "<=": lambda found, limit: found <= limit,
@@ -32,11 +32,11 @@ _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
 
 
 class MeasurementError(Exception):
-    """A benchmark could not be measured, for the reason given in one line."""
+    """A benchmark could not be measured; the message is the reason, one line."""
 
 
 class Peer(NamedTuple):
-    """The alternative that was measured in the same run."""
+    """The figure of the alternative, measured in the same run."""
 
     name: str
     value: float | None
@@ -65,11 +65,11 @@ class Row:
         value: the figure; None if it could not be measured.
         unit: its unit.
         peer: the alternative, in the same unit.
-        goal: what the ratio to the peer has to satisfy; without a peer, the value itself.
-        note: anything a reader has to know.
+        goal: condition on the ratio to the peer; without a peer, on the value.
+        note: a remark for the reader.
         unjudged: why the goal cannot be judged although there is a figure.
-        paired_ratio: median over rounds of the ratio to the peer within a round, where both were
-            measured in alternating rounds; it takes the place of the ratio of the two figures.
+        paired_ratio: if both sides were measured in alternating rounds, the median over rounds of
+            the ratio within a round; it replaces the ratio of the two figures.
     """
 
     name: str
@@ -83,7 +83,7 @@ class Row:
 
     @property
     def ratio(self) -> float | None:
-        """Our value per the peer's."""
+        """Ratio of our value to the peer's."""
         if self.paired_ratio is not None:
             return self.paired_ratio
         if self.value is None or self.peer is None or not self.peer.value:
@@ -99,7 +99,7 @@ class Row:
         return self.goal.holds(found)
 
     def as_json(self) -> dict[str, Any]:
-        """The row as written by ``--json``."""
+        """Return the row as ``--json`` writes it."""
         row: dict[str, Any] = {
             "name": self.name,
             "value": self.value,
@@ -122,7 +122,7 @@ class CpuTimes(NamedTuple):
 
 
 def cpu_times(stat: str) -> CpuTimes:
-    """CPU times from the content of ``/proc/stat``; guests are counted as user time already."""
+    """Return CPU times from the content of ``/proc/stat``; user time already includes guests."""
     ticks = [int(field) for field in stat.splitlines()[0].split()[1:9]]
     user, nice, system, idle, iowait, irq, softirq, steal = ticks
     busy = user + nice + system + irq + softirq
@@ -131,13 +131,13 @@ def cpu_times(stat: str) -> CpuTimes:
 
 
 class Load:
-    """How busy the machine was with other programs from its construction on."""
+    """The machine's load by other programs since the object's construction."""
 
     def __init__(self) -> None:
         self._before = self._read()
 
     def rows(self) -> list[Row]:
-        """Shares of all cores that went to other programs and to the hypervisor."""
+        """Return the shares of all cores used by other programs and by the hypervisor."""
         if self._before is None or (now := self._read()) is None:
             return []
         (before, own_before_s), (after, own_after_s) = self._before, now
@@ -164,13 +164,13 @@ def _share(name: str, share: float, doubtful: float) -> Row:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark as the command line knows it.
+    """A benchmark of the command line.
 
     Args:
-        name: its file's name.
+        name: name of its file.
         title: title of its table.
-        measure: carries it out and returns its rows.
-        add_arguments: declares options of its own.
+        measure: runs it and returns its rows.
+        add_arguments: declares its own options.
     """
 
     name: str
@@ -180,7 +180,7 @@ class Benchmark:
 
 
 def median(values: Iterable[float]) -> float:
-    """Median over rounds."""
+    """Return the median over rounds."""
     return statistics.median(values)
 
 
@@ -193,7 +193,7 @@ class Rounds:
 
     def __init__(self) -> None:
         self.missing: dict[str, str] = {}
-        """By side without (valid) figures, the reason."""
+        """For each side without valid figures, the reason."""
         self._figures: dict[str, list[Figures]] = {}
 
     def add(self, side: str, figures: Figures | str) -> None:
@@ -221,7 +221,7 @@ class Rounds:
             peer: the alternative's side.
             goal: see :class:`Row`.
             note: for the reader.
-            paired: take the median of the rounds' ratios, as a disturbance affects both sides of
+            paired: use the median of the rounds' ratios, since a disturbance affects both sides of
                 a round; False: the ratio of the medians.
         """
         sides = [side for side in (ours, peer) if side is not None]
@@ -238,12 +238,12 @@ class Rounds:
 
 
 def say(text: str) -> None:
-    """Tell a waiting person what is being measured."""
+    """Print what is being measured."""
     print(f"  {text} ...", file=sys.stderr, flush=True)
 
 
 def table_of(title: str, rows: Sequence[Row]) -> Table:
-    """The rows as a table."""
+    """Return the rows as a table."""
     table = Table(title=title, title_justify="left")
     for heading in ("figure", "value", "alternative", "its value", "ratio", "goal", "holds"):
         right = heading in ("value", "its value", "ratio", "goal")

@@ -1,4 +1,4 @@
-"""Runs of noack as a user starts them: a process of their own, watched from outside."""
+"""Runs of noack as a user starts them: separate processes, observed from outside."""
 
 import json
 import os
@@ -15,27 +15,27 @@ from benchmarks._report import MeasurementError
 
 _PROGRESS = re.compile(r"^([0-9.]+)/[0-9.e+]+ s\b")
 _ROUNDING_S = 0.05
-"""A progress line shows tenths of a second."""
+"""Rounding error of a progress line, which shows tenths of a second."""
 
 PLAIN_TERMINAL = {"FORCE_COLOR": "1", "TERM": "dumb"}
-"""Has a pipe taken for a terminal that cannot redraw a line; into others goes no progress."""
+"""Makes noack treat a pipe as a simple terminal; other pipes receive no progress lines."""
 FREE_PORTS = tuple(
     argument
     for role in ("plant", "sensor", "netem", "controller")
     for argument in ("--set", f"ports.{role}=0")
 )
-"""Lets runs of a benchmark go on beside a demo, whose ports are fixed."""
+"""Free ports, so that a benchmark can run at the same time as a demo, whose ports are fixed."""
 
 
 class Line(NamedTuple):
-    """A line of a program's standard error, and when it was read."""
+    """A line of a program's standard error, and the time at which it was read."""
 
     at_s: float
     text: str
 
 
 class Finished(NamedTuple):
-    """A program that has ended well."""
+    """A program that has ended with exit status 0."""
 
     begun_s: float
     lines: list[Line]
@@ -43,7 +43,7 @@ class Finished(NamedTuple):
 
 
 class NoackRun(NamedTuple):
-    """A run of noack that has ended well."""
+    """A completed run of noack."""
 
     summary: dict[str, Any]
     first_step_s: float | None
@@ -51,7 +51,7 @@ class NoackRun(NamedTuple):
 
 
 def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
-    """Run a program to its end, noting when each line of its standard error came.
+    """Run a program to its end, recording the time of each line of its standard error.
 
     Raises:
         MeasurementError: it failed.
@@ -72,13 +72,13 @@ def execute(command: Sequence[str], cwd: Path | None = None) -> Finished:
 
 
 def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
-    """Upper bound of the time from ``begun_s`` to the first control step of a run at speed 1.
+    """Return an upper bound of the time from ``begun_s`` to the first control step at speed 1.
 
     A progress line that shows simulated time t and is read at time s proves that the run's epoch
-    was at s − t or before, to the line's rounding: s − t is the epoch plus the line's way through
-    the recorder to us, some hundredths of a second. The least over all lines is the best bound. The
-    first control step follows the epoch by half a control period, 1 ms, which is far less than what
-    the bound gives away. None if there was no progress line.
+    was at s − t or before, up to the line's rounding: s − t is the epoch plus the line's delay,
+    some hundredths of a second. The minimum over all lines is the best bound. The first control
+    step is half a control period (1 ms) after the epoch, far less than the bound's slack. None if
+    there was no progress line.
     """
     bounds_s = [
         line.at_s - (float(found[1]) - _ROUNDING_S) - begun_s
@@ -89,7 +89,7 @@ def first_step_s(begun_s: float, lines: Iterable[Line]) -> float | None:
 
 
 def noack(*arguments: str) -> NoackRun:
-    """Run ``noack ARGUMENTS`` to its end and return what it measured of itself.
+    """Run ``noack ARGUMENTS`` to its end and return its own measurements.
 
     Raises:
         MeasurementError: it failed.

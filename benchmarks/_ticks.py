@@ -1,4 +1,4 @@
-"""Loops that tick at a fixed rate and note how late each tick is: ours and two alternatives."""
+"""Loops that tick at a fixed rate and record each tick's lateness: ours and two alternatives."""
 
 import argparse
 import asyncio
@@ -31,13 +31,13 @@ class Ticks(NamedTuple):
 
 
 def ticks(kind: str, seconds: float, period_us: int, *, asked: bool) -> Ticks:
-    """Run a loop in a process of its own.
+    """Run a loop in a separate process.
 
     Args:
         kind: one of LOOPS.
-        seconds: how long.
+        seconds: duration.
         period_us: time between two ticks.
-        asked: whether it asks for the real-time settings.
+        asked: whether it requests real-time settings.
 
     Raises:
         MeasurementError: the process failed.
@@ -54,7 +54,7 @@ def ticks(kind: str, seconds: float, period_us: int, *, asked: bool) -> Ticks:
 
 
 class _Ticker:
-    """A machine that does nothing but note its lateness."""
+    """A machine that only records its lateness."""
 
     def __init__(self, count: int, period_ns: int) -> None:
         self.late_ns: list[int] = []
@@ -75,7 +75,7 @@ class _Ticker:
 
 
 class _Nowhere:
-    """Takes what the ticker never puts out."""
+    """An output that is never used."""
 
     def append(self, record: Record) -> None: ...
     def notice(self, notice: Notice) -> None: ...
@@ -83,7 +83,7 @@ class _Nowhere:
 
 
 class _Silence:
-    """A socket that nothing is sent to."""
+    """A socket that never receives anything."""
 
     def __init__(self) -> None:
         self._endpoint = bind(0, "port")
@@ -118,7 +118,7 @@ def _time_sleep(count: int, period_ns: int) -> list[int]:
 
 def _asyncio(count: int, period_ns: int) -> list[int]:
     late_ns: list[int] = []
-    loop = asyncio.new_event_loop()  # its time is the monotonic clock's
+    loop = asyncio.new_event_loop()  # its clock is the monotonic clock
     begin_ns = time.monotonic_ns()
 
     def tick() -> None:

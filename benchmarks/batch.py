@@ -1,10 +1,10 @@
-"""The batch engine against what a user would write, in runs per second on one core.
+"""The batch engine compared with what a user would write, in runs per second on one core.
 
-Three sides take the same draws of the lane example, with the same packet fates: the engine; scipy's
+Three sides use the same draws of the lane example, with the same packet fates: the engine; scipy's
 integrator with an event function, at rtol 1e-8; and numpy loops with exact steps of 1 ms. The
 engine also measures each run (cost, settling time, supremum of the error); the others only find the
-events. Under other policies than the paper's, the engine is beside the exact simulator, which finds
-the same events by another method, in Python.
+events. For policies other than the paper's, the engine is compared with the exact simulator, which
+finds the same events by another method, in Python.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
-# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -45,18 +45,18 @@ from noack.core.linear_systems import Vector
 Mode = Literal["model", "zoh"]
 Method = Literal["RK45", "DOP853"]
 METHODS: tuple[Method, ...] = ("RK45", "DOP853")
-"""Of the integrator: its own choice, and its best at this accuracy, which few users choose."""
+"""Methods of the integrator: its default, and the fastest at this accuracy."""
 
 ROUNDS = 5
 DRAWS = 200
-"""Different plants and losses; a batch repeats them."""
+"""Number of different plants and losses; a batch repeats them."""
 _REPEATED = {"model": 40, "zoh": 8}
 _INTEGRATED = {"model": 20, "zoh": 3}
 """Runs of the integrator in a round."""
 _STEP_S = 1e-3
 _FATES = 1000
 _AGREEMENT_S = 1e-4
-"""What the integrator's errors of 1e-8 add up to over hundreds of events."""
+"""Accumulated effect of the integrator's errors of 1e-8 over hundreds of events."""
 _GOALS = {"model": 20_000.0, "zoh": 3_000.0}
 _SIMULATED = 10
 """Runs of the exact simulator in a round."""
@@ -65,7 +65,7 @@ _SIMULATED = 10
 def drawn(
     mode: Mode, trigger: Mapping[str, Any] | None = None
 ) -> tuple[Setting, Population, NDArray[np.bool_]]:
-    """The draws, under the paper's trigger unless given, and the fates of their first updates."""
+    """Return the draws, by default with the paper's trigger, and the fates of the first updates."""
     scenario = load(find_scenario("lane_following"), ()).model_copy(update={"mode": mode})
     if trigger is not None:
         content = scenario.model_dump(mode="json") | {"trigger": trigger}
@@ -89,7 +89,7 @@ def drawn(
 def integrated(
     setting: Setting, draw: Population, delivered: NDArray[np.bool_], method: Method
 ) -> list[float]:
-    """Event times by ``solve_ivp``: plant and both models, from one crossing to the next."""
+    """Return event times by ``solve_ivp`` of plant and both models, from crossing to crossing."""
     A, B, x = draw.A[0], draw.B[0], draw.x0[0]
     n, trigger = len(x), setting.trigger
     field = np.zeros((3 * n, 3 * n))
@@ -122,13 +122,13 @@ def stepped(
     x0: NDArray[np.float64],
     fates: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Events of k runs at once by steps of 1 ms, each exact; the trigger is looked at after each.
+    """Find the events of k runs at once by exact steps of 1 ms, with a trigger test after each.
 
     Args:
-        setting: what they share.
-        transitions: of one step, (k, 3n, 3n).
-        x0: (k, n).
-        fates: of each run's updates, (k, most).
+        setting: the settings that they share.
+        transitions: (k, 3n, 3n) transition matrices of one step.
+        x0: (k, n) initial states.
+        fates: (k, most) fates of each run's updates.
     """
     n, trigger = x0.shape[1], setting.trigger
     steps = round(setting.horizon_s / _STEP_S)
@@ -148,7 +148,7 @@ def stepped(
 def stepped_alone(
     setting: Setting, transition: NDArray[np.float64], x0: Vector, fates: NDArray[np.bool_]
 ) -> int:
-    """The same for one run, as it is usually written."""
+    """Find the events of one run in the same way, with the usual plain loop."""
     n, trigger = len(x0), setting.trigger
     z, events = np.concatenate([x0, x0, x0]), 1
     for step in range(1, round(setting.horizon_s / _STEP_S) + 1):
@@ -164,7 +164,7 @@ def stepped_alone(
 
 
 def transition(setting: Setting, draw: Population) -> NDArray[np.float64]:
-    """The matrix of one step of 1 ms of plant and both models."""
+    """Return the transition matrix of plant and both models for a step of 1 ms."""
     n = len(setting.H)
     field = np.zeros((3 * n, 3 * n))
     field[:n, :n], field[:n, 2 * n :] = draw.A[0], draw.B[0] @ setting.K
@@ -173,14 +173,14 @@ def transition(setting: Setting, draw: Population) -> NDArray[np.float64]:
 
 
 def per_s(runs: int, call: Callable[[], object]) -> float:
-    """Runs per second of CPU time of this thread, which nobody else's load lengthens much."""
+    """Return runs per second of this thread's CPU time, on which other load has little effect."""
     begun_ns = time.thread_time_ns()
     call()
     return runs / ((time.thread_time_ns() - begun_ns) * 1e-9)
 
 
 def rows_of(mode: Mode) -> list[Row]:
-    """The rows of a mode, all sides in turn."""
+    """Return the rows of a mode, all sides measured in turn."""
     setting, population, fates = drawn(mode)
     draws = [Population(*(part[i : i + 1] for part in population)) for i in range(DRAWS)]
     batch = Population(*(np.concatenate([part] * _REPEATED[mode]) for part in population))
@@ -232,9 +232,9 @@ def rows_of(mode: Mode) -> list[Row]:
 
 
 def rows_of_policies() -> list[Row]:
-    """A row for each policy but the paper's, model-based, beside the exact simulator.
+    """Return a row for each policy but the paper's (model mode), compared with the exact simulator.
 
-    A policy whose events may accumulate where updates are lost is measured with a dwell time only.
+    If losses can make the events of a policy accumulate, it is only measured with a dwell time.
     """
     rows = []
     for name, settings in POLICIES.items():
@@ -270,7 +270,7 @@ def rows_of_policies() -> list[Row]:
 def simulated(
     setting: Setting, draws: Sequence[Population], fates: NDArray[np.bool_]
 ) -> list[ContinuousRun]:
-    """The first few draws by the exact simulator."""
+    """Simulate the first few draws with the exact simulator."""
     runs = []
     for (A, B, x0, _), delivered in zip(draws[:_SIMULATED], fates, strict=False):
         loop = LoopMatrices(
@@ -284,7 +284,7 @@ def simulated(
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Both modes under the paper's policy, and the others."""
+    """Measure both modes of the paper's policy, and the other policies."""
     rows: list[Row] = []
     for mode in ("model", "zoh"):
         say(mode)

@@ -1,7 +1,7 @@
-"""A shipped campaign: what a second worker brings, and time and memory of a million runs.
+"""A shipped campaign: the speed-up by a second worker, and time and memory of a million runs.
 
-The workers of one round run the same draws in turn, from the first process that starts to the last
-file that is written. The million is the command as a user types it, with its summary and page.
+In a round, one and then two workers run the same draws, timed from the start of the first process
+to the last written file. The million runs are the user's command, with summary and page.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import threading
 import time
 from pathlib import Path
 
-# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import psutil
@@ -30,7 +30,7 @@ from cosim.studies.campaign.chunk_store import Store
 NAME = "mb_vs_zoh"
 ROUNDS = 3
 SHARED_DRAWS = 40_000
-"""At each grid point of the rounds; enough for the start of processes to weigh little."""
+"""Draws per grid point of the rounds; enough to make the start of processes negligible."""
 WORKERS_GOAL = Goal(">=", 1.8)
 MEMORY_GOAL = Goal("<=", 1024)
 """MiB."""
@@ -38,7 +38,7 @@ _LOOK_EVERY_S = 0.5
 
 
 def runs_per_s(workers: int, draws: int) -> float:
-    """Throughput of the campaign with so many workers."""
+    """Return the throughput of the campaign with this number of workers."""
     path = find_shipped(NAME, "campaigns")
     plan = load(path)
     with tempfile.TemporaryDirectory() as folder:
@@ -50,7 +50,7 @@ def runs_per_s(workers: int, draws: int) -> float:
 
 
 class PeakMemory:
-    """Largest memory of a process and its descendants, pages that several share counted once."""
+    """Peak memory of a process and its descendants; shared pages count once."""
 
     def __init__(self, process: psutil.Process) -> None:
         self._process, self._ended = process, threading.Event()
@@ -68,14 +68,14 @@ class PeakMemory:
             self.mib = max(self.mib, total_bytes / 2**20)
 
     def end(self) -> float:
-        """Stop looking; the peak in MiB."""
+        """Stop sampling; return the peak in MiB."""
         self._ended.set()
         self._thread.join()
         return self.mib
 
 
 def whole(draws: int) -> tuple[float, float]:
-    """Seconds and peak MiB of the command.
+    """Return seconds and peak MiB of the command.
 
     Raises:
         MeasurementError: it failed.
@@ -98,7 +98,7 @@ def whole(draws: int) -> tuple[float, float]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """The rounds, then the million."""
+    """Measure the rounds, then the million runs."""
     one, two = [], []
     for number in range(ROUNDS):
         say(f"{NAME}, one worker and two, round {number + 1} of {ROUNDS}")

@@ -1,6 +1,6 @@
-"""The demo, as a user runs it: is every sample there, did only netem lose anything, was it in time?
+"""The demo, as a user runs it: missing samples, unintended losses, and late steps.
 
-A plant step is late that is made more than one period after its time.
+A plant step is late if it is made more than one period after its time.
 """
 
 import argparse

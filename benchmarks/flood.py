@@ -1,8 +1,8 @@
-"""What a flood does to a run at speed 1: with the shield, and without it.
+"""Effect of a flood on a run at speed 1: with and without the per-peer kernel sockets (shield).
 
-From another process, in the middle of a run of the paper's example, datagrams of another run come
-to one port or to all: at five times the loop's rate, and as many as go. Without the shield what
-comes from the peer and what comes from elsewhere share a queue, as on systems that have none.
+In the middle of a run of the paper's example, another process sends datagrams of another run to one
+port or to all: at five times the loop's rate, and as fast as possible. Without the shield, traffic
+from the peer and traffic from unknown sources share a queue, as on systems without peer sockets.
 """
 
 import argparse
@@ -42,9 +42,9 @@ class Case(NamedTuple):
     name: str
     roles: Sequence[str]
     rate_hz: float | None
-    """Datagrams a second in all; None is as many as go."""
+    """Total rate of datagrams; None: as fast as possible."""
     asked: bool = True
-    """Whether the run asks for real-time settings."""
+    """Whether the run requests real-time settings."""
 
 
 CASES = (
@@ -58,8 +58,8 @@ CASES = (
 def figures_of(run: FaultedRun[Flood]) -> Figures:
     """Return the effects of a flood on a run at speed 1.
 
-    ``missed`` measurements did not reach the sensor; ``lost`` are all datagrams of the loop that
-    were lost elsewhere than in the emulator; lateness is that of the latest process, p99.
+    ``missed``: measurements that did not reach the sensor. ``lost``: all datagrams of the loop that
+    were lost outside the emulator. Lateness: p99 of the process with the largest value.
     """
     record, flood = run.record, run.outcome
     begin_s, end_s = flood.begun_s - run.epoch_s, flood.ended_s - run.epoch_s
@@ -124,7 +124,7 @@ def _flood(case: Case, processes: Processes) -> Flood:
 
 
 def rows_of(case: Case, rounds: Rounds) -> list[Row]:
-    """Return a case's rows: with the shield, beside those without."""
+    """Return a case's rows: with the shield, compared with those without."""
     figures = (
         ("the flood", "datagrams/s", "rate_hz"),
         ("measurements missed", "", "missed"),

@@ -1,10 +1,10 @@
 """One-way latency from the sensor's event to the controller's update, through netem.
 
 Compared with a bare Python UDP ping through a bare two-socket relay (:mod:`benchmarks._ping`) at
-the same period, with the same datagram size and the same real-time settings. Ours includes what the
-ping lacks: the sensor's trigger test, tagging and checking the datagram, the loss model, the MANSD
-cap and the record, on a machine that also runs the plant, the control plane and the recorder. In
-this scenario every measurement is an event, so that each run gives thousands of updates.
+the same period, with the same datagram size and the same real-time settings. Ours also includes the
+sensor's trigger test, tagging and checking the datagram, the loss model, the MANSD cap and the
+record, on a machine that also runs the plant, the control plane and the recorder. In this scenario
+every measurement is an event, so that each run gives thousands of updates.
 """
 
 import argparse

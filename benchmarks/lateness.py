@@ -1,8 +1,8 @@
-"""Lateness of a 1 kHz loop of ours, against cyclictest, asyncio and ``time.sleep``.
+"""Lateness of our 1 kHz loop, compared with cyclictest, asyncio and ``time.sleep``.
 
 cyclictest (Debian: rt-tests) is the kernel's own measure: a C loop on ``clock_nanosleep`` with
 SCHED_FIFO, locked memory and no deep idle states, the settings that our processes request. Without
-SCHED_FIFO there is no such comparison, and the goal is not judged.
+SCHED_FIFO, there is no comparison with cyclictest, and the goal is not judged.
 """
 
 import argparse
@@ -26,7 +26,7 @@ _ASKED = {True: "real-time settings", False: "no settings"}
 
 
 def quantile_of(histogram: Mapping[int, int], share: float) -> float:
-    """Quantile of a histogram with bins of 1 µs: the middle of the bin that it falls in."""
+    """Return a quantile of a histogram with bins of 1 µs: the middle of its bin."""
     rank = share * sum(histogram.values())
     seen = 0
     for low_us, count in sorted(histogram.items()):
@@ -39,7 +39,7 @@ def quantile_of(histogram: Mapping[int, int], share: float) -> float:
 def cyclictest(
     seconds: int = ROUND_S, priority: int = FIFO_PRIORITY, core: int | None = None
 ) -> Figures | str:
-    """Lateness in a round of cyclictest, p50, p99 and max in µs; or why there is none.
+    """Return the lateness in a round of cyclictest, p50, p99 and max in µs; or why there is none.
 
     Args:
         seconds: length of the round.

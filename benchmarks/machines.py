@@ -1,7 +1,7 @@
-"""Cost per call of the pure machines, the wire format and the telemetry buffer.
+"""Cost per call of the state machines, the wire format and the telemetry buffer.
 
-Each stands against what one would write without it: pickle with HMAC, JSON, a matrix exponential in
-each step, a general integrator. Both sides make the same calls on the same inputs, in turn.
+Each is compared with a simple alternative: pickle with HMAC, JSON, a matrix exponential in each
+step, a general integrator. Both sides make the same calls on the same inputs, in turn.
 """
 
 import argparse
@@ -43,7 +43,7 @@ Batch = Callable[[], object]
 
 
 class Case(NamedTuple):
-    """A pair to compare; each side is set up anew for each round, outside the timing."""
+    """Two sides to compare; each is set up again for each round, outside the timing."""
 
     name: str
     ours: Callable[[], Batch]
@@ -52,7 +52,7 @@ class Case(NamedTuple):
 
 
 class Inputs:
-    """What both sides of all cases work on: the paper's loop and a stretch of its measurements."""
+    """The inputs of all cases: the paper's loop and a series of its measurements."""
 
     def __init__(self) -> None:
         self.scenario: Scenario = resolve(load(find_scenario("lane_following"), ()))
@@ -83,13 +83,13 @@ def each(calls: Callable[..., object], *inputs: Iterable[object]) -> Batch:
 
 
 def pickled(key: bytes, message: Message) -> bytes:
-    """A message as a pickle, tagged with HMAC-SHA-256."""
+    """Return a message as a pickle, tagged with HMAC-SHA-256."""
     content = pickle.dumps(tuple(message), pickle.HIGHEST_PROTOCOL)
     return content + hmac.digest(key, content, hashlib.sha256)
 
 
 def unpickled(key: bytes, datagram: bytes) -> Message:
-    """A message back from :func:`pickled`.
+    """Return the message of a datagram of :func:`pickled`.
 
     Raises:
         ValueError: the tag is wrong.
@@ -101,7 +101,7 @@ def unpickled(key: bytes, datagram: bytes) -> Message:
 
 
 def wire_cases(inputs: Inputs) -> list[Case]:
-    """Datagrams there and back, authenticated, against pickle with HMAC-SHA-256."""
+    """Encode and decode authenticated datagrams, compared with pickle with HMAC-SHA-256."""
     key, messages = inputs.key, inputs.measurements
     encoder = Encoder(1, key)
     ours = [encoder.encode(message) for message in messages]
@@ -116,7 +116,7 @@ def wire_cases(inputs: Inputs) -> list[Case]:
 
 
 def telemetry_case(inputs: Inputs) -> Case:
-    """A row into the record's buffer, batches included, against a list that becomes JSON."""
+    """Add a row to the record's buffer, including batches, compared with a list written as JSON."""
     loop = inputs.loop
     table = {PLANT_STEP: tables(loop.n, loop.m)[PLANT_STEP]}
 
@@ -137,7 +137,7 @@ def telemetry_case(inputs: Inputs) -> Case:
 
         def batch() -> None:
             for row in rows:
-                gathered.append(row.row)  # noqa: PERF401 - one by one, as a loop would
+                gathered.append(row.row)  # noqa: PERF401 - one by one, like the other side
             json.dumps(gathered, default=np.ndarray.tolist).encode()
 
         return batch
@@ -146,7 +146,7 @@ def telemetry_case(inputs: Inputs) -> Case:
 
 
 def machine_cases(inputs: Inputs) -> list[Case]:
-    """The machines and the propagation inside them, against the plain mathematics."""
+    """The machines and their propagation, compared with the plain mathematics."""
     loop, scenario, h_s, h_ns = inputs.loop, inputs.scenario, inputs.period_s, inputs.period_ns
     messages, steps = inputs.measurements, [k * h_ns for k in range(CALLS)]
     states = [message.vector for message in messages]
@@ -188,14 +188,14 @@ def machine_cases(inputs: Inputs) -> list[Case]:
 
 
 def per_call_us(batch: Batch) -> float:
-    """Wall microseconds per call of a batch of CALLS calls."""
+    """Return wall microseconds per call of a batch of CALLS calls."""
     begun_ns = time.perf_counter_ns()
     batch()
     return (time.perf_counter_ns() - begun_ns) / CALLS / 1e3
 
 
 def compare(case: Case, rounds: int = ROUNDS) -> Row:
-    """Time both sides of a case in turn; the row of their medians."""
+    """Time both sides of a case in turn; return the row of their medians."""
     ours, peers = [], []
     gc.collect()
     gc.disable()

@@ -1,8 +1,8 @@
-"""Cost per step of each plant, in its loop: beside a linear plant's, and of its period.
+"""Cost per step of each plant in its loop, compared with a linear plant and with its period.
 
 The inputs are those of a simulated run of its scenario. Plant and linear plant take turns, a step
-every 2 ms and with the real-time settings, so that both find the processor's caches as in a run.
-Figures are the thread's CPU time: what others take on a busy machine is not the plant's cost.
+every 2 ms and with the real-time settings, so that the processor's caches are as in a run. Figures
+are the thread's CPU time, which excludes other load of the machine.
 """
 
 import argparse
@@ -10,7 +10,7 @@ import os
 import time
 from typing import NamedTuple
 
-# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -31,15 +31,15 @@ from noack.runtime.real_time_settings import realtime
 from plant_server.plant import Plant, plant_of
 
 STEPS = 7500
-"""At most: all of the vehicles' scenario, as its slow steps come late. A shorter run has fewer."""
+"""Maximum number: the whole scenario of the vehicles, whose slow steps are at its end."""
 PACE_NS = 2_000_000
 SHARE = Goal("<", 20.0)
-"""Per cent of its period that a step may take at p99."""
+"""Goal for a step's p99, in percent of its period."""
 LINEAR = "lane_following"
 
 
 class Case(NamedTuple):
-    """A plant: its scenario, and what is set in it."""
+    """A plant: its scenario, and the settings changed in it."""
 
     name: str
     scenario: str
@@ -58,11 +58,11 @@ CASES = tuple(
     if settings.scenario not in (None, LINEAR)
     for variant in settings.variants
 )
-"""Every kind of plant that has a scenario, the linear one aside."""
+"""All kinds of plants with a scenario, except the linear one."""
 
 
 class Steps:
-    """A plant that makes the steps of a simulated run of its scenario, one by one."""
+    """A plant that repeats the steps of a simulated run of its scenario, one by one."""
 
     def __init__(self, scenario: str, settings: tuple[str, ...], count: int) -> None:
         self.resolved: Scenario = resolve(load(find_scenario(scenario), settings))
@@ -91,14 +91,14 @@ class Steps:
 
     @property
     def us(self) -> NDArray[np.float64]:
-        """CPU time of the steps so far, µs; the first, of no length, left out."""
+        """CPU time of the steps so far, µs, without the first, which has length 0."""
         return np.array(self.cpu_ns[1:]) / 1e3
 
 
 def timed(
     case: Case, count: int = STEPS, pace_ns: int = PACE_NS, *, asked: bool = True
 ) -> tuple[Steps, Steps]:
-    """Make steps of a case and of a linear plant in turn, asking for the real-time settings."""
+    """Make steps of a case and of a linear plant in turn; request the real-time settings."""
     ours, linear = Steps(case.scenario, case.settings, count), Steps(LINEAR, (), count)
     with realtime(asked, FIFO_PRIORITY):
         due_ns = time.monotonic_ns()
@@ -111,7 +111,7 @@ def timed(
 
 
 def rows_of(case: Case, ours: Steps, linear: Steps) -> list[Row]:
-    """The rows of a case: median, 99 % quantile, and what that is of the period in wall time."""
+    """Return the rows of a case: median, p99, and p99 as a share of the period in wall time."""
     period_us = ours.resolved.timing.plant_period_ns / ours.resolved.speed / 1e3
     found = {q: (float(np.quantile(ours.us, q)), float(np.quantile(linear.us, q)))
              for q in (0.5, 0.99)}  # fmt: skip

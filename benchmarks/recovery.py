@@ -1,8 +1,8 @@
-"""How soon a run at speed 1 is itself again after one of its processes died, or stood still.
+"""Recovery time of a run at speed 1 after one of its processes was killed or stopped.
 
-A process is killed in the middle of a run of the paper's example, and the launcher starts another
+A process is killed in the middle of a run of the paper's example, and the launcher restarts it
 (``recovery.rejoin_within_s``); or it is stopped for 0.7 s and continued. The alternative is a
-Python that does no more than import what that process imports: no restart can be faster.
+Python that only imports the same modules as that process: no restart can be faster.
 """
 
 import argparse
@@ -30,11 +30,11 @@ IMPORT = "Python that imports as much"
 
 
 def suffer(role: str, fault: Callable[[psutil.Process], float]) -> tuple[FaultedRun[float], float]:
-    """Run with a fault of a process; return the run, and when the fault was over, in its time.
+    """Run with a fault of a process; return the run, and the fault's end in time of the run.
 
     Args:
         role: the process.
-        fault: returns the time when it was over, on the monotonic clock.
+        fault: returns the time of its end on the monotonic clock.
 
     Raises:
         MeasurementError: the run failed.
@@ -55,7 +55,7 @@ def kill(process: psutil.Process) -> float:
 
 
 def stop(process: psutil.Process) -> float:
-    """Stop a process, and continue it after a while."""
+    """Stop a process, and continue it after 0.7 s."""
     process.send_signal(signal.SIGSTOP)
     time.sleep(STOPPED_S)
     process.send_signal(signal.SIGCONT)
@@ -89,13 +89,13 @@ def killed(role: str) -> Figures:
 
 
 def stopped_ms(role: str) -> float:
-    """Stop a process for a while; return wall time from then to the last late step of all."""
+    """Stop a process for 0.7 s; return the wall time from then to the last late step of all."""
     run, at_s = suffer(role, stop)
     return 1e3 * run_recovery_s(run.record, at_s)
 
 
 def imported_s(role: str) -> float:
-    """Wall seconds from the start of a Python until it has imported the modules of a process."""
+    """Return wall seconds from the start of a Python to the end of a process's imports."""
     module = MODULES[role] + (".__main__" if role != "recorder" else "")
     command = [sys.executable, "-c", f"import {module}, sys; print('ready', file=sys.stderr)"]
     finished = execute(command)

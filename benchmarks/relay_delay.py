@@ -1,12 +1,12 @@
-"""What a relay adds to the one-way delay, and how exactly it keeps a configured delay.
+"""The one-way delay that a relay adds, and the accuracy of a configured delay.
 
-Added delay: sender, relay and sink share a core, datagrams go one by one, back to back, and the
-median delay without a relay is subtracted. Our relay asks its loss model for every datagram and
-lets all pass (``mansd 0``).
+Added delay: sender, relay and sink share a core, datagrams are sent one by one, back to back, and
+the median delay without a relay is subtracted. Our relay applies its loss model to every datagram
+and forwards all of them (``mansd 0``).
 
-Lateness: a datagram every 0.97 ms through a delay of 10 ms; what its way took beyond that, from the
-sender's stamp just before the system call to the kernel's receive stamp at the sink (on one clock),
-so that the sink's wake-up has no part in it. Compared with cyclictest on the relay's core.
+Lateness: a datagram every 0.97 ms, with a delay of 10 ms. Lateness is the excess over this delay,
+from the sender's timestamp just before the system call to the kernel's receive timestamp at the
+sink (same clock), which excludes the sink's wake-up. Compared with cyclictest on the relay's core.
 """
 
 import argparse
@@ -36,11 +36,11 @@ PINGS = 500
 LINE_ROUNDS = 8
 LINE_ROUND_S = 2
 PERIOD_NS = 970_000
-"""Not a divisor of the delay: else each datagram would be due when a later one has just woken the
-relay."""
+"""Not a divisor of the delay: else each datagram would be due when the arrival of a later one has
+just woken the relay."""
 DELAY_MS = 10
 FIFO_PRIORITY = 80
-"""The usual one for cyclictest."""
+"""The usual priority of cyclictest."""
 _LATENCY = "/dev/cpu_dma_latency"
 OURS, DIRECT = "ours", "direct, no relay"
 ADDED_GOALS = {("socat", "p50"): Goal("<=", 0.75)}
@@ -48,7 +48,7 @@ LATENESS_GOALS = {(KERNEL, "p99"): Goal("<=", 2)}
 
 
 def quantiles_of(name: str, delays_ns: Nanoseconds, base_us: float = 0.0) -> Figures:
-    """Quantiles of the delays beyond ``base_us``, in µs.
+    """Return quantiles of the delays minus ``base_us``, in µs.
 
     Raises:
         MeasurementError: a datagram is missing.
@@ -85,7 +85,7 @@ def lateness_rows(rounds: Rounds) -> list[Row]:
 
 
 def refusal(fifo: bool) -> str | None:
-    """Return why the relay lacks the settings that cyclictest applies, or None.
+    """Return why the relay lacks the settings of cyclictest, or None.
 
     Args:
         fifo: whether SCHED_FIFO was applied to the sender.

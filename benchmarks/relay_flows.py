@@ -1,9 +1,9 @@
-"""What ten thousand flows cost a relay, and how fast the pure link decides.
+"""The cost of ten thousand flows for a relay, and the speed of the link's decisions.
 
-Flows differ in the sender's address (127.1.0.0 and on), datagrams come from them in turn. Cost is
-the relay's CPU time per datagram while it works off a full receive buffer, as in
-:mod:`benchmarks.relays`; the C relay, which looks at no address, shows what of it is the kernel's.
-The decisions' loss bursts are counted from the fates alone.
+Flows differ in the sender's address (127.1.0.0 and on); datagrams come from them in turn. The cost
+is the relay's CPU time per datagram while it empties a full receive buffer, as in
+:mod:`benchmarks.relays`. The C relay, which ignores addresses, shows the kernel's share of it. The
+loss bursts of the decisions are counted from the fates only.
 """
 
 import argparse
@@ -37,11 +37,11 @@ KINDS = {
     "ours, with the reverse direction": Ours(WORDS, reverse=True),
 }
 _PACKETS = 10
-"""Of each flow in a call."""
+"""Packets of each flow in a call."""
 
 
 def flow_rows(rounds: Rounds) -> list[Row]:
-    """Return the rows of the relays: the cost of many flows beside the cost of one."""
+    """Return the rows of the relays: the cost of many flows compared with the cost of one."""
     rows = []
     for name in (*KINDS, "C relay"):
         many, one = f"{name}, {FLOWS:,} flows", f"{name}, one flow"
@@ -54,16 +54,16 @@ def flow_rows(rounds: Rounds) -> list[Row]:
 
 
 class Decided(NamedTuple):
-    """What the link decided."""
+    """Results of the link's decisions."""
 
     per_s: float
     runs: LossRuns
 
 
 def decide_all(decide: Decide, decisions: int, flows: int) -> Decided:
-    """Let the link decide batch by batch, at least so many; only its own time counts."""
+    """Make at least this number of decisions, batch by batch; only the link's time counts."""
     runs, seconds = LossRuns(flows), 0.0
-    runs.add(decide(1))  # makes the flows' states, and the compiled code
+    runs.add(decide(1))  # creates the flows' states, compiles the code
     unmeasured = runs.decisions
     while runs.decisions < decisions:
         begun_s = time.perf_counter()
@@ -74,7 +74,7 @@ def decide_all(decide: Decide, decisions: int, flows: int) -> Decided:
 
 
 def decision_rows(name: str, found: Decided | str) -> list[Row]:
-    """Return the rows of one way to run the link: what was found, or why nothing was."""
+    """Return the rows of one way to run the link: the results, or why there are none."""
     if isinstance(found, str):
         return [Row(f"{name}: decisions", None, "/s", unjudged=found)]
     runs = found.runs
@@ -110,7 +110,7 @@ def _measure_flows() -> list[Row]:
                 rounds.add(f"{relay.name}, one flow", figures[0])
                 rounds.add(f"{relay.name}, {FLOWS:,} flows", figures[1])
 
-        for number in range(-1, ROUNDS):  # the first makes the flows' states and does not count
+        for number in range(-1, ROUNDS):  # the first creates the flows' states; not counted
             if number % 10 == 0:
                 say(f"rounds {number + 1} to {number + 10} of {ROUNDS}")
             in_turn(relays, rounds, partial(costs, counted=number >= 0))

@@ -1,8 +1,8 @@
-"""A steady load through our relay at half of what it can take: nothing lost, memory flat.
+"""A steady load through our relay at half its maximum rate: no unintended loss, constant memory.
 
-Loss is counted at both sides: the relay must have received all that was sent, all that it forwarded
-must have arrived at the sink, and at most MANSD consecutive datagrams may be missing there.
-``--soak-s 600`` is the real test.
+Loss is counted at both sides: the relay must receive all sent datagrams, all forwarded datagrams
+must arrive at the sink, and at most M − 1 consecutive datagrams may be missing there.
+``--soak-s 600`` is the full test.
 """
 
 import argparse
@@ -24,23 +24,23 @@ MEMORY_GOAL = Goal("<=", 1024)
 """KiB; a leak of two bytes per datagram shows in ten seconds."""
 _BURSTS = 15
 _GROUP_S = 250e-6
-"""About so often a group of datagrams is sent."""
+"""Approximate time between two groups of datagrams."""
 _LAST_S = 0.1
 _STARVED = 0.01
 
 
 @dataclass(frozen=True)
 class Found:
-    """What a steady load showed.
+    """Results of a steady load.
 
     Args:
-        maximum_per_s: what the relay drains.
-        seconds: how long the load lasted.
-        soak: the counts of sender and sink.
-        totals: the relay's own.
-        resident_kib: its memory, each second.
-        cpu_s: its CPU time.
-        waited_s: for so long it could have worked, but others had its core.
+        maximum_per_s: maximum rate of the relay.
+        seconds: duration of the load.
+        soak: counts of sender and sink.
+        totals: counts of the relay.
+        resident_kib: memory of the relay, each second.
+        cpu_s: CPU time of the relay.
+        waited_s: time in which the relay was ready to run, but other threads had its core.
     """
 
     maximum_per_s: float
@@ -53,7 +53,7 @@ class Found:
 
 
 def growth_kib(resident_kib: Sequence[float]) -> float:
-    """Growth of memory from the second quarter to the last; what is made at the start is not it."""
+    """Return the growth of memory from the second quarter to the last, without the start-up."""
     quarter = max(len(resident_kib) // 4, 1)
     return median(resident_kib[-quarter:]) - median(resident_kib[quarter : 2 * quarter])
 
@@ -85,7 +85,7 @@ def _resident_kib(relay: Relay) -> float:
 
 
 def groups(per_s: float) -> tuple[int, int]:
-    """Size of a group, and the time between two, ns, that make a rate."""
+    """Return the size of a group and the time between two groups, ns, for a rate."""
     size = max(round(per_s * _GROUP_S), 1)
     return size, round(size / per_s * 1e9)
 
@@ -103,13 +103,13 @@ def _soak(tools: Built, seconds: int, maximum_per_s: float) -> Found:
             resident_kib.append(_resident_kib(relay))
         elapsed_s, cpu_s = time.monotonic() - begun_s, relay.cpu_s() - begun_cpu_s
         waited_s = relay.waited_s() - begun_waited_s
-        # Empty groups: receives what is still in flight.
+        # Empty groups: receive the datagrams still in flight.
         relay.ends.soak(state, round(_LAST_S / _GROUP_S), 0, period_ns)
         return Found(maximum_per_s, elapsed_s, state, relay.totals(), resident_kib, cpu_s, waited_s)
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Find the maximum rate, then put half of it on a new relay."""
+    """Find the maximum rate, then load a new relay with half of it."""
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS):
         with running(KIND, tools) as relay:
             maximum_per_s = median([relay.burst()["per_s"] for _ in range(_BURSTS)])
@@ -124,7 +124,7 @@ def _seconds(text: str) -> int:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare how long the load lasts."""
+    """Declare the duration of the load."""
     parser.add_argument(
         "--soak-s",
         type=_seconds,

@@ -1,12 +1,12 @@
 """Datagrams per second through our relay and through others, with Bernoulli loss and MANSD.
 
-Drained: a relay is stopped, its receive buffer filled with thousands of datagrams of 72 bytes, and
-it goes on; the rate is what it has taken in and decided until its last arrival at the sink, per
-second of wall time since then. So nobody has to send faster than the fastest relay, nobody waits
-for anybody's wake-up, and the sink is read afterwards, where its buffer holds the burst. The peers
-forward everything; ours forwards what it does not drop, and the dropped ones count as decided.
-Relays have one core, sender and sink the other; each round is one burst of each relay, and ratios
-are the median over rounds of the ratio within a round.
+A relay is stopped, its receive buffer is filled with thousands of datagrams of 72 bytes, and the
+relay is continued. The rate is the number of datagrams received and decided up to the last arrival
+at the sink, per second of wall time since the continuation. Hence the sender need not be faster
+than the fastest relay, no wake-up is included, and the sink, whose buffer holds the burst, is read
+afterwards. The peers forward everything; ours drops some datagrams, which count as decided. Relays
+have one core, sender and sink the other. Each round is one burst of each relay, and ratios are the
+median over rounds of the ratio within a round.
 """
 
 import argparse
@@ -71,7 +71,7 @@ def rows_of(rounds: Rounds) -> list[Row]:
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """Put one burst after the other on each relay in turn."""
+    """Send bursts to each relay in turn."""
     rounds = Rounds()
     with built() as tools, on_core(LOAD_CORE), scheduled(BEFORE_OTHERS), ExitStack() as stack:
         kinds = {

@@ -1,7 +1,7 @@
-"""The exact simulator against scipy's integrator with events, and certificates, per call.
+"""The exact simulator compared with scipy's integrator with events; certificates; per call.
 
-Both sides run the paper's example in continuous time with the same packet fates. The integrator is
-asked for the accuracy at which its event times agree to 1e-8 s.
+Both sides run the paper's example in continuous time with the same packet fates. The integrator's
+accuracy is set so that its event times agree to 1e-8 s.
 """
 
 import argparse
@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 
-# As the command line does, before numpy is imported: small matrices gain nothing from threads.
+# Set before numpy is imported, as the command line does: small matrices do not gain from threads.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -36,7 +36,7 @@ _AGREEMENT_S = 1e-8
 def integrated_events(
     system: ContinuousLoop, horizon_s: float, delivered: Sequence[bool]
 ) -> list[float]:
-    """Event times by ``solve_ivp``, from one crossing of the threshold to the next."""
+    """Return event times by ``solve_ivp``, from one threshold crossing to the next."""
     n, generator = system.loop.n, system.generator
     trigger = system.trigger
 
@@ -63,7 +63,7 @@ def integrated_events(
 
 
 def timed_ms(call: Callable[[], object]) -> float:
-    """Wall milliseconds of one call."""
+    """Return wall milliseconds of one call."""
     begun_ns = time.perf_counter_ns()
     call()
     return (time.perf_counter_ns() - begun_ns) / 1e6
@@ -94,21 +94,21 @@ def continuous_row(scenario: Scenario) -> Row:
 
 
 def sampled_row(scenario: Scenario) -> Row:
-    """A run of the machines in virtual time, against the time that it takes live."""
+    """A run of the machines in virtual time, compared with its duration as a live run."""
     taken = [timed_ms(lambda: simulate(scenario)) for _ in range(ROUNDS)]
     peer = Peer("the live run", 1e3 * scenario.horizon_s / scenario.speed)
     return Row(f"{scenario.horizon_s:g} s of the machines", median(taken), "ms", peer)
 
 
 def certificate_row(scenario: Scenario) -> Row:
-    """A certificate, from nothing."""
+    """A certificate, computed without caches."""
     conditions = ideal_conditions(scenario)
     taken = [timed_ms(lambda: certify(scenario, conditions)) for _ in range(ROUNDS)]
     return Row("certificate", median(taken), "ms")
 
 
 def measure(options: argparse.Namespace) -> list[Row]:
-    """The paper's example."""
+    """Measure the paper's example."""
     scenario = resolve(load(find_scenario("lane_following"), ()))
     rows = []
     for row in (continuous_row, sampled_row, certificate_row):

@@ -1,9 +1,9 @@
-"""Time from the start of ``noack run`` to the first control step; on request, from a bare system.
+"""Time from the start of ``noack run`` to the first control step; optionally, with installation.
 
-The first control step is read off the progress lines (:func:`benchmarks._runs.first_step_s`), which
-bounds it from above. The alternative is a Python that does no more than import the libraries that
-every process of a run needs. ``--install`` also copies the repository's files into an empty folder
-and runs ``make demo`` there: a new environment, the pinned dependencies, the first run.
+The progress lines give an upper bound of this time (:func:`benchmarks._runs.first_step_s`). The
+alternative is a Python that only imports the libraries that every process of a run needs.
+``--install`` also copies the repository's files into an empty folder and runs ``make demo`` there:
+a new environment, the pinned dependencies, the first run.
 """
 
 import argparse
@@ -31,11 +31,11 @@ def started() -> tuple[float, float | None]:
     """Start a short run.
 
     Returns:
-        Wall seconds from the start of ``noack run`` to the first control step, and what the run's
-        summary says about the launch alone, if it does.
+        Wall seconds from the start of ``noack run`` to the first control step, and the launch time
+        from the run's summary, if it has one.
 
     Raises:
-        MeasurementError: the run failed or showed no progress.
+        MeasurementError: the run failed or printed no progress.
     """
     found = noack("run", "lane_following", *_SHORT)
     if found.first_step_s is None:
@@ -44,13 +44,13 @@ def started() -> tuple[float, float | None]:
 
 
 def imported_s() -> float:
-    """Wall seconds from the start of a bare Python until it has imported the libraries."""
+    """Return wall seconds from the start of a bare Python to the end of the libraries' import."""
     finished = execute([sys.executable, "-c", _IMPORT_LIBRARIES])
     return finished.lines[-1].at_s - finished.begun_s
 
 
 def copy_repository(target: Path) -> None:
-    """Copy the repository's own files, as they are now, and nothing that was made from them.
+    """Copy the repository's own files in their present state, without generated files.
 
     Raises:
         MeasurementError: this is not a git repository.
@@ -70,7 +70,7 @@ def installed_s() -> float:
     """Wall seconds from ``make demo`` in a fresh copy of the repository to the first control step.
 
     Raises:
-        MeasurementError: it failed or showed no progress.
+        MeasurementError: it failed or printed no progress.
     """
     if shutil.which("make") is None:
         raise MeasurementError("make is not installed")

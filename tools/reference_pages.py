@@ -1,6 +1,6 @@
-"""Pages of the documentation that are made of the program itself, so that they cannot be stale.
+"""Generates parts of the documentation from the program, so that they are always up to date.
 
-A Sphinx extension: where a page says ``<!-- made: NAME -->`` stands what is made of that name.
+A Sphinx extension: it replaces ``<!-- made: NAME -->`` in a page by the generated text NAME.
 """
 
 import contextlib
@@ -58,7 +58,7 @@ def _plain(markup: str | None) -> str:
 
 
 def _meaning(record: str) -> str:
-    """Return an option's help, and what the help says in brackets after it: default, required."""
+    """Return an option's help, and the text in brackets after it: default, required."""
     text, gap, more = record.rpartition("  [")
     return f"{_plain(text)} ({more.removesuffix(']')})" if gap else _plain(record)
 
@@ -89,7 +89,7 @@ def _netem_help() -> str:
 
 
 def shipped(folder: str) -> str:
-    """Return every file of ``scenarios`` or ``campaigns``: what it says of itself, and its text."""
+    """Return every file of ``scenarios`` or ``campaigns``: its description and its text."""
     return "\n".join(_shipped(folder))
 
 
@@ -103,7 +103,7 @@ def _shipped(folder: str) -> Iterator[str]:
 
 
 def example(name: str) -> str:
-    """Return a program in cells, of ``docs/examples``, as a page of prose and code."""
+    """Return a program of ``docs/examples``, divided into cells, as a page of prose and code."""
     text = (ROOT / f"docs/examples/{name}.py").read_text(encoding="utf-8")
     cells = (cell.partition("\n") for cell in f"\n{text}".split("\n# %%")[1:])
     return "\n\n".join(
@@ -124,12 +124,12 @@ MADE: dict[str, Callable[[], str]] = {
 
 
 def fill_in(page: str) -> str:
-    """Return a page with what is made in the place of its marks."""
+    """Return a page with its marks replaced by the generated texts."""
     return _MARK.sub(lambda mark: MADE[mark[1]](), page)
 
 
 def setup(sphinx: Any) -> dict[str, bool]:
-    """Have Sphinx fill in every page that it reads."""
+    """Make Sphinx fill in every page that it reads."""
 
     def on_read(_sphinx: Any, _name: str, source: list[str]) -> None:
         source[0] = fill_in(source[0])

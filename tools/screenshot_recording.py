@@ -1,9 +1,9 @@
-"""Picture of a recording: rerun's web viewer in a headless Chromium, saved as a PNG.
+"""Screenshot of a recording: rerun's web viewer in a headless Chromium, saved as a PNG.
 
     python tools/screenshot_recording.py recording.rrd picture.png --size 1600x1000
 
-Needs Chromium or Chrome on the PATH and nothing beyond the standard library. The browser is
-driven by its debugging protocol over a pipe; the picture is taken when it no longer changes.
+Needs Chromium or Chrome on the PATH, and only the standard library. It controls the browser by its
+debugging protocol over a pipe, and takes the picture when it no longer changes.
 """
 
 import argparse
@@ -51,7 +51,7 @@ POLL_S, SETTLE_S, LIMIT_S = 0.5, 2.5, 300.0
 
 
 class Browser:
-    """A headless browser, told what to do by messages of the Chrome DevTools Protocol."""
+    """A headless browser, controlled by messages of the Chrome DevTools Protocol."""
 
     def __init__(self, program: str, profile: str) -> None:
         from_us, to_browser = os.pipe()
@@ -72,7 +72,7 @@ class Browser:
         self._session: str | None = None
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Send one command and give its result; messages that answer nothing are skipped."""
+        """Send one command and return its result; other messages are skipped."""
         number = next(self._numbers)
         message: dict[str, Any] = {"id": number, "method": method, "params": parameters}
         if self._session is not None:
@@ -96,7 +96,7 @@ class Browser:
         self.call("Page.navigate", url=url)
 
     def picture(self) -> bytes:
-        """Give the page as it looks now, as a PNG."""
+        """Return the page's present appearance as a PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ class Browser:
 
 
 def take_picture(recording: Path, size: tuple[int, int], theme: str) -> bytes:
-    """Show a recording in a headless browser and give the settled page as a PNG.
+    """Show a recording in a headless browser and return the final page as a PNG.
 
     Raises:
         NoackError: the recording or the browser is missing, or the page does not settle.
@@ -155,7 +155,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def main() -> int:
-    """Run the command; 0 when the picture is written."""
+    """Run the command; return 0 when the picture is written."""
     parser = argparse.ArgumentParser(description="Save a picture of a recording.")
     parser.add_argument("recording", type=Path, metavar="RRD")
     parser.add_argument("picture", type=Path, metavar="PNG")

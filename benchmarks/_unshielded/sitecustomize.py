@@ -1,4 +1,4 @@
-"""Takes the shield from every process that finds this first on its path; for ``flood``."""
+"""Disables the per-peer kernel sockets in every process with this folder on its path (flood)."""
 
 from noack.runtime import udp_sockets
 

@@ -1,4 +1,4 @@
-"""The soak: a real run, watched from outside for hours.
+"""The soak test: a real run of several hours, observed from outside.
 
-``python -m benchmarks.soak`` is one hour at speed 1, then a day of simulated time at speed 48.
+``python -m benchmarks.soak`` runs one hour at speed 1, then a day of simulated time at speed 48.
 """

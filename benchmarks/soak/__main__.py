@@ -20,7 +20,7 @@ _LEAST_MINUTES = 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Soak; 0 if everything was flat and nothing was broken."""
+    """Run the soak; return 0 if all memory was flat and no invariant was violated."""
     options = _options(arguments)
     console = Console()
     if not console.is_terminal:

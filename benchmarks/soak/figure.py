@@ -1,4 +1,4 @@
-"""The picture of a soak: private memory over time, process by process."""
+"""The figure of a soak: private memory over time, per process."""
 
 from matplotlib.figure import Figure
 
@@ -22,7 +22,7 @@ _HEIGHT_IN, _GAP_IN = 0.95, 0.3
 
 @styled
 def memory_figure(result: Result) -> Figure:
-    """Private memory above what it was at the end of the warm-up, over the run, in KiB."""
+    """Plot private memory minus its value at the end of the warm-up, in KiB, over the run."""
     import numpy as np
 
     roles = list(result.watched)

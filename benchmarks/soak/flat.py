@@ -1,20 +1,20 @@
-"""When memory counts as flat.
+"""Decides whether a process's memory is flat.
 
-The warm-up is left out: the first fifth of a run, five minutes at the most. The rest is cut into
-twelve windows. Of each only the lower median counts, so that what is allocated for a moment does
-not; the slope is the median of the slopes between all pairs of windows (Theil and Sen), so that
-four windows out of twelve may be anything, or missing. Memory
+The warm-up is ignored: the first fifth of a run, at most five minutes. The rest is divided into
+twelve windows. Each window counts with its lower median, which ignores short allocations. The slope
+is the median of the slopes between all pairs of windows (Theil and Sen), so that four of the twelve
+windows may be outliers or missing. Memory
 
-* **grows** if by this slope it gained more than 1 MiB, or in a run that is longer than an hour more
+* **grows** if this slope gives a gain of more than 1 MiB, or, in a run longer than an hour, of more
   than 1 MiB per hour;
-* **creeps** if in half an hour or more nine in ten pairs of windows rise, by 256 KiB in all: what
-  leaks is steady, what a cache or an allocator takes is not;
+* **creeps** if, in half an hour or more, at least nine in ten pairs of windows rise and the total
+  gain is at least 256 KiB: a leak is steady, the memory of a cache or an allocator is not;
 * is **flat** otherwise.
 
-A run of less than half an hour may gain 9.5 MiB, as the recorder's memory goes up and down by 9: in
-the four minutes that one of five leaves, at 500 Hz, that is 83 bytes a step, so that a row that is
-kept shows; what leaks at events alone takes the longer run. Nothing is said of less than two
-minutes after the warm-up.
+A run of less than half an hour may gain 9.5 MiB, since the recorder's memory varies by 9 MiB. In
+the four minutes that a run of five minutes leaves, at 500 Hz, this is 83 bytes per step, so that a
+leak of one row per step is detected. A leak per event needs a longer run. With less than two
+minutes after the warm-up, there is no verdict.
 """
 
 import math
@@ -25,7 +25,7 @@ from typing import Literal, NamedTuple
 WARM_UP_SHARE, LONGEST_WARM_UP_S = 0.2, 300.0
 WINDOWS, LEAST_WINDOWS = 12, 8
 ALLOWED_KIB = 1024.0
-"""In all, and per hour where that is more."""
+"""Allowed total growth, and allowed growth per hour in runs longer than an hour."""
 SHORT_S, SHORT_ALLOWED_KIB, LEAST_S = 1800.0, 9728.0, 120.0
 STEADY_KIB, STEADY_SHARE, STEADY_FROM_S = 256.0, 0.9, 1800.0
 
@@ -33,16 +33,16 @@ Word = Literal["flat", "grows", "creeps", "unknown", "too short"]
 
 
 class Trend(NamedTuple):
-    """How memory went over a run."""
+    """The trend of memory over a run."""
 
     at_10_kib: float
     at_50_kib: float
     at_100_kib: float
-    """At so many per cent of the run."""
+    """Memory at this percentage of the run."""
     slope_kib_per_h: float
-    """NaN of too few samples."""
+    """NaN if there are too few samples."""
     growth_kib: float
-    """By the slope, from the end of the warm-up on."""
+    """Growth since the end of the warm-up, from the slope."""
     allowed_kib: float
     rising: float
     """Share of the pairs of windows that rise."""
@@ -50,7 +50,7 @@ class Trend(NamedTuple):
 
 
 def warm_up_s(length_s: float) -> float:
-    """How much of a run is not judged."""
+    """Return the length of the warm-up, which is not judged."""
     return min(WARM_UP_SHARE * length_s, LONGEST_WARM_UP_S)
 
 
@@ -58,9 +58,9 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
     """Judge memory over a run.
 
     Args:
-        at_s: when it was looked at, from the run's start, rising.
-        kib: what was seen.
-        length_s: of the run.
+        at_s: times of the samples since the run's start, ascending.
+        kib: the samples.
+        length_s: length of the run.
     """
     at_10, at_50, at_100 = (_near(at_s, kib, share * length_s) for share in (0.1, 0.5, 1.0))
     begin_s = warm_up_s(length_s)
@@ -98,7 +98,7 @@ def trend(at_s: Sequence[float], kib: Sequence[float], length_s: float) -> Trend
 
 
 def constant(at_s: Sequence[float], counts: Sequence[int], length_s: float) -> tuple[int, int]:
-    """Least and most of a count after the warm-up, but for what a single look saw."""
+    """Return minimum and maximum of a count after the warm-up, ignoring single outliers."""
     judged = [
         count
         for at, count in zip(at_s, counts, strict=True)

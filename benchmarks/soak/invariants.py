@@ -1,6 +1,6 @@
-"""Holds what must always be true against a run while it goes on, in bounded memory.
+"""Checks the invariants of a run while it goes on, in bounded memory.
 
-Takes the batches of the spool as they come, and keeps nothing that has been judged.
+Receives the batches of the spool as they arrive, and discards rows that have been checked.
 """
 
 from collections.abc import Iterable
@@ -28,14 +28,14 @@ from noack.protocol.topology import LOOP_ROLES
 from noack.theory.error_bounds import ErrorMonitor
 
 _IDENTITY = 1e-9
-"""Of (I1), relative to the largest entry of x_s: the margin that a run's claims have."""
+"""Tolerance of (I1), relative to the largest entry of x_s; the same as in a run's claims."""
 _TOLD = 20
 _UNDER_WAY = 2
-"""Inputs that may be sent after the plant has made its last step."""
+"""Number of inputs that may be sent after the plant's last step."""
 
 
 class Invariants:
-    """Follows a run.
+    """Checks a run while it goes on.
 
     Args:
         scenario: resolved, with the paper's trigger and nothing acknowledged.
@@ -67,13 +67,13 @@ class Invariants:
         self._events = self._most_held = 0
         self.broken_count = 0
         self.broken: list[str] = []
-        """The first few things that were not as they must be."""
+        """The first few violations."""
         self.t_ns = 0
         """Time of the newest measurement."""
 
     @property
     def rows(self) -> dict[str, int]:
-        """How many of each table were taken."""
+        """Number of received rows per table."""
         return dict(self._counts)
 
     @property
@@ -82,7 +82,7 @@ class Invariants:
         return self._network.delivered_out_of_order
 
     def account(self) -> dict[str, object]:
-        """What was looked at, for the soak's result."""
+        """Return what was checked, for the soak's result."""
         return {
             "rows": self.rows,
             "events": self._events,
@@ -96,12 +96,12 @@ class Invariants:
         }
 
     def take(self, table: str, first: int, payload: bytes) -> None:
-        """Take a batch of the spool.
+        """Process a batch of the spool.
 
-        What was lost under way was sent again, and lies behind what followed it; perhaps twice.
+        A batch that was lost and sent again comes after later batches, possibly twice.
         """
         if table not in self._types:
-            return  # a notice; the run's summary has those that tell of a violation
+            return  # a notice; the summary has the notices of violations
         early = self._early[table]
         early[first] = np.frombuffer(payload, self._types[table])
         while early and (first := min(early)) <= self._counts[table]:
@@ -110,7 +110,7 @@ class Invariants:
                 self._in_order(table, rows)
 
     def _in_order(self, table: str, rows: Rows) -> None:
-        """Take the rows that follow those taken before."""
+        """Process the rows that follow the previously processed rows."""
         self._counts[table] += len(rows)
         now_ns = np.concatenate([[self._last_now_ns[table]], rows["now_ns"]])
         self._last_now_ns[table] = int(now_ns[-1])
@@ -120,9 +120,9 @@ class Invariants:
         self._pending[table].append(rows)
 
     def advance(self, *, final: bool = False) -> None:
-        """Judge what is complete; at the end, everything."""
+        """Check all complete data; at the end, everything."""
         legs = (self._measurements, self._into_network, self._to_controller, self._actuations)
-        if final:  # what waits for an input that never came is judged without it
+        if final:  # check rows whose input never arrived without it
             self._break(
                 f"{table}: row {self._counts[table]} is missing"
                 for table, early in self._early.items()
@@ -130,7 +130,7 @@ class Invariants:
             )
             for inputs in self._inputs.values():
                 self._break(inputs.end())
-        with np.errstate(all="ignore"):  # what is not finite is found, and told
+        with np.errstate(all="ignore"):  # values that are not finite are detected and reported
             self._judge_plant()
             self._judge_network()
             self._judge_controller()
@@ -184,7 +184,7 @@ class Invariants:
         self._track = controller_track(self._track, steps, deliveries)
 
     def _join(self, *, final: bool) -> None:
-        """Hold (I1) against the measurements up to which the controller's state is known."""
+        """Check (I1) at the measurements for which the controller's state is known."""
         reach_ns = int(self._track.model_ns[-1])
         if final:
             reach_ns += self._scenario.timing.controller_period_ns
@@ -222,7 +222,7 @@ class Invariants:
         return np.concatenate([np.zeros(0, self._types[table]), *waiting])
 
     def _in_turn(self, table: str) -> Rows:
-        """Take the rows before which nothing of another table of the same process can come."""
+        """Return the rows that no other row of the same process can precede."""
         rows = self._take(table)
         ready = int(np.searchsorted(rows["input"], self._inputs[OWNER[table]].next))
         if ready < len(rows):

@@ -1,4 +1,4 @@
-"""Numbers that come in turn, and datagrams that arrive as they were sent: in bounded memory."""
+"""Checks of consecutive numbers, and of datagrams without loss, in bounded memory."""
 
 from collections.abc import Iterator
 
@@ -8,25 +8,25 @@ from numpy.typing import NDArray
 Numbers = NDArray[np.int64]
 
 MOST_WAITING = 200_000
-"""Numbers for which something else has not come yet; more are a fault, and let go."""
+"""Maximum number of waiting numbers; more are a fault, and are discarded."""
 
 
 class InTurn:
-    """Numbers 0, 1, 2, … that come by several ways, batch by batch."""
+    """Numbers 0, 1, 2, … that arrive from several sources, batch by batch."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self.next = 0
-        """All before it have come."""
+        """All numbers before it have arrived."""
         self._ahead: Numbers = np.zeros(0, np.int64)
 
     @property
     def waiting(self) -> int:
-        """Numbers whose predecessors have not come yet."""
+        """Number of numbers with predecessors that have not arrived yet."""
         return len(self._ahead)
 
     def take(self, numbers: Numbers) -> Iterator[str]:
-        """Take a batch; yield what is wrong."""
+        """Process a batch; yield the faults."""
         ahead = np.sort(np.concatenate([self._ahead, numbers]))
         if len(ahead) and ahead[0] < self.next:
             yield f"{self._what} {ahead[0]} came twice"
@@ -39,17 +39,17 @@ class InTurn:
             yield from self.end()
 
     def end(self) -> Iterator[str]:
-        """Yield what never came."""
+        """Yield the numbers that never arrived."""
         if self.waiting:
             yield f"{self._what} {self.next} never came, but {self._ahead[0]} and others did"
             self.next, self._ahead = int(self._ahead[-1]) + 1, np.zeros(0, np.int64)
 
 
 class Leg:
-    """A way on which nothing may be lost: what arrives is what was sent, in order, each once.
+    """A path without losses: the sent datagrams arrive, in order, each once.
 
     Args:
-        what: names it.
+        what: name of the path.
     """
 
     def __init__(self, what: str) -> None:
@@ -59,19 +59,19 @@ class Leg:
 
     @property
     def waiting(self) -> int:
-        """Numbers of which only one end is known."""
+        """Number of datagrams known from one end only."""
         return len(self._sent) + len(self._arrived)
 
     def sent(self, numbers: Numbers) -> None:
-        """Take what was sent."""
+        """Add sent datagrams."""
         self._sent = np.concatenate([self._sent, numbers])
 
     def arrived(self, numbers: Numbers) -> None:
-        """Take what arrived."""
+        """Add arrived datagrams."""
         self._arrived = np.concatenate([self._arrived, numbers])
 
     def judge(self) -> Iterator[str]:
-        """Yield what is wrong with what is known of both ends."""
+        """Compare the datagrams known from both ends; yield the faults."""
         while both := min(len(self._sent), len(self._arrived)):
             differ = np.flatnonzero(self._sent[:both] != self._arrived[:both])
             same = int(differ[0]) if len(differ) else both
@@ -89,7 +89,7 @@ class Leg:
             self._sent, self._arrived = self._sent[:0], self._arrived[:0]
 
     def end(self, in_flight: int) -> Iterator[str]:
-        """Yield what never came; what was sent last may be under way at the end."""
+        """Yield the datagrams that never arrived; the last ``in_flight`` ones may be in flight."""
         yield from self.judge()
         if len(self._sent) > in_flight:
             yield f"{self._what} {self._sent[0]} and {len(self._sent) - 1} more never came"

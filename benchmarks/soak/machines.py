@@ -1,7 +1,7 @@
-"""What each machine's rows must be, computed anew from the scenario; batch after batch.
+"""Checks each machine's rows by independent computations from the scenario, batch by batch.
 
-The replay at a run's end compares with the machines themselves. These are other computations of
-the same rules, over whole batches, and to rounding.
+The replay at a run's end compares with the machines themselves. These are other implementations of
+the same rules, for whole batches, equal up to rounding errors.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ from noack.protocol.record_tables import NO_SEQUENCE, effective
 Reals = NDArray[np.float64]
 
 _ROUNDING = 1e-12
-"""Of one step, relative to what it is computed from."""
+"""Rounding error of one step, relative to the inputs of the computation."""
 
 
 class PlantSteps:
@@ -31,7 +31,7 @@ class PlantSteps:
         self._last: Rows | None = None
 
     def take(self, rows: Rows) -> Iterator[str]:
-        """Take rows of ``plant_step``; yield what is wrong."""
+        """Check rows of ``plant_step``; yield the faults."""
         if self._last is not None:
             rows = np.concatenate([self._last, rows])
         self._last = rows[-1:]
@@ -45,7 +45,7 @@ class PlantSteps:
 
 
 class SensorSteps:
-    """x_s follows its model from event to event; an event is where the threshold is exceeded."""
+    """x_s follows its model between events; an event happens when the threshold is exceeded."""
 
     def __init__(self, scenario: Scenario) -> None:
         loop, trigger = loop_of(scenario), scenario.decaying
@@ -58,7 +58,7 @@ class SensorSteps:
         self._events = 0
 
     def take(self, rows: Rows) -> Iterator[str]:
-        """Take rows of ``sensor_measurement``; yield what is wrong."""
+        """Check rows of ``sensor_measurement``; yield the faults."""
         events = rows["event"][rows["event"] != NO_SEQUENCE]
         if (events != self._events + np.arange(len(events))).any():
             yield f"sensor_measurement: events are not numbered in turn from {self._events} on"
@@ -98,7 +98,7 @@ class ControllerTicks:
         self._next = 0
 
     def take(self, rows: Rows) -> Iterator[str]:
-        """Take rows of ``controller_step``; yield what is wrong."""
+        """Check rows of ``controller_step``; yield the faults."""
         if (rows["sequence"] != self._next + np.arange(len(rows))).any():
             yield f"controller_step: ticks are not numbered in turn from {self._next} on"
         self._next += len(rows)
@@ -109,7 +109,7 @@ class ControllerTicks:
 
 
 class Network:
-    """What the network lets through, and at most M − 1 in a row that it does not.
+    """The network's fates and releases; at most M − 1 consecutive losses.
 
     Args:
         mansd: M − 1.
@@ -121,18 +121,18 @@ class Network:
         self._packets = 0
         self.longest_loss_burst = 0
         self.delivered_out_of_order = 0
-        """Updates that left after a newer one; the controller takes them for old ones."""
+        """Updates that left after a newer one; the controller treats them as stale."""
 
     @property
     def waiting(self) -> int:
-        """Updates that have not left yet."""
+        """Number of updates that have not left yet."""
         return len(self._in_flight)
 
     def take(self, packets: Rows, releases: Rows) -> tuple[list[int], list[int], list[str]]:
-        """Take rows of the network's tables that follow one another in the order of inputs.
+        """Check rows of the network's tables; they must be consecutive in the order of inputs.
 
         Returns:
-            Numbers of the updates that came in, and that left, in order; and what is wrong.
+            Numbers of the updates that arrived, and that left, in order; and the faults.
         """
         updates, sequences, _ = updates_in(packets)
         wrong = [] if len(updates) == len(packets) else ["netem_packet: something is no update"]
@@ -169,7 +169,7 @@ def _on_grid(table: str, rows: Rows, period_ns: int) -> Iterator[str]:
 
 
 def _unlike(table: str, rows: Rows, column: str, expected: Reals, size: Reals) -> Iterator[str]:
-    """Yield where a column is not as computed, up to rounding relative to what it comes from."""
+    """Yield the rows in which a column differs from its computed value by more than rounding."""
     tiny = np.finfo(float).tiny
     wrong = ~(np.abs(rows[column] - expected) <= _ROUNDING * (size + tiny))
     if wrong.ndim == 2:

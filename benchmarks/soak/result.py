@@ -1,4 +1,4 @@
-"""What a soak found: figures, verdicts, a table."""
+"""The result of a soak: figures, verdicts, a table."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -15,12 +15,12 @@ from benchmarks.soak.watch import Sample
 
 @dataclass(frozen=True)
 class Watched:
-    """A process over a run.
+    """The samples of a process over a run.
 
     Args:
-        at_s: when it was looked at, in wall time from the run's start.
-        samples: what was seen.
-        length_s: of the run, wall time.
+        at_s: times of the samples, in wall time since the run's start.
+        samples: the samples.
+        length_s: length of the run in wall time.
     """
 
     at_s: Sequence[float]
@@ -29,11 +29,11 @@ class Watched:
 
     @property
     def memory(self) -> Trend:
-        """Its private memory."""
+        """The trend of its private memory."""
         return trend(self.at_s, [sample.uss_kib for sample in self.samples], self.length_s)
 
     def range_of(self, count: str) -> tuple[int, int]:
-        """Least and most of ``fds``, ``sockets`` or ``threads`` after the warm-up."""
+        """Return minimum and maximum of ``fds``, ``sockets`` or ``threads`` after the warm-up."""
         counts = [getattr(sample, count) for sample in self.samples]
         return constant(self.at_s, counts, self.length_s)
 
@@ -45,7 +45,7 @@ class Watched:
         return used_s / elapsed_s if elapsed_s > 0 else 0.0
 
     def faults(self, role: str) -> list[str]:
-        """What is not flat, in words."""
+        """Return descriptions of what is not flat."""
         memory = self.memory
         found = []
         if memory.verdict == "unknown":
@@ -57,14 +57,14 @@ class Watched:
             )
         for count in ("fds", "sockets", "threads"):
             least, most = self.range_of(count)
-            # On a starved machine the plane's sessions connect anew, by threads that last a while.
+            # On an overloaded machine, control-plane sessions reconnect, which adds threads.
             judged = count != "threads" or self.length_s >= SHORT_S
             if judged and least != most:
                 found.append(f"{role}: {count} vary from {least} to {most} after the warm-up")
         return found
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, for ``--json``."""
+        """Return everything, for ``--json``."""
         counts = {count: list(self.range_of(count)) for count in ("fds", "sockets", "threads")}
         return {
             "memory": self.memory._asdict(),
@@ -79,27 +79,27 @@ class Watched:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a soak."""
+    """The result of a soak."""
 
     name: str
     run_dir: Path | None
     wall_s: float
-    """Of the loop, until its horizon."""
+    """Wall time of the loop, until its horizon."""
     end_s: float
-    """From then until the launcher was through."""
+    """Wall time from then until the launcher ended."""
     end_peak_kib: Mapping[str, float]
-    """Resident memory meanwhile, at most, of launcher and recorder."""
+    """Peak resident memory of launcher and recorder during that time."""
     disk_bytes: int
-    """What the run directory grew to while the loop ran."""
+    """Size of the run directory at the end of the loop."""
     watched: Mapping[str, Watched]
     account: Mapping[str, Any]
-    """Of the invariants."""
+    """What the invariants checked."""
     summary: Mapping[str, Any]
     faults: Sequence[str] = field(default_factory=list)
-    """All that was wrong, in words."""
+    """Descriptions of all faults."""
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, for ``--json``."""
+        """Return everything, for ``--json``."""
         kept = (
             "exit", "events", "deliveries", "drops", "longest_loss_burst", "missing_samples",
             "unintended_losses", "replay", "lateness_us", "reached_s", "horizon_s", "speed",
@@ -118,7 +118,7 @@ class Result:
         }
 
     def dumps(self) -> str:
-        """The result as JSON."""
+        """Return the result as JSON."""
         return json.dumps(self.as_json(), indent=2, default=float) + "\n"
 
 

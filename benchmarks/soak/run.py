@@ -1,4 +1,4 @@
-"""Carries out a soak: a run as a user starts one, looked at every few seconds."""
+"""Carries out a soak: a run as a user starts it, sampled every few seconds."""
 
 import json
 import math
@@ -28,15 +28,15 @@ FREE_PORTS = ("--set", "ports={}")
 _POLL_S = 0.25
 _START_PATIENCE_S = 120.0
 _LEAST_LOOKS = 150
-"""As many samples at least, so that each window has several."""
+"""Minimum number of samples, so that each window has several."""
 _LONGEST_PAUSE_S = 5.0
 _LAST_S = 1.0
-"""Before the horizon: then processes begin to end."""
+"""Time before the horizon that is ignored, since processes start to end."""
 _SAY_S = 300.0
 _STUCK_S = 120.0
-"""Wall time without a new row, far beyond what a busy machine makes of a poll."""
+"""A run without a new row for this wall time is stuck; far longer than a poll on a busy machine."""
 _END_PATIENCE = 4.0
-"""The end may take so many times as long as the loop, and ten minutes."""
+"""The end may take this multiple of the loop's time, plus ten minutes."""
 _EXIT_PATIENCE_S = 10.0
 
 Say = Callable[[str], None]
@@ -48,11 +48,11 @@ def soak(path: Path, settings: tuple[str, ...], runs: Path, say: Say) -> Result:
     Args:
         path: the scenario file; its trigger is the paper's, and nothing is acknowledged.
         settings: values to replace, as after ``--set``.
-        runs: where the run directory is made, in a folder of its own.
-        say: is told, now and then, how far it is.
+        runs: folder in which the run directory is made, in its own subfolder.
+        say: called with the progress at intervals.
 
     Raises:
-        MeasurementError: the run never began.
+        MeasurementError: the run never started.
     """
     runs.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=runs))
@@ -125,7 +125,7 @@ class _Soak:
         return result
 
     def _watched(self, began_s: float, length_s: float) -> dict[str, Watched]:
-        """What was seen between the run's first and last second."""
+        """Return the samples between the run's first and last second."""
         found = {}
         for role in (*LOOP_ROLES, RECORDER, LAUNCHER):
             looks = [
@@ -139,11 +139,11 @@ class _Soak:
         return found
 
     def _loop(self) -> tuple[float, int]:
-        """Look at the run until its horizon.
+        """Sample the run until its horizon.
 
         Returns:
-            When it was at t = 0, by our clock: a row that is read now was made before, so that the
-            earliest that any row gives is the best. And what the run directory had grown to.
+            The time of t = 0 on our clock (the minimum over all rows, since each row is read after
+            it was made), and the final size of the run directory.
         """
         pause_s = min(self._length_s / _LEAST_LOOKS, _LONGEST_PAUSE_S)
         look_s = told_s = moved_s = time.monotonic()
@@ -170,7 +170,7 @@ class _Soak:
         return min(began_s, time.monotonic()), disk_bytes
 
     def _end(self, patience_s: float) -> Mapping[str, float]:
-        """Wait until the launcher is through; return most memory meanwhile, by process."""
+        """Wait until the launcher ends; return the peak memory meanwhile, by process."""
         deadline_s = time.monotonic() + patience_s
         self._say("the loop is at its horizon; the run is replayed and judged")
         peaks: dict[str, float] = {}
@@ -205,7 +205,7 @@ class _Soak:
         )
 
     def _judge_end(self) -> dict[str, Any]:
-        """Look at what the run says of itself, and at what it left behind."""
+        """Check the run's summary, and that no process is left."""
         faults = self._faults
         if alive := self._processes.left_behind(_EXIT_PATIENCE_S):
             faults.append(f"left behind: {', '.join(alive)}")
@@ -230,12 +230,12 @@ def ended_badly(
     rows: Mapping[str, int],
     delivered_out_of_order: int = 0,
 ) -> list[str]:
-    """What a run's summary says that it must not say, in words.
+    """Return descriptions of the faults in a run's summary.
 
     Args:
-        summary: of the run.
+        summary: summary of the run.
         status: exit status of ``noack run``.
-        rows: how many were seen on the way, by table.
+        rows: number of rows received during the run, by table.
         delivered_out_of_order: updates that left the network after a newer one.
     """
     faults = []

@@ -1,4 +1,4 @@
-"""Watches the processes of a run from outside."""
+"""Samples the processes of a run from outside."""
 
 import contextlib
 import os
@@ -19,12 +19,12 @@ MODULES: Mapping[str, str] = {
 
 
 class Sample(NamedTuple):
-    """What the system says of a process."""
+    """The system's data about a process."""
 
     rss_kib: float
     pss_kib: float
     uss_kib: float
-    """What is the process's own, and judged: what it shares with others is no leak of its."""
+    """Private memory, which is judged; shared memory is no leak of this process."""
     fds: int
     sockets: int
     threads: int
@@ -43,11 +43,11 @@ class Processes:
 
     @property
     def roles(self) -> set[str]:
-        """Who has been seen."""
+        """Roles of all processes seen so far."""
         return set(self._known)
 
     def sample(self) -> dict[str, Sample]:
-        """Look at every process that is alive."""
+        """Sample every process that is alive."""
         self._find()
         found = {}
         for role, process in self._known.items():
@@ -56,12 +56,12 @@ class Processes:
         return found
 
     def left_behind(self, patience_s: float) -> list[str]:
-        """Who is alive although the run is over."""
+        """Return the roles of processes that are alive although the run is over."""
         _, alive = psutil.wait_procs(list(self._known.values()), timeout=patience_s)
         return sorted(role for role, process in self._known.items() if process in alive)
 
     def kill(self) -> None:
-        """End them all; the launcher last."""
+        """Kill all processes, the launcher last."""
         for process in reversed(self._known.values()):
             with contextlib.suppress(psutil.Error):
                 process.kill()
@@ -89,9 +89,9 @@ def _sample(process: psutil.Process) -> Sample:
 
 
 def size_bytes(folder: Path) -> int:
-    """What a folder takes on the disk; files and folders may vanish meanwhile."""
+    """Return a folder's size on the disk; files and folders may vanish meanwhile."""
     total = 0
-    for inner, _, names in os.walk(folder):  # which passes over what it cannot read
+    for inner, _, names in os.walk(folder):  # os.walk skips folders that it cannot read
         for name in names:
             with contextlib.suppress(OSError):
                 total += (Path(inner) / name).stat().st_blocks * 512
