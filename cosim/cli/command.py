@@ -1,4 +1,4 @@
-"""How a command of ``noack`` is declared, what all commands share, the entry point."""
+"""Declaration of ``noack``'s commands, their shared functions, and the entry point."""
 
 import math
 import os
@@ -32,7 +32,7 @@ _TOUR = (
     ("noack campaign mb_vs_zoh", "run a grid of settings many times"),
     ("noack netem --explain loss 5%", "use the network emulator alone"),
 )
-"""A first session: commands, and what each does."""
+"""A first session: commands and their descriptions."""
 _MOST_COLUMNS = 78
 
 RUNS, THEORY, CAMPAIGNS = "Runs", "Theory", "Campaigns"
@@ -136,13 +136,13 @@ def options(
 def command(
     panel: str, place: int, examples: Sequence[tuple[str, str]] = (), **settings: Any
 ) -> Callable[[Callable[..., int]], Callable[..., None]]:
-    """Register a command. Its result is the exit status; a mistake becomes one line.
+    """Register a command. Its result is the exit status; an error is printed as one line.
 
     Args:
-        panel: of the help, one of :data:`PANELS`.
-        place: in the panel; commands are listed by it, in ascending order.
+        panel: panel of the help, one of :data:`PANELS`.
+        place: sort key within the panel, ascending.
         examples: commands and their descriptions, shown at the end of the command's help.
-        settings: of :meth:`typer.Typer.command`.
+        settings: keyword arguments of :meth:`typer.Typer.command`.
     """
 
     def register(function: Callable[..., int]) -> Callable[..., None]:

@@ -1,4 +1,4 @@
-"""What the commands that make a run share: warnings, the run itself, its verdict."""
+"""Functions of all commands that make a run: warnings, the run itself, its verdict."""
 
 import sys
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from noack.config.scenario import Scenario
 if TYPE_CHECKING:
     from cosim.record.run_ending import RunEnding
 
-# Each process of a run waits for the slowest: what is not needed at the start is imported later.
+# All processes wait for the slowest one: modules not needed at the start are imported later.
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def run_processes(
     """Run a scenario live; print its verdict and return the exit status.
 
     Args:
-        scenario: not resolved.
+        scenario: the scenario, not resolved.
         runs: folder of the run directories.
         output: what is printed and written at the end.
         spawn: roles of the processes to start; the others join by ``session``.
@@ -58,7 +58,7 @@ def run_processes(
             ending = launch(
                 scenario, runs, spawn=spawn, session=session, live=live, watcher=watcher
             )
-    except OSError:  # a closed terminal does not cost the run
+    except OSError:  # a closed terminal must not end the run
         if ending is None:
             raise
     return finalize_run(ending, output)
@@ -80,7 +80,7 @@ def finalize_run(ending: "RunEnding", output: RunOutput) -> int:
     from cosim.live.progress import PatientConsole
     from cosim.output.run_verdict import print_outcome
 
-    # Minutes for a run of an hour.
+    # This takes minutes for a run of an hour.
     with PatientConsole(stderr=True).status("replaying the run and checking its claims"):
         outcome = finalize(ending, report=output.report)
     if output.json:

@@ -1,4 +1,4 @@
-"""The program as a whole: how mistakes end, what a reader who leaves means, what help hides."""
+"""The program: error messages, closed standard streams, help."""
 
 import io
 import sys
@@ -17,10 +17,10 @@ _COMPLETION = ("install_completion", "show_completion")
 
 
 class Program(TyperGroup):
-    """All commands; a mistake in how one is called is one line, with what would be right."""
+    """All commands; a usage error is printed as one line with a suggestion."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The options before the command; those of shell completion are not in the help."""
+        """Return the options before the command; the help hides those of shell completion."""
         found: list[Any] = super().get_params(ctx)
         for one in found:
             one.hidden = one.hidden or one.name in _COMPLETION
@@ -45,7 +45,7 @@ class Program(TyperGroup):
             status = ExitStatus.CALLER
             if said := self._line(error, words):
                 failed(said, status, who=NAME, as_json="--json" in words)
-        except OSError as error:  # help goes to a full disk
+        except OSError as error:  # help is written to a full disk
             status = failed(
                 f"cannot write: {why(error)}",
                 ExitStatus.FAILED,
@@ -57,7 +57,7 @@ class Program(TyperGroup):
         return status
 
     def _line(self, error: typer.TyperException, words: Sequence[str]) -> str:
-        """What is wrong with a command line, in one line; empty if the help has been shown."""
+        """Return the usage error as one line; empty if the help has been shown."""
         message = printable(" ".join(error.format_message().split())).rstrip(".")
         if not message:
             return ""
@@ -74,34 +74,34 @@ class Program(TyperGroup):
 
 
 def examples_of(command: Any) -> list[str]:
-    """The commands among the examples that a help page ends with."""
+    """Return the commands of the examples at the end of a help page."""
     lines = Text.from_markup(command.epilog or "").plain.splitlines()
     commands = (line.strip().partition("   ")[0] for line in lines)
     return [line for line in commands if line.startswith(f"{NAME} ")]
 
 
 def be_patient() -> None:
-    """Let what is written to standard streams go nowhere once their readers have left.
+    """Discard output to a standard stream after its reader has closed it.
 
-    So `noack run ... | head -1` runs to its end, and its exit status says what became of the run.
+    Hence `noack run ... | head -1` runs to its end, with the run's exit status.
     """
     sys.stdout, sys.stderr = _patient(sys.stdout), _patient(sys.stderr)
 
 
 def _patient(stream: Any) -> Any:
-    if not isinstance(stream, io.TextIOWrapper):  # a shell's >&- gives a program none
+    if not isinstance(stream, io.TextIOWrapper):  # the shell closed it by >&-
         return stream
     return io.TextIOWrapper(
         io.BufferedWriter(_Patient(stream.fileno(), "w", closefd=False)),
         encoding=stream.encoding,
         errors="replace",  # a terminal that cannot show ‖x‖ gets ?x?
-        # PYTHONUNBUFFERED asks for more; a line is what somebody waits for.
+        # PYTHONUNBUFFERED requests more than lines; readers wait for lines.
         line_buffering=stream.line_buffering or stream.write_through,
     )
 
 
 class _Patient(io.FileIO):
-    """Says once that it is full; what is left is tried again at the end, and nobody listens."""
+    """Raises one error if the disk is full; the rest, written at the end, is discarded."""
 
     _full = False
 

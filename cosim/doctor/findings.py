@@ -1,4 +1,4 @@
-"""Judges the measurements of a machine: what was found, what it means for a run, what to do."""
+"""Judges the measurements of a machine: findings, their meaning for a run, remedies."""
 
 from collections.abc import Iterator, Sequence
 from enum import StrEnum
@@ -53,7 +53,7 @@ class MachineFinding(NamedTuple):
     verdict: FindingStatus
     found: str
     means: str = ""
-    """For a run; empty if there is nothing to say."""
+    """Meaning for a run; may be empty."""
     remedy: str = ""
 
 

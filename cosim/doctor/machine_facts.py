@@ -22,7 +22,7 @@ class RunRequirements(NamedTuple):
     fifo_priority: int
     spin_us: float
     ports: Mapping[str, int]
-    """By key; ports that are 0 (any free port) are left out."""
+    """Ports by key, without ports that are 0 (any free port)."""
 
     @property
     def rate_hz(self) -> float:
@@ -89,7 +89,7 @@ class Disk(NamedTuple):
 
 @dataclass(frozen=True)
 class MachineFacts:
-    """All measurements. A measurement that failed is the line that says why."""
+    """All measurements. A failed measurement is one line with the reason."""
 
     cores: int
     """Cores that this process may use."""
@@ -99,7 +99,7 @@ class MachineFacts:
     governor: str | None
     """Frequency governor of the first core; None if unknown."""
     granted: Mapping[str, str]
-    """By real-time setting: applied or not permitted, as ``realtime`` reports it."""
+    """For each real-time setting: applied or not permitted, as ``realtime`` reports it."""
     timer_resolution_ns: int
     timer_slack_ns: int | None
     plain: Lateness | str

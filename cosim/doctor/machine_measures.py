@@ -45,7 +45,7 @@ from noack.runtime.zenoh_session import SessionSecret, answer_to, cause_of, open
 T = TypeVar("T")
 
 EXTRAS = {"fmi": "fmpy", "vehicle": "vehiclemodels", "cluster": "distributed"}
-"""Extras of noack by name, and the module that each brings."""
+"""Extras of noack by name, and one module that each installs."""
 
 _DATAGRAM = bytes(72)
 _ROUND_TRIPS = 1000
@@ -126,7 +126,7 @@ def _wake_ups(
 
 
 def lateness(late_ns: Iterable[int], allowance_ns: int) -> Lateness | str:
-    """Return the statistics of lateness in ns; a line that says why if there is none."""
+    """Return the statistics of lateness in ns, or one line with the reason why there are none."""
     late = np.array(list(late_ns), dtype=np.int64)
     if not len(late):
         return "no wake-up was measured"
@@ -199,7 +199,7 @@ def _ports_taken(wanted: RunRequirements) -> Iterable[str]:
 
 
 def _control() -> float:
-    """Return the seconds that a query takes over a star as in the control plane."""
+    """Return the time of a query in seconds, over zenoh sessions as in the control plane."""
     secret = SessionSecret("doctor", secrets.token_hex(16))
     endpoint, key = f"tcp/{LOOPBACK}:{free_tcp_port()}", "noack/doctor"
     centre = open_session(endpoint, secret, listen=True)
@@ -262,7 +262,7 @@ def _runtime_folder() -> str | None:
 def _cache() -> bool:
     try:
         folder = cache_folder("doctor", [Path(__file__)])
-    except ImportError:  # no numba, nothing to cache
+    except ImportError:  # no numba: there is nothing to cache
         return False
     if folder is not None:
         with suppress(OSError):

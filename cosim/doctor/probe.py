@@ -24,7 +24,7 @@ def wake(period_ns: int, duration_s: float, priority: int, spin_us: float) -> di
         ``plain`` and ``realtime``: lateness in ns; ``granted``: the settings.
     """
     found: dict[str, object] = {}
-    # Timer slack and locked memory stay for the life of a process: measure without them first.
+    # Timer slack and locked memory cannot be undone in a process: measure without them first.
     for name, enabled in (("plain", False), ("realtime", True)):
         with realtime(enabled, priority, place=0) as granted:
             found |= {name: _lateness(period_ns, duration_s, spin_us), "granted": granted}
@@ -85,7 +85,7 @@ class _Nothing:
 
 
 def echo() -> None:
-    """Print a port and return what arrives there; an empty datagram ends it."""
+    """Print a port and echo datagrams that arrive there; an empty datagram ends it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind((LOOPBACK, 0))
         endpoint.settimeout(_IDLE_S)

@@ -1,1 +1,1 @@
-"""What people see: number formats, tables, figures, report, viewer."""
+"""Output for people: number formats, tables, figures, report, viewer."""

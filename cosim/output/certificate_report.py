@@ -33,14 +33,14 @@ from noack.theory.weight import choose_weight
 IDEAL = "paper"
 """The paper's conditions: no sampling, no delay, no hold."""
 SCHEDULE = "schedule"
-"""The scenario's rates, plus the lateness that it allows."""
+"""The scenario's rates, and the lateness that it allows."""
 
 MOST_LATE = 1000
 _MOST_S = 10.0
 
 
 class NetworkLimits(NamedTuple):
-    """Largest certified value of each quantity, the others as in the schedule."""
+    """Largest certified value of each quantity; the others are those of the schedule."""
 
     sampling_s: float
     delay_s: float
@@ -69,7 +69,7 @@ class Study:
 
     @cached_property
     def limits(self) -> dict[str, NetworkLimits]:
-        """By scope; computed at first use, from about a hundred certificates."""
+        """Limits by scope; computed at first use, from about a hundred certificates."""
         return {scope.name: _limits(scope, self.scheduled) for scope in self.scopes}
 
     def certificate(self, under: str) -> ScenarioCertificate:
@@ -82,7 +82,7 @@ class Study:
         return next(of_box, None)
 
     def to_json(self) -> dict[str, Any]:
-        """Return all of it as one JSON document."""
+        """Return the study as one JSON document."""
         theorem = None if self.theorem_2 is None else self.theorem_2._asdict()
         return {
             "scenario": self.resolved.name,
@@ -105,7 +105,7 @@ def with_weight(
     """Return the scenario with the requested weight, and W if noack chose it.
 
     Raises:
-        CallerError: there is no such choice, or no weight can be chosen for this scenario.
+        CallerError: the choice is unknown, or no weight can be chosen for this scenario.
     """
     weight: Matrix | None = None
     if which == "given":
@@ -136,12 +136,12 @@ def study_scenario(
 
     Args:
         scenario: as loaded; it is resolved here.
-        weight: given, identity or chosen.
+        weight: ``given``, ``identity`` or ``chosen``.
         late_periods: allowed lateness in steps of the plant, 0 to 1000; by default the scenario's.
-        progress: called with the share of the choice of a weight that is done.
+        progress: called with the completed share of the choice of a weight.
 
     Raises:
-        CallerError: there is no such choice, or no certificate covers this scenario.
+        CallerError: the choice is unknown, or no certificate covers this scenario.
     """
     resolved = resolve(scenario)
     allowed = resolved.certificate.late_periods if late_periods is None else late_periods
@@ -210,7 +210,7 @@ def print_study(console: Console, found: Study) -> None:
 
 
 def in_words(found: Study) -> Iterator[str]:
-    """Yield what is certified for the scenario's schedule, in sentences."""
+    """Yield sentences with the certified bounds for the scenario's schedule."""
     for under, certificate in found.certificates:
         constants, dropouts = certificate.constants, certificate.conditions.dropouts
         if under != SCHEDULE or constants is None:
@@ -258,7 +258,7 @@ def _print_constants(console: Console, found: Study) -> None:
 
 
 def whose(certificate: ScenarioCertificate) -> str:
-    """Return "box" or "plant": the plants that a certificate covers."""
+    """Return which plants a certificate covers: "box" or "plant"."""
     return "box" if certificate.scope == BOX else "plant"
 
 

@@ -19,7 +19,7 @@ _EVENTS_SHOWN = 40
 def print_run(console: Console, run: ContinuousRun, resolved: Scenario) -> None:
     """Print how the run ended, its key numbers, and its first 40 events."""
     found = summary(run, resolved)
-    for line in verdict(found)[:2]:  # no claims are checked
+    for line in verdict(found)[:2]:  # without claims
         console.print(Text(line.text, line.style), soft_wrap=True)
     rows = (
         *loss_and_interval_rows(found),

@@ -1,4 +1,4 @@
-"""Tables of a run's fidelity: its difference to the ideal loop, effect by effect."""
+"""Tables of a run's fidelity: its difference from the ideal loop, effect by effect."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,8 +1,8 @@
-"""The colours of every picture: the viewer's, the reports', the library's. One concept, one colour.
+"""The colours of the viewer, the reports and the library's figures. One concept, one colour.
 
-Every colour stands out from a light and from a dark background, 3 to 1. Colours that appear in one
-panel can be told apart by colour-blind people as well; a test computes both. What they colour also
-differs in width, dash or marker.
+Every colour has a contrast of at least 3 to 1 with a light and with a dark background. Colours in
+one panel can be distinguished by colour-blind people as well; a test computes both. Lines and marks
+also differ in width, dash or marker.
 """
 
 Colour = tuple[int, int, int]
@@ -21,13 +21,13 @@ CERTIFIED: Colour = (51, 162, 78)
 IDENTITY: Colour = (200, 115, 215)
 """The bound from identity (I1)."""
 PRINTED: Colour = (180, 60, 0)
-"""Bounds by the paper's printed formulas."""
+"""Bounds from the paper's formulas."""
 LOST: Colour = (120, 90, 150)
 """Lost packets."""
 FORCED: Colour = (0, 150, 255)
 """Deliveries forced by the guarantee."""
 SERIES: tuple[Colour, ...] = (SENSOR, CONTROLLER, FORCED, PRINTED, THRESHOLD, PLANT)
-"""For what has no colour of its own."""
+"""Colours for series without their own colour."""
 PROCESSES: dict[str, Colour] = {
     "plant": PLANT,
     "sensor": SENSOR,

@@ -1,4 +1,4 @@
-"""Remarks on a run: what to know before trusting its numbers, a sentence each."""
+"""Remarks on a run that limit the validity of its numbers, one sentence each."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -43,7 +43,7 @@ def _warnings(summary: Summary) -> Iterator[str]:
         yield f"the plant missed {share:.0f} % of its deadlines: lower speed or plant.rate_hz"
     first, last = summary["initial_state_norm"], summary["final_state_norm"]
     grew = first is not None and last is not None and last > _MOST_GROWTH * first > 0
-    if grew and summary.get("diverged_at_s") is None:  # else it is the reason of the end
+    if grew and summary.get("diverged_at_s") is None:  # else it is the reason why the run ended
         yield f"‖x‖ grew from {first:.3g} to {last:.3g} during the run"
     if (summary.get("fidelity") or {}).get("explained") is False:
         yield "sampling, delay and hold do not explain the difference to the ideal loop"

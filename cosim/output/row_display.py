@@ -1,15 +1,15 @@
-"""Rows of words as a person sees them: in a terminal, in a notebook."""
+"""Formats rows of texts for a terminal and for a notebook."""
 
 import html
 import unicodedata
 from collections.abc import Sequence
 
 Rows = Sequence[Sequence[str]]
-"""The first entry of a row names it."""
+"""The first entry of a row is its name."""
 
 
 def as_text(rows: Rows) -> str:
-    """Rows in columns that line up."""
+    """Return rows as aligned columns."""
     widths = [max(map(_width, column)) for column in zip(*rows, strict=True)]
     lines = (
         "  ".join(
@@ -21,7 +21,7 @@ def as_text(rows: Rows) -> str:
 
 
 def as_html(rows: Rows) -> str:
-    """Rows as a table of HTML."""
+    """Return rows as an HTML table."""
     body = "".join(
         f"<tr><th>{html.escape(name)}</th>"
         + "".join(f'<td style="text-align: left">{html.escape(entry)}</td>' for entry in entries)
@@ -32,5 +32,5 @@ def as_html(rows: Rows) -> str:
 
 
 def _width(text: str) -> int:
-    """Columns that a text takes: a combining sign stands on another, as the line in δ̲."""
+    """Return the width of a text in columns; a combining character, as in δ̲, has width 0."""
     return sum(not unicodedata.combining(one) for one in text)

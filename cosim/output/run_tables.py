@@ -129,7 +129,7 @@ def _ideal_difference(fidelity: dict[str, Any] | None) -> Iterator[tuple[str, st
 
 
 def _lateness(summary: Summary) -> Iterator[tuple[str, str]]:
-    """Latency of updates and missed deadlines of a live run."""
+    """Yield the latency of updates and the missed deadlines of a live run."""
     if latency := summary["latency_us"]:
         quantiles = " / ".join(whole(latency[key]) for key in ("p50", "p99"))
         yield "sensor-to-controller latency p50 / p99", f"{quantiles} µs"

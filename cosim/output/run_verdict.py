@@ -1,4 +1,4 @@
-"""The end of a run on the terminal: a verdict of three lines, a table, where to find more."""
+"""Terminal output at the end of a run: a verdict of three lines, a table, the run's files."""
 
 import shutil
 import sys
@@ -21,7 +21,7 @@ from noack.runtime.life_cycle import HORIZON
 
 GOOD, DOUBTFUL, BAD, NEUTRAL = "green", "yellow", "bold red", ""
 _CLAIMS = {"violated": BAD, "void": DOUBTFUL, "not applicable": NEUTRAL}
-"""Styles of claims that did not hold, the worst first."""
+"""Styles of verdicts other than "held", the worst first."""
 
 
 class VerdictLine(NamedTuple):
@@ -29,7 +29,7 @@ class VerdictLine(NamedTuple):
 
     text: str
     style: str
-    """A style of rich."""
+    """Name of a style of rich."""
 
 
 def verdict(summary: Summary) -> tuple[VerdictLine, VerdictLine, VerdictLine]:
@@ -80,8 +80,8 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
     """Print the verdict, the key numbers, the remarks, and where to find more.
 
     Args:
-        console: of the output.
-        outcome: of the run.
+        console: console for the output.
+        outcome: outcome of the run.
         verbose: print all tables instead of the key numbers.
     """
     summary = outcome.summary
@@ -99,7 +99,7 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool = False) 
 
 
 def _where(outcome: Outcome, *, verbose: bool) -> Iterator[str]:
-    """Yield the files of a run, or one line that says how to see them."""
+    """Yield the files of a run, or one line with the commands that show them."""
     run_dir, report = outcome.run_dir, outcome.run_dir / REPORT_FILE
     if not verbose:
         page = f"{report} and " if report.is_file() else ""

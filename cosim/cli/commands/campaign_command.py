@@ -13,7 +13,7 @@ from cosim.record.run_directory import DEFAULT_RUNS
 from noack.core.errors import CallerError, ExitStatus
 
 _PER_CORE = 4
-"""More worker processes per core gain nothing, and take memory."""
+"""Maximum worker processes per core; more gain nothing, and use memory."""
 
 Draws = Annotated[
     int | None,
@@ -76,7 +76,7 @@ def campaign(
 
 
 def _worker_pool(workers: int | None, scheduler: str | None) -> Callable[[Any], Any]:
-    """Return what starts the workers, given a function that prints a line."""
+    """Return a function that starts the workers; its argument is a function that prints a line."""
     from cosim.studies.campaign.campaign_workers import cluster, local
 
     if scheduler is not None:
@@ -93,7 +93,7 @@ def _run(
     console: Console, path: Path, start: Callable[[Any], Any], *, draws: int | None,
     out: Path | None,
 ) -> tuple[Any, int, list[Path]]:  # fmt: skip
-    """Run or continue a campaign; return its summary, the runs made now, the files written."""
+    """Run or continue a campaign; return its summary, the number of new runs, the written files."""
     from cosim.live.progress import runs_bar
     from cosim.studies.campaign.campaign_file import load
     from cosim.studies.campaign.campaign_grid import base_of, grid

@@ -41,11 +41,11 @@ def check(
     from noack.trigger.trigger_policy import new_trigger
 
     resolved = resolve(load(find_scenario(scenario), settings or ()))
-    new_trigger(policy_of(resolved))  # some need a stable loop, others a class of the user's
+    new_trigger(policy_of(resolved))  # some need a stable loop, others a user's class
     verdicts = [assumption._asdict() for assumption in assumptions(resolved)]
     console = Console()
     console.width -= len(_COMMENT)
-    with console.capture() as captured:  # printed last: the plant may be refused
+    with console.capture() as captured:  # printed last: the plant may be rejected
         console.print("the paper's assumptions for this scenario:")
         print_assumptions(console, verdicts)
         _print_plant(console, resolved)

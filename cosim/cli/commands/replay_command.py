@@ -1,4 +1,4 @@
-"""``noack replay``: a run's recorded inputs again, its outputs compared."""
+"""``noack replay``: repeats a run's recorded inputs and compares the outputs."""
 
 from rich.console import Console
 

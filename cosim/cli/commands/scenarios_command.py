@@ -46,7 +46,7 @@ def scenarios(
 
 
 def _print_shipped(console: Console, some: Sequence[ShippedFile]) -> None:
-    """Print a line each to a pipe, a wrapped table to a terminal."""
+    """Print one line per file to a pipe, or a wrapped table to a terminal."""
     width = max(len(one.name) for one in some)
     if not console.is_terminal:
         for one in some:

@@ -1,6 +1,6 @@
-"""The report of a run: figures, and a page that holds them."""
+"""The report of a run: figures, and an HTML page with them."""
 
 import logging
 
-# Where it can keep no cache, matplotlib says so at every run; nobody could do anything with that.
+# If matplotlib cannot write its cache, it warns in every run; the warning is of no use here.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)

@@ -1,7 +1,7 @@
-"""What the figures' axes have in common: their place, legends, lines thinned to what can be seen.
+"""Shared functions for axes: positions, legends, lines reduced to the visible points.
 
-Axes are placed by the inch: that takes no layout engine's time, lines the figures of a page up with
-each other, and gives the same figure the same bytes.
+Axes have positions in inches: this needs no layout engine, aligns the figures of a page with each
+other, and gives the same figure the same bytes.
 """
 
 import math
@@ -21,11 +21,11 @@ from cosim.output.report.decimate import Reals, decimate
 from cosim.output.report.figure_style import NotebookFigure, printed
 
 BoundKind = Literal["certified", "identity", "printed"]
-"""What a bound rests on: a certificate, identity (I1), or a formula printed in the paper."""
+"""Source of a bound: a certificate, identity (I1), or a formula of the paper."""
 
 
 class Bound(NamedTuple):
-    """A curve that bounds what was measured."""
+    """A curve that bounds a measured quantity."""
 
     label: str
     t_s: Reals
@@ -36,19 +36,19 @@ class Bound(NamedTuple):
 
 
 Shown = tuple[Artist, str]
-"""What is drawn and what the legend calls it."""
+"""A drawn object and its label in the legend."""
 
 TIME = "time t [s]"
 
 WIDTH_IN, LEFT_IN, RIGHT_IN, BELOW_IN = 10.0, 1.15, 0.2, 0.55
-"""A figure's width; what labels and ticks take at its left, right, and below an axes."""
+"""Width of a figure; space for labels and ticks at the left, at the right, and below an axes."""
 _ABOVE_IN, _LEGEND_ROW_IN, _TITLE_IN, _HANDLE_IN, _CHARACTER_IN = 0.34, 0.19, 2.3, 0.6, 0.075
 
 _COLUMNS = 600
-"""Pixel columns of a panel, which lines are thinned for."""
+"""Pixel columns of a panel, to which lines are reduced."""
 _MARKS, _CROWD = 120, 80
-"""Markers are wider than a pixel: fewer columns of them fill a panel, and a crowd of them is drawn
-smaller."""
+"""Columns of markers in a panel, which are wider than a pixel; more markers than ``_CROWD`` are
+drawn smaller."""
 _MARKUP = re.compile(r"[$\\{}^_]|(?<=\\)\w+")
 _LARGEST = 1e150
 _LONGEST_NAME = 16
@@ -66,14 +66,14 @@ _BOUND_STYLES: dict[BoundKind, tuple[palette.Colour, tuple[Any, ...]]] = {
 def place(
     figure: Figure, left_in: float, top_in: float, width_in: float, height_in: float, **shared: Any
 ) -> Axes:
-    """Add axes, whose upper left corner is so far from the figure's."""
+    """Add axes; their upper left corner has this distance from the figure's."""
     whole_in = figure.get_figheight()
     bottom_in = whole_in - top_in - height_in
     axes = figure.add_axes(
         (left_in / WIDTH_IN, bottom_in / whole_in, width_in / WIDTH_IN, height_in / whole_in),
         **shared,
     )
-    factor = axes.yaxis.get_offset_text()  # ×10⁻⁶; above the axes it would meet the title
+    factor = axes.yaxis.get_offset_text()  # e.g. ×10⁻⁶; above the axes it would overlap the title
     factor.set(x=-0.05 / width_in, horizontalalignment="right")
     return axes
 
@@ -85,7 +85,7 @@ def single(
 
     Args:
         height_in: height of the axes.
-        labels: those of the first panel's legend, which takes room above it.
+        labels: labels of the first panel's legend, which needs space above it.
         beside_in: width of the second panel; 0 for none.
     """
     width_in = WIDTH_IN - LEFT_IN - RIGHT_IN - (beside_in + 0.25 if beside_in else 0.0)
@@ -100,13 +100,13 @@ def single(
 
 
 def head_in(labels: Sequence[str], width_in: float = WIDTH_IN - LEFT_IN - RIGHT_IN) -> float:
-    """What title and legend take above axes so wide."""
+    """Return the height of title and legend above axes of this width."""
     rows = math.ceil(len(labels) / _legend_columns(labels, width_in))
     return _ABOVE_IN + _LEGEND_ROW_IN * max(rows - 1, 0)
 
 
 def _legend_columns(labels: Sequence[str], width_in: float) -> int:
-    """As many as there is room for beside the title."""
+    """Return the number of legend columns that fit beside the title."""
     entries_in = [_HANDLE_IN + _CHARACTER_IN * len(_MARKUP.sub("", label)) for label in labels]
     for columns in range(len(labels), 1, -1):
         widths_in = [max(column) for column in np.array_split(entries_in, columns)]
@@ -116,7 +116,7 @@ def _legend_columns(labels: Sequence[str], width_in: float) -> int:
 
 
 def legend(axes: Axes, shown: Sequence[Shown]) -> None:
-    """Put the legend above the axes at the right, where no data are."""
+    """Put the legend above the axes at the right, where there are no data."""
     if shown:
         handles, labels = zip(*shown, strict=True)
         columns = _legend_columns(labels, axes.get_position().width * WIDTH_IN)
@@ -124,7 +124,7 @@ def legend(axes: Axes, shown: Sequence[Shown]) -> None:
 
 
 def finite(values: Reals, *, positive: bool = False) -> Reals:
-    """Return values with NaN for what no axis can show: infinite or immense; if asked, not > 0."""
+    """Return values with NaN for infinite and huge ones, and, if ``positive``, those not > 0."""
     values = np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore"):
         shown = np.abs(values) < _LARGEST
@@ -136,8 +136,8 @@ def finite(values: Reals, *, positive: bool = False) -> Reals:
 def for_log_axis(values: Reals) -> Reals:
     """Return values for a curve on a logarithmic axis.
 
-    A zero, to which an error is reset, becomes a value far below every axis: the curve falls there
-    vertically, where a NaN would leave a gap. Values that are all zero become NaN.
+    A zero (an error after a reset) becomes a value far below every axis, so that the curve falls
+    vertically; a NaN would leave a gap. If all values are zero, they become NaN.
     """
     shown = finite(values, positive=True)
     if np.isfinite(shown).any():
@@ -146,7 +146,7 @@ def for_log_axis(values: Reals) -> Reals:
 
 
 def limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
-    """Show all curves, but at most so many decades below and above the largest measured value."""
+    """Show all curves, but at most ``decades`` below and above the largest measured value."""
     measured = finite(measured, positive=True)
     if not np.isfinite(measured).any():
         return
@@ -159,7 +159,7 @@ def limit_log_axis(axes: Axes, measured: Reals, decades: int) -> None:
 
 
 def plain(name: str, longest: int = _LONGEST_NAME) -> str:
-    """A user's name as it is, not taken for mathematics, on one line short enough for a label."""
+    """Return a user's name for a label: no mathematical markup, one line, limited length."""
     line = " ".join(name.split())
     if len(line) > longest:
         line = line[: longest - 1] + "…"
@@ -167,10 +167,10 @@ def plain(name: str, longest: int = _LONGEST_NAME) -> str:
 
 
 def line(axes: Axes, t_s: Reals, values: Reals, label: str = "", **style: Any) -> list[Shown]:
-    """Draw a curve; its values are finite or NaN, and a single one shows as a dot."""
+    """Draw a curve; its values are finite or NaN; a single point is drawn as a dot."""
     keep = decimate(t_s, values, _COLUMNS)
     if len(keep) < len(t_s):
-        style.pop("drawstyle", None)  # steps between the points that are left would be untrue
+        style.pop("drawstyle", None)  # steps between the remaining points would be wrong
     if np.isfinite(values).sum() == 1:
         style["marker"] = "o"
     (drawn,) = axes.plot(t_s[keep], values[keep], **style)
@@ -180,7 +180,7 @@ def line(axes: Axes, t_s: Reals, values: Reals, label: str = "", **style: Any) -
 def marks(
     axes: Axes, t_s: Reals, values: Reals, label: str = "", size: float = 5.0, **style: Any
 ) -> list[Shown]:
-    """Draw markers, smaller where there are many; named in the legend only if there are any."""
+    """Draw markers, smaller ones if there are many; without markers, there is no legend entry."""
     seen = np.isfinite(values)
     t_s, values = t_s[seen], values[seen]
     if not len(values):
@@ -192,7 +192,7 @@ def marks(
 
 
 def stems(axes: Axes, t_s: Reals, values: Reals, **style: Any) -> None:
-    """Draw a stem from 0 to each value, all of them one line."""
+    """Draw a stem from 0 to each value, all stems as one line."""
     keep = decimate(t_s, values, _MARKS)
     feet = np.column_stack([np.zeros(len(keep)), values[keep], np.full(len(keep), np.nan)])
     axes.plot(np.repeat(t_s[keep], 3), feet.ravel(), linewidth=1.0, **style)
@@ -208,7 +208,7 @@ def bounds(axes: Axes, curves: Sequence[Bound]) -> list[Shown]:
 
 
 def bound_styles(curves: Sequence[Bound]) -> list[dict[str, Any]]:
-    """How each bound of a figure is drawn: one colour per kind, one dash per bound of a kind."""
+    """Return each bound's style: one colour per kind, one dash pattern per bound of a kind."""
     drawn: Counter[BoundKind] = Counter()
     styles = []
     for bound in curves:
@@ -220,11 +220,11 @@ def bound_styles(curves: Sequence[Bound]) -> list[dict[str, Any]]:
 
 
 def finish(axes: Axes, t_s: Reals | None = None) -> None:
-    """Span the time, from 0 if it begins near; say where no data are, lest they be taken for zero.
+    """Set the range of the time axis, from 0 if the data start near 0; mark axes without data.
 
     Args:
-        axes: the axes, all data drawn.
-        t_s: times whose first and last the axis shows, if time is what it shows.
+        axes: the axes, with all data drawn.
+        t_s: the axis shows the range of these times, if it is a time axis.
     """
     if t_s is not None and len(t_s) and t_s[-1] > t_s[0]:
         start = 0.0 if 0 <= t_s[0] < 0.05 * t_s[-1] else t_s[0]
@@ -235,7 +235,7 @@ def finish(axes: Axes, t_s: Reals | None = None) -> None:
 
 
 class _Numbers(LogFormatter):
-    """Writes 0.2 and 200, but 10⁻⁵; typesetting the powers would take longer than all the rest."""
+    """Writes 0.2 and 200, but 10⁻⁵ as plain text: typeset powers would be slow."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         if not super().__call__(x, pos):

@@ -1,4 +1,4 @@
-"""Fewer points, the same picture."""
+"""Reduces the number of points of a line without changing its plot."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,10 @@ _POINTS_PER_COLUMN = 4
 
 
 def decimate(t: Reals, y: Reals, columns: int) -> Indices:
-    """Pick what a plot of y over t shows when it is so many pixel columns wide.
+    """Select the points that a plot of y over t needs at a width of ``columns`` pixels.
 
-    Of each column the first, the last, the smallest and the largest value stay, so that a line
-    through them covers the same pixels (Jugel et al. 2014, *M4*) and no peak is lost.
+    These are the first, the last, the smallest and the largest value of each column: a line through
+    them covers the same pixels (Jugel et al. 2014, *M4*), and no peak is lost.
 
     Args:
         t: (k,), ascending.
@@ -21,7 +21,7 @@ def decimate(t: Reals, y: Reals, columns: int) -> Indices:
         columns: width of the plot.
 
     Returns:
-        At most 4 ``columns`` indices, ascending; all k when they are no more than that.
+        At most 4 ``columns`` indices, ascending; all k indices if k is not larger.
     """
     k = len(t)
     if k <= _POINTS_PER_COLUMN * columns:
@@ -39,7 +39,7 @@ def decimate(t: Reals, y: Reals, columns: int) -> Indices:
 def _where_first(
     extreme: Reals, y: Reals, column: Indices, first: Indices, last: Indices
 ) -> Indices:
-    """Index of each column's first value that equals its extreme."""
+    """Return the index of each column's first value that equals its extreme."""
     equal = np.flatnonzero(y == np.repeat(extreme, last - first + 1))
     _, which = np.unique(column[equal], return_index=True)
     found: Indices = equal[which]

@@ -1,4 +1,4 @@
-"""Figures as files and as part of a page; the same figure gives the same bytes."""
+"""Figures as files and as parts of a page; the same figure gives the same bytes."""
 
 import base64
 import io
@@ -35,12 +35,12 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def inline(figure: Figure, name: str, description: str) -> str:
-    """Return a figure as HTML: SVG whose inks are the page's, or a picture where that is heavy.
+    """Return a figure as HTML: SVG with the page's colours, or PNG if the SVG would be large.
 
     Args:
         figure: the figure.
-        name: sets the ids inside apart from those of the page's other figures; a word.
-        description: what is to be seen, for those who cannot see it.
+        name: a word, which makes the figure's ids unique on the page.
+        description: text alternative of the figure.
     """
     text = _page_svg(_drawn(figure, "svg"), name, description)
     if len(text) <= _HEAVY_CHARACTERS:
@@ -61,7 +61,7 @@ def _page_svg(drawn: bytes, name: str, description: str) -> str:
     root = ET.fromstring(drawn)
     for parent in root.iter():
         for child in list(parent):
-            if child.tag.endswith("}style"):  # it would hold for the whole page
+            if child.tag.endswith("}style"):  # it would apply to the whole page
                 parent.remove(child)
     referred = {
         reference

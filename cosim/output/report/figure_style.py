@@ -1,6 +1,6 @@
-"""How every figure looks: settings of matplotlib and colours.
+"""Style of all figures: settings of matplotlib and colours.
 
-Nothing here touches pyplot or leaves a trace in matplotlib's global settings.
+This module does not use pyplot, and does not change matplotlib's global settings permanently.
 """
 
 import functools
@@ -19,7 +19,7 @@ P = ParamSpec("P")
 Rgb = tuple[float, float, float]
 
 INK, GRID, PAPER = "#1b1f24", "#d9dde3", "#fefefe"
-"""Text and frames, grid lines, background: a page puts others in their place on a dark screen."""
+"""Text and frames, grid lines, background; a page replaces them in dark mode."""
 
 _SETTINGS: dict[Any, Any] = {
     "axes.axisbelow": True,
@@ -67,17 +67,17 @@ _SETTINGS: dict[Any, Any] = {
 
 @contextmanager
 def settings() -> Iterator[None]:
-    """Draw by these settings alone, whatever the user's matplotlibrc says."""
+    """Apply only these settings within the context, regardless of the user's matplotlibrc."""
     with mpl.rc_context(), warnings.catch_warnings():
         mpl.rcdefaults()
         mpl.rcParams.update(_SETTINGS)
-        # A name may use signs that the font lacks; a box in their place is no reason to complain.
+        # A name may use characters that the font lacks; they are drawn as boxes, without a warning.
         warnings.filterwarnings("ignore", message="Glyph .* missing from")
         yield
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows, although pyplot has never heard of it."""
+    """A figure that a notebook shows although it was not created by pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -87,7 +87,7 @@ class NotebookFigure(Figure):
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Let a function draw its figure by these settings."""
+    """Decorate a function that draws a figure: it draws with these settings."""
 
     @functools.wraps(draw)
     def drawn(*arguments: P.args, **options: P.kwargs) -> Figure:
@@ -98,6 +98,6 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
 
 def printed(colour: Colour) -> Rgb:
-    """A colour of the palette, as matplotlib has them."""
+    """Return a colour of the palette in matplotlib's format."""
     r, g, b = (part / 255 for part in colour)
     return r, g, b

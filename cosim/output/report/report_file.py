@@ -20,19 +20,19 @@ def write_report(
     run_dir: Path,
     envelopes: Sequence[Envelope] = (),
 ) -> Path:
-    """Write the report of a run, or write it anew.
+    """Write the report of a run; replace an existing one.
 
     Args:
         record: the run's record.
         summary: the run's summary.
         run_dir: the run's directory.
-        envelopes: certified bounds to be drawn beside what they bound.
+        envelopes: certified bounds, drawn with the quantities that they bound.
 
     Returns:
         The report's path.
 
     Raises:
-        MachineError: it cannot be written.
+        MachineError: the report cannot be written.
     """
     timed = summary.get("kind") != "simulated"
     figures = [

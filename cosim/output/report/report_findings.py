@@ -1,4 +1,4 @@
-"""Sections of a report: the difference to the ideal loop, and the replay."""
+"""Sections of a report: the difference from the ideal loop, and the replay."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple

@@ -39,13 +39,13 @@ def page(
     scenario_toml: str,
     environment: Mapping[str, Any],
 ) -> str:
-    """Return the report of a run as HTML; whatever is not a figure is escaped.
+    """Return the report of a run as HTML; everything but figures is escaped.
 
     Args:
         scenario: the resolved scenario.
         summary: the content of ``summary.json``.
         figures: the run's figures, in order.
-        scenario_toml: the resolved scenario as it stands in the run directory.
+        scenario_toml: the resolved scenario, as stored in the run directory.
         environment: the content of ``environment.json``; empty if there is none.
     """
     claims = _objects(summary.get("claims"))
@@ -62,7 +62,7 @@ def page(
         ending=_ending(summary),
         verdict_tone="bad" if status else "doubt" if remarks_shown else "good",
         remarks=remarks_shown,
-        # These have sections of their own.
+        # These have their own sections.
         key_numbers=key_numbers({**summary, "fidelity": None, "replay": None}),
         parameters=list(_parameters(scenario)),
         figures=figures,
@@ -78,7 +78,7 @@ def page(
 
 @cache
 def templates(folder: Path = Path(__file__).parent) -> Environment:
-    """The templates of the report and of a folder; all text is escaped."""
+    """Return the templates of the report and of a folder; all text is escaped."""
     found = Environment(
         loader=FileSystemLoader([folder, Path(__file__).parent]),
         autoescape=True,
@@ -101,7 +101,7 @@ def _ending(summary: Mapping[str, Any]) -> str:
 
 
 def _remarks(summary: Mapping[str, Any], claims: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield what to know before trusting the rest."""
+    """Yield the remarks that limit the validity of the rest."""
     yield from (remark.text for remark in remarks(dict(summary)))
     for verdict in ("violated", "void"):
         count = sum(claim.get("verdict") == verdict for claim in claims)

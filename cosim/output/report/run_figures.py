@@ -28,7 +28,7 @@ from noack.protocol.record_tables import (
 from noack.protocol.topology import LOOP_ROLES
 
 Envelope = tuple[str, Literal["e_c", "x", "inter_event"], Reals, Reals, BoundKind]
-"""A bound: label, what it bounds, times in s (k,), values (k,), what it rests on."""
+"""A bound: label, bounded quantity, times in s (k,), values (k,), source."""
 
 
 class RunFigure(NamedTuple):
@@ -55,17 +55,17 @@ def run_figures(
 def pictures(
     record: RunRecord, envelopes: Sequence[Envelope] = (), *, timed: bool | None = None
 ) -> dict[str, Callable[[], RunFigure]]:
-    """List the figures of a run by name; each is drawn when it is called.
+    """Return functions that draw the figures of a run, by name.
 
     Args:
-        record: the run's record, of any length, none included.
-        envelopes: certified bounds to be drawn beside what they bound.
-        timed: whether to show lateness; there is none in virtual time.
+        record: the run's record, of any length, including 0.
+        envelopes: certified bounds, drawn with the quantities that they bound.
+        timed: whether to show lateness, which does not exist in virtual time.
     """
 
     @cache
     def joined() -> AlignedRun:
-        with np.errstate(all="ignore"):  # a run that diverged has figures, too
+        with np.errstate(all="ignore"):  # a diverged run has figures, too
             return join_all(record)
 
     found = {
@@ -126,7 +126,7 @@ def _states(record: RunRecord, joined: AlignedRun) -> RunFigure:
 
 
 def _known(scenario: Scenario) -> str:
-    """Explain x̂, where the sensor does not measure x exactly."""
+    """Explain x̂, if the sensor does not measure x exactly."""
     if scenario.coverage.knows_state:
         return ""
     if scenario.observer is None:

@@ -1,8 +1,8 @@
 """The figures of a run, from plain arrays: times in seconds, one row per sample.
 
-Every function takes arrays of any length, none included, and values that are not finite, and leaves
-pyplot alone. Norms are those of the run's trigger, ‖v‖ = ‖W v‖₂. In every figure the plant is grey,
-what the sensor knows blue, what the controller knows orange; dashed curves are certified bounds.
+Every function accepts arrays of any length, including 0, and values that are not finite; none uses
+pyplot. Norms are those of the run's trigger, ‖v‖ = ‖W v‖₂. In every figure, grey is the plant, blue
+the sensor, orange the controller; dashed curves are certified bounds.
 """
 
 import math
@@ -78,18 +78,18 @@ def paper_figure(
     """States, and broadcasting and receiving intervals: the paper's Fig. 2 and 3.
 
     Args:
-        mode: model is the paper's MB-ET (Fig. 2), zoh its ZOH-ET (Fig. 3).
+        mode: ``model`` is the paper's MB-ET (Fig. 2), ``zoh`` its ZOH-ET (Fig. 3).
         t_s: (k,) times of the samples.
         x: (k, n) the plant's state.
         x_s: (k, n) the sensor's model.
         x_c: (k, n) the controller's model; NaN where unknown.
         state_names: n names; the first 16 states are drawn.
         broadcast_s: (e,) times t_i of all transmissions.
-        dropped: (e,) which of them the network lost.
-        received_s: (d,) times t_i* of those that the controller received.
-        forced: (d,) which of them were forced by the guarantee.
-        title: what the run was, shown after "MB-ET" or "ZOH-ET".
-        x_hat: (k, n) the sensor's estimate of x; None where it measures x exactly.
+        dropped: (e,) whether the network lost the transmission.
+        received_s: (d,) times t_i* of the transmissions that the controller received.
+        forced: (d,) whether the guarantee forced the delivery.
+        title: title of the run, shown after "MB-ET" or "ZOH-ET".
+        x_hat: (k, n) the sensor's estimate of x; None if it measures x exactly.
     """
     n = len(state_names)
     drawn = min(n, _MOST_STATES)
@@ -206,7 +206,7 @@ def error_figure(
     Args:
         t_s: (k,) times of the samples.
         e_s_norm: (k,) ‖x_s − x‖ before a reset, as the trigger tested it.
-        threshold: (k,) of the trigger.
+        threshold: (k,) threshold of the trigger.
         e_c_norm: (k,) ‖x_c − x‖; NaN where unknown.
         envelopes: certified bounds on ‖e_c‖.
     """
@@ -258,10 +258,10 @@ def _norms(
 
 @styled
 def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
-    """Control inputs, held from one to the next.
+    """Control inputs; each is held until the next.
 
     Args:
-        t_s: (k,) times from which each is held.
+        t_s: (k,) times from which each input is held.
         u: (k, m) inputs.
         input_names: m names.
     """
@@ -273,7 +273,7 @@ def input_figure(t_s: Reals, u: Reals, input_names: Sequence[str]) -> Figure:
         style = {
             "color": printed(palette.SERIES[i % len(palette.SERIES)]),
             "linestyle": _DASHES[i // len(palette.SERIES) % len(_DASHES)],
-            # Inputs often coincide: the first ones, wider, stay visible beneath the last.
+            # Inputs often coincide: the first ones are wider, and stay visible under the last.
             "linewidth": 1.3 + 2.6 * (m - 1 - i) / m,
             "drawstyle": "steps-post",
         }
@@ -313,13 +313,14 @@ def lateness_figure(lateness_us: Mapping[str, Reals], period_us: float | None = 
 
 
 def _later_than(values: Reals) -> tuple[Reals, Reals]:
-    """Return values, ascending, and the share of all values that are at least as large."""
+    """Return values in ascending order, and for each the share of values at least as large."""
     values = finite(values)
     values = np.maximum(np.sort(values[np.isfinite(values)]), _SHORTEST_US)
     k = len(values)
     if not k:
         return values, values
-    # The k-th largest is reached by k: as many points in every decade of shares, and the median's.
+    # k values are at least as large as the k-th largest. The same number of points in each decade
+    # of shares, and linearly spaced ones, which resolve the median.
     rank = np.concatenate([np.geomspace(1, k, _RANKS), np.linspace(1, k, _RANKS)])
     rank = np.unique(rank.round().astype(np.intp))[::-1]
     return values[k - rank], rank / k
@@ -341,7 +342,7 @@ def latency_figure(t_s: Reals, latency_us: Reals, until_s: float | None = None) 
 
 @styled
 def fidelity_figure(found: Fidelity) -> Figure:
-    """How much each effect changes x, over time: ‖x_(with the effect) − x_(without)‖."""
+    """Change of x by each effect, over time: ‖x_(with the effect) − x_(without)‖."""
     names = [stage.name for stage in found.stages]
     figure, (axes,) = single(2.7, names)
     logarithmic(axes, "y")
@@ -361,7 +362,7 @@ def inter_event_figure(
 
     Args:
         broadcast_s: (e,) times t_i of all transmissions.
-        lower_bounds: certified or printed bounds on the inter-event time.
+        lower_bounds: bounds on the inter-event time, certified or from the paper's formula.
         until_s: end of the time axis; by default the last event.
     """
     intervals_s = np.diff(broadcast_s)

@@ -1,1 +1,1 @@
-"""The view of a run for people: a rerun recording, shown live or afterwards."""
+"""The view of a run: a rerun recording, shown live or afterwards."""

@@ -63,23 +63,23 @@ _PAGE_OF_FEW, _PAGE_OF_MANY, _MANY = 4, 9, 16
 _BEFORE, _AFTER = 0.02, 0.06
 """Margins of the time axis, as shares of the run's length."""
 _GLOBAL_VIEW = UUID("5c0dca6a-e63f-9cf7-f657-2602590474cc")
-"""Id of rerun's view that stores what linked views share."""
+"""Id of rerun's view that stores the shared settings of linked views."""
 
 
 def state_path(name: str) -> str:
-    """Entity of one state coordinate, its name escaped."""
+    """Return the entity of a state coordinate; its name is escaped."""
     return f"state/{rr.escape_entity_path_part(name)}"
 
 
 def lateness_path(process: str) -> str:
-    """Entity of one process's lateness, its name escaped."""
+    """Return the entity of a process's lateness; its name is escaped."""
     return f"lateness/{rr.escape_entity_path_part(process)}"
 
 
 def styles(
     state_names: Sequence[str], input_names: Sequence[str], processes: Sequence[str]
 ) -> dict[str, rr.SeriesLines | rr.SeriesPoints]:
-    """Name, colour and width of every series, by entity; logged once as static data."""
+    """Return name, colour and width of every series, by entity; logged once as static data."""
     triple = rr.SeriesLines(
         names=["x plant", "x_s sensor model", "x_c controller model"],
         colors=[PLANT, SENSOR, CONTROLLER],
@@ -145,7 +145,7 @@ def layout(
 ) -> rrb.Blueprint:
     """Lay out the panels: picture, packets and texts on the left, curves on the right.
 
-    Plots have no legends, which would cover data: a panel names the colours.
+    Plots have no legends, which would cover data; instead, a panel explains the colours.
     """
     texts = _texts(input_names, lateness=bool(processes))
     drawings = [] if picture is None else [panel(picture)]
@@ -192,7 +192,7 @@ def _inputs() -> rrb.View:
 
 
 def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
-    """Tabs: the colour key, the text about the run, lateness, the log."""
+    """Return the tabs: the colour key, the text about the run, lateness, the log."""
     return rrb.Tabs(
         ColourKey(input_names).panel(),
         rrb.TextDocumentView(origin=ABOUT, name="About this run"),
@@ -211,7 +211,7 @@ def _texts(input_names: Sequence[str], *, lateness: bool) -> rrb.Container:
 
 
 def _states(names: Sequence[str]) -> rrb.Container:
-    """One panel for each coordinate: together up to four, else in tabs of equal size."""
+    """Return one panel per coordinate: up to four together, more in tabs of equal size."""
     most = _PAGE_OF_FEW if len(names) <= _MANY else _PAGE_OF_MANY
     size = math.ceil(len(names) / math.ceil(len(names) / most))
     pages = [names[i : i + size] for i in range(0, len(names), size)]
@@ -242,7 +242,7 @@ def _common_time_axis(horizon_s: float) -> rrb.View:
 
 
 def _plot(name: str, origin: str, contents: Sequence[str] = ("$origin",)) -> rrb.TimeSeriesView:
-    """One time series; all share the time axis and zoom together."""
+    """Return a time series; all share the time axis and zoom together."""
     return rrb.TimeSeriesView(
         origin=origin,
         contents=[path if path.startswith("$") else f"/{path}" for path in contents],

@@ -29,7 +29,7 @@ _DIAMOND = ((0.0, 0.3), (0.2, 0.1), (0.0, -0.1), (-0.2, 0.1), (0.0, 0.3))
 _CROSS = ((-0.16, 0.26), (0.16, -0.06), (0.0, 0.1), (0.16, 0.26), (-0.16, -0.06))
 _STROKE = ((-_HALF, 0.0), (_HALF, 0.0))
 _Entry = tuple[str, Colour, Sequence[tuple[float, float]]]
-"""Name, colour, line of the sample."""
+"""Name, colour, and line of the sample."""
 _ROWS: tuple[tuple[_Entry, ...], ...] = (
     (
         ("plant: x", PLANT, _STROKE),
@@ -50,7 +50,7 @@ _ROWS: tuple[tuple[_Entry, ...], ...] = (
 
 
 def input_colour(i: int) -> Colour:
-    """Colour of the i-th control input."""
+    """Return the colour of the i-th control input."""
     return SERIES[i % len(SERIES)]
 
 
@@ -58,7 +58,7 @@ class ColourKey:
     """Samples of lines and marks, with their names.
 
     Args:
-        input_names: of the control inputs; a single one needs no entry.
+        input_names: names of the control inputs; a single input needs no entry.
     """
 
     def __init__(self, input_names: Sequence[str]) -> None:

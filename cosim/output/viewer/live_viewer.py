@@ -1,9 +1,9 @@
-"""Showing a recording: in a window where there is a display, else in the browser on loopback.
+"""Shows a recording: in a window if there is a display, else in a browser on loopback.
 
-A viewer and the recorder share nothing but the recording's file. A process of its own (this module
-run as a program) reads the file as it grows and serves it over HTTP, to each viewer at that
-viewer's pace. A viewer that stalls holds up its own download: the recorder never waits, the file
-is complete, and nothing has to be dropped.
+A viewer and the recorder share only the recording's file. A separate process (this module run as a
+program) reads the file while it grows and serves it over HTTP, to each viewer at its own rate. A
+viewer that stalls delays only its own download: the recorder never waits, the file is complete, and
+no data are dropped.
 """
 
 import contextlib
@@ -37,12 +37,12 @@ class LiveView:
     """Shows a recording while it is written.
 
     Args:
-        native: open a window (True), serve a browser (False), or decide by the display (None);
-            where no window can be opened after all, a browser is served.
+        native: open a window (True), serve a browser (False), or decide by the display (None); if
+            the window cannot be opened, serve a browser.
 
     Attributes:
         url: address to open in a browser; None for a window, and while nothing is shown.
-        status: where the recording is shown, or why it is not, as a line for a person.
+        status: one line: where the recording is shown, or why it is not.
     """
 
     def __init__(self, *, native: bool | None = None) -> None:
@@ -53,11 +53,11 @@ class LiveView:
 
     @property
     def pid(self) -> int | None:
-        """Process that serves the recording, and leads its process group; None if there is none."""
+        """Process that serves the recording, leader of its process group; None if there is none."""
         return None if self._host is None else self._host.pid
 
     def show(self, path: Path) -> None:
-        """Start showing the file, which exists and may grow; a failure is told by ``status``."""
+        """Start to show the file, which exists and may grow; ``status`` reports a failure."""
         command = python_command("-m", "cosim.output.viewer.live_viewer", path)
         if self._native:
             command.append("--native")
@@ -66,7 +66,7 @@ class LiveView:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            # Ctrl-C is for the run; the viewer ends when this process says so, or is gone.
+            # Ctrl-C ends the run only; the viewer ends on request, or when this process has ended.
             start_new_session=True,
         )
         assert self._host.stdout is not None
@@ -81,14 +81,14 @@ class LiveView:
             self.status = f"no live view: {answer or 'the viewer did not start'}"
 
     def finish(self) -> None:
-        """Say that the file is complete: downloads in progress end at its end."""
+        """Report that the file is complete: downloads in progress end at its end."""
         self._say("finish")
 
     def close(self, *, keep: bool = False) -> None:
-        """Stop serving; a window stays open and keeps what it has received.
+        """Stop serving; a window stays open and keeps the received data.
 
         Args:
-            keep: go on serving until the process ``pid`` is ended with SIGTERM.
+            keep: continue to serve until SIGTERM ends the process ``pid``.
         """
         if self._host is None:
             return
@@ -107,7 +107,7 @@ class LiveView:
         if self._host is None:
             return
         assert self._host.stdin is not None
-        # A viewer that died, or was ended by hand, is no concern of the run's.
+        # A viewer that crashed or was ended by the user does not affect the run.
         with contextlib.suppress(OSError, ValueError):
             self._host.stdin.write(word + "\n")
             self._host.stdin.flush()
@@ -119,12 +119,12 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
     Args:
         path: the recording.
         native: open a window (True), serve a browser on loopback (False), or decide by the display
-            (None); where no window can be opened after all, a browser is served.
+            (None); if the window cannot be opened, serve a browser.
 
     Raises:
-        CallerError: there is no such file, or it is no recording.
+        CallerError: there is no such file, or it is not a recording.
         MachineError: the viewer cannot be started.
-        SystemExit: by SIGTERM or SIGHUP.
+        SystemExit: on SIGTERM or SIGHUP.
     """
     if not path.is_file():
         raise CallerError(f"{path}: no such recording")
@@ -144,10 +144,10 @@ def view_recording(path: Path, *, native: bool | None = None) -> None:
 
 
 def _host(path: Path, *, native: bool, commands: Iterable[str]) -> None:
-    """Serve a growing file: say where it is shown, then obey ``commands`` until their end."""
+    """Serve a growing file: print where it is shown, then execute ``commands`` until their end."""
     signal.signal(signal.SIGTERM, _exit)
     if hasattr(os, "nice"):
-        os.nice(10)  # the processes of the run come first
+        os.nice(10)  # lower priority than the processes of the run
     with RecordingServer(path, follow=True) as server:
         window = server.open_window() if native else None
         print(_WINDOW if window is not None else server.start_page(), flush=True)

@@ -1,8 +1,8 @@
-"""The time at which a finished run's view opens: that of the largest ‖e_c‖.
+"""Opens the view of a finished run at the time of the largest ‖e_c‖.
 
-A layout in a recording cannot set rerun's time cursor, nor can the address of a recording; only
-requests to a running viewer do. The web viewer takes a protobuf message ``ViewerControlRequest``,
-the window what rerun's client sends.
+Neither a layout in a recording nor the address of a recording can set rerun's time cursor; only
+requests to a running viewer can. The web viewer accepts a protobuf message
+``ViewerControlRequest``, the window accepts the requests of rerun's client.
 """
 
 import json
@@ -21,7 +21,7 @@ _RETRY_S = 0.25
 _START_S = 60.0
 _TAKES_REQUESTS_AT = re.compile(rb"rerun\+http://127\.0\.0\.1:(\d+)")
 _SET_TIME_CURSOR, _TIMELINE, _TIME, _PLAY_STATE, _FIRST = 6, 2, 3, 5, 1
-"""Numbers of the message's fields; those of nested messages have only a first."""
+"""Numbers of the message's fields; nested messages have only a first field."""
 _PAUSED = 1
 _SCRIPT = """<script>
 (function openAt() {{
@@ -34,7 +34,7 @@ _SCRIPT = """<script>
 
 
 def opening_time_ns(recording: Path) -> int | None:
-    """Time of the largest ‖e_c‖ by the summary beside a recording; None while there is none."""
+    """Return the time of the largest ‖e_c‖ from the recording's summary; None without a summary."""
     try:
         summary: Any = json.loads((recording.parent / SUMMARY_FILE).read_text(encoding="utf-8"))
         at_s: float = summary["sup_e_c_at_s"]
@@ -44,18 +44,18 @@ def opening_time_ns(recording: Path) -> int | None:
 
 
 def script_to_open_at(t_ns: int) -> bytes:
-    """HTML for the web viewer's page: it moves the cursor as soon as the recording is there."""
+    """Return HTML for the web viewer's page: it moves the cursor once the recording is loaded."""
     request = list(_request(t_ns))
     return _SCRIPT.format(retry_ms=round(1e3 * _RETRY_S), request=request).encode()
 
 
 def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]) -> None:
-    """Move the cursor of a window as soon as the recording is there, unless it closes before.
+    """Move the cursor of a window once the recording is loaded, unless the window closes before.
 
     Args:
         t_ns: time on the recording's timeline.
         window: the viewer's process.
-        output: what it logs, the address at which it takes requests included.
+        output: its log, which contains the address at which it accepts requests.
     """
     from rerun.experimental import ViewerClient
 
@@ -65,7 +65,7 @@ def move_window_to(t_ns: int, window: "subprocess.Popen[Any]", output: IO[bytes]
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
             client.set_time(TIMELINE, duration=t_ns / NS_PER_S, play_state="paused")
-        except OSError:  # it loads
+        except OSError:  # it is still loading
             time.sleep(_RETRY_S)
         else:
             return
@@ -81,7 +81,7 @@ def _request(t_ns: int) -> bytes:
 
 
 def _message(field: int, content: bytes) -> bytes:
-    """A field with a length, in protobuf's encoding."""
+    """Return a length-delimited field in protobuf's encoding."""
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 

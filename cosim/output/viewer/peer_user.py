@@ -1,4 +1,4 @@
-"""Whose process is at the other end of a TCP connection on the loopback interface."""
+"""Finds the user of the process at the other end of a TCP connection on loopback."""
 
 import socket
 import sys
@@ -6,14 +6,14 @@ from pathlib import Path
 
 _SOCKETS = Path("/proc/net/tcp")
 _TRIES = 3
-"""The kernel's list may leave out a socket while others come and go."""
+"""Maximum tries: the kernel's list may miss a socket while others open and close."""
 
 
 def peer_user(connection: socket.socket) -> int | None:
-    """Return the user id that holds the other end; None if nobody does, or it is unknown.
+    """Return the user id of the process at the other end; None if there is none, or it is unknown.
 
-    Linux's list of sockets names the user of each. A connection that no process has accepted yet
-    has none.
+    Linux's list of sockets has the user of each. A connection that no process has accepted yet has
+    no user.
     """
     try:
         wanted = [_written(connection.getpeername()), _written(connection.getsockname())]
@@ -23,12 +23,12 @@ def peer_user(connection: socket.socket) -> int | None:
                 user, inode = fields[7], fields[9]
                 if fields[1:3] == wanted and inode != "0":
                     return int(user)
-    except OSError:  # it is broken, or this is not Linux
+    except OSError:  # the connection is broken, or this is not Linux
         pass
     return None
 
 
 def _written(address: tuple[str, int]) -> str:
-    """An address as the list has it."""
+    """Return an address in the list's format."""
     host, port = address
     return f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}:{port:04X}"

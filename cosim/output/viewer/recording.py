@@ -1,6 +1,6 @@
 """The recording of a run for the viewer: its signals, events, packets and log.
 
-The recording is for people. The data of record is in the Parquet files; a recording can only be
+The recording is only for viewing. The run's data are in the Parquet files; a recording can only be
 read by similar versions of rerun.
 """
 
@@ -21,12 +21,12 @@ from cosim.output.viewer.recording_file import Floats, Nanoseconds, RecordingFil
 from cosim.record.align import AlignedRun
 from noack.core.clock import NS_PER_S
 
-# The logarithm of an error that is reset to zero is not a point of the plot: errors are drawn down
-# to this fraction of the threshold, and no lower than the smallest error of interest.
+# The logarithm of an error that is reset to zero cannot be plotted: errors are cut off at this
+# fraction of the threshold, or at the smallest error of interest, if that is larger.
 _LOG_DEPTH = 1e-3
 _LOG_FLOOR = 1e-12
 _FRAMES_AT_ONCE = 12
-"""Frames per batch; a batch takes more than a kilobyte for each moving entity."""
+"""Frames per batch; a batch needs more than a kilobyte for each moving entity."""
 
 
 class RunView(RecordingFile):
@@ -43,9 +43,9 @@ class RunView(RecordingFile):
         input_names: names of the m coordinates of u.
         processes: names of the processes whose lateness is shown; none in a simulated run.
         horizon_s: length of the run, and of the plots' time axis.
-        picture: of the plant, if there is one.
-        diagram: of the network, if there is one.
-        live: shows the file while it is written.
+        picture: picture of the plant, if there is one.
+        diagram: diagram of the network, if there is one.
+        live: live viewer, which shows the file while it is written.
         indexed: see :class:`RecordingFile`.
 
     Raises:
@@ -92,8 +92,8 @@ class RunView(RecordingFile):
 
         Args:
             aligned: states, errors and threshold on a common time grid.
-            e_c_bounds: of ‖e_c‖, from (I1) and certified (k, 2); NaN for none.
-            x_bound: certified bound of ‖x‖ (k,); NaN for none.
+            e_c_bounds: (k, 2) bounds of ‖e_c‖, from (I1) and certified; NaN for none.
+            x_bound: (k,) certified bound of ‖x‖; NaN for none.
         """
         t_ns, k = aligned.t_ns, len(aligned.t_ns)
         states = [
@@ -201,7 +201,7 @@ class RunView(RecordingFile):
         self.send_columns(bp.LOG, np.array([t_ns], dtype=np.int64), columns)
 
     def close(self) -> None:
-        """Write what is left and the file's footer; a second call does nothing.
+        """Write the waiting data and the file's footer; a second call does nothing.
 
         Raises:
             ViewError: the file could not be written in full.
@@ -223,7 +223,7 @@ def _shaped(name: str, value: Floats, shape: tuple[int, ...]) -> Floats:
 
 
 def _log10(norms: Floats, threshold: Floats) -> Floats:
-    """Decimal logarithm of norms (k, series), cut off below the threshold (k,)."""
+    """Return the decimal logarithm of norms (k, series), cut off below the threshold (k,)."""
     level = np.nan_to_num(threshold, nan=0.0, posinf=0.0)[:, None]
     floor = np.maximum(_LOG_DEPTH * level, _LOG_FLOOR)
     return np.log10(np.maximum(norms, floor))

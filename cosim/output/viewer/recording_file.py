@@ -24,17 +24,17 @@ class ViewError(MachineError):
 
 
 class RecordingFile:
-    """Writes a ``.rrd`` file. Data is passed to the operating system as it comes.
+    """Writes a ``.rrd`` file. Data are passed to the operating system as they arrive.
 
-    So the file can be shown while it grows, and read after a crash.
+    Hence the file can be shown while it grows, and read after a crash.
 
     Args:
         path: the file; replaced if it exists.
         run_id: identity of the recording, unique among runs.
-        layout: of the viewer's panels.
+        layout: layout of the viewer's panels.
         indexed: end the file with an index of its chunks. Until then the index is kept in memory,
-            about 200 bytes per chunk. A recording of hours is written without; readers then read
-            it in full.
+            about 200 bytes per chunk. A recording of several hours has no index; readers must then
+                read all of it.
 
     Raises:
         ViewError: the file cannot be created.
@@ -67,7 +67,7 @@ class RecordingFile:
         """Add columns of any components at times (k,).
 
         Raises:
-            ViewError: they cannot be written.
+            ViewError: the columns cannot be written.
         """
         times = rr.TimeColumn(TIMELINE, duration=np.asarray(t_ns).astype("timedelta64[ns]"))
         try:

@@ -26,26 +26,26 @@ def start_rerun(
     output: int | IO[bytes] = subprocess.DEVNULL,
     start_new_session: bool = False,
 ) -> subprocess.Popen[bytes]:
-    """Start rerun's program; unless it is a session of its own, it ends when this process does.
+    """Start rerun's program; unless it has its own session, it ends when this process ends.
 
     Args:
-        arguments: of the program; every user of this machine can read them.
-        output: takes what it logs.
-        start_new_session: whether it stays when this process ends.
+        arguments: arguments of the program; every user of this machine can read them.
+        output: receives its log.
+        start_new_session: whether it continues when this process ends.
 
     Raises:
-        MachineError: it is not installed.
+        MachineError: the program is not installed.
     """
     tied = sys.platform == "linux" and not start_new_session
     return subprocess.Popen(
         [_path(), *arguments],
-        # CI keeps it quiet; what it logs says where it serves.
+        # CI disables other output; the log contains the address at which it serves.
         env=os.environ | {"CI": "1", "RUST_LOG": "info"},
         stdin=subprocess.DEVNULL,
         stdout=output,
         stderr=output,
         start_new_session=start_new_session,
-        # Not SIGTERM, for which a program that stands still waits until it goes on.
+        # Not SIGTERM, which a stopped program does not handle until it continues.
         preexec_fn=partial(_prctl(), _PR_SET_PDEATHSIG, signal.SIGKILL) if tied else None,
     )
 
@@ -56,10 +56,10 @@ def logged_port(
     """Wait until rerun logs an address; return its port, None if that takes too long.
 
     Args:
-        process: from :func:`start_rerun`.
-        output: what it was given.
-        address: its first group is the port.
-        within_s: how long to wait.
+        process: the process, from :func:`start_rerun`.
+        output: its ``output``.
+        address: pattern of the address; its first group is the port.
+        within_s: maximum time to wait.
     """
     deadline_s = time.monotonic() + within_s
     while process.poll() is None and time.monotonic() < deadline_s:
@@ -80,13 +80,13 @@ def end_process(process: "subprocess.Popen[Any]", *, patience_s: float = 0.0) ->
 
 
 def _prctl() -> Callable[[int, int], int]:
-    """Linux's; looked up here, as little as possible is to be done in a child."""
+    """Return Linux's prctl; looked up here, since a forked child should do very little."""
     prctl: Callable[[int, int], int] = ctypes.CDLL(None).prctl
     return prctl
 
 
 def _path() -> str:
-    """Path of rerun's own program: the ``rerun`` script only wraps it, and would orphan it."""
+    """Return the path of rerun's own program; the ``rerun`` script is a wrapper and orphans it."""
     if chosen := os.environ.get("RERUN_CLI_PATH"):
         return chosen
     spec = importlib.util.find_spec("rerun_cli")

@@ -1,4 +1,4 @@
-"""The recording of a run for the viewer: written during the run, or from its record."""
+"""Creates a run's recording for the viewer, during the run or from its record."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from noack.config.scenario import Scenario
 from noack.protocol.topology import LOOP_ROLES
 
 _INDEXED_S = 120.0
-"""Longest wall time of a run whose recording gets an index, which takes memory."""
+"""Recordings of runs up to this wall time get an index, which needs memory."""
 
 
 def open_view(
@@ -27,7 +27,7 @@ def open_view(
     *,
     at_once: bool = False,
 ) -> RunView:
-    """Create the recording of a run, written at once or during the run."""
+    """Create the recording of a run; it is written afterwards, at once or during the run."""
     loop = loop_of(scenario)
     return RunView(
         run_dir / RECORDING_FILE,

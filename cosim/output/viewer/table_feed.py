@@ -42,7 +42,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate, certify
 _LAG_S = 0.2
 """Wall time by which the view lags, so that the batches of all processes have arrived."""
 _PATIENCE_S = 1.0
-"""Wall time that it waits for a silent controller."""
+"""Maximum wall time to wait for a controller that sends no rows."""
 
 _SHOWN = (
     CONTROLLER_STEP, CONTROLLER_DELIVERY, CONTROLLER_SETTING, NETEM_PACKET, PLANT_STEP,
@@ -85,12 +85,12 @@ class ViewFeed:
         self._last_delivery_ns: int | None = None
 
     def add(self, table: str, rows: Rows) -> None:
-        """Take rows that follow those added before."""
+        """Add rows that follow the previously added ones."""
         if table in self._pending and len(rows):
             self._pending[table].append(rows)
 
     def log(self, notice: Mapping[str, Any]) -> None:
-        """Take a line of the run's log."""
+        """Add a line of the run's log."""
         text = f"{notice['process']}: {notice['text']}" if "process" in notice else notice["text"]
         level = "WARN" if notice["level"] in ("failed", "violation", "void", "watchdog") else "INFO"
         self._view.log(int(notice["t_ns"]), level, str(text))
@@ -187,9 +187,9 @@ class ViewFeed:
 
     @cached_property
     def _certificate(self) -> ScenarioCertificate | None:
-        """The certificate of the run, None if there is none; computed at first use: it is slow."""
+        """The run's certificate; None if there is none. Computed at first use, since it is slow."""
         if not self._scenario.coverage.is_certifiable or self._loop.setpoint is not None:
-            return None  # at a set-point it bounds the deviations
+            return None  # with a set-point, it bounds the deviations from it
         certificate = certify(self._scenario, allowed_conditions(self._scenario))
         if certificate.inter_event_s is not None:
             self._view.certified_interval(

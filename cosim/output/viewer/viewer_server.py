@@ -1,8 +1,7 @@
-"""Serves one recording over HTTP on loopback, with the page that shows it, or to a window.
+"""Serves one recording over HTTP on loopback, with a page that shows it, or to a window.
 
-Every user of the machine can connect. What is served is therefore under a path that begins with a
-secret; everything else does not exist. A file that still grows is served to each viewer at that
-viewer's pace.
+Every user of the machine can connect. Therefore all content is under a path that begins with a
+secret; other paths do not exist. A growing file is served to each viewer at that viewer's rate.
 """
 
 import contextlib
@@ -40,25 +39,25 @@ _OWN_HOST = re.compile(r"(127\.0\.0\.1|localhost)(:\d{1,5})?")
 
 
 class RecordingServer:
-    """Serves one recording on a loopback port, and starts the viewers that ask for it.
+    """Serves one recording on a loopback port, and starts the viewers that request it.
 
     The web viewer's page comes from the same port as the recording: one forwarded port is enough
-    to look from another machine, and pages of other origins cannot read the recording.
+    to view it from another machine, and pages of other origins cannot read the recording.
 
     Args:
         path: the recording.
         follow: at the end of the file, wait for more until ``finish``.
 
     Attributes:
-        address: what is served lies under it: the page itself, and the recording as
-            ``recording.rrd``. Whoever knows the address can read it.
-        window_address: the same for a window. It is on a command line, which every user can read,
-            and is served to processes of this user only.
+        address: address of the page; the recording is ``recording.rrd`` below it. Everyone who has
+            the address can read the recording.
+        window_address: the same for a window. It is on a command line, which every user can read;
+            therefore it is served to processes of this user only.
         requested: set when a viewer has asked for the recording.
         downloaded: set when a viewer has received all of it.
 
     Raises:
-        MachineError: no port can be had.
+        MachineError: no port is available.
     """
 
     def __init__(self, path: Path, *, follow: bool) -> None:
@@ -85,16 +84,16 @@ class RecordingServer:
         threading.Thread(target=self._http.serve_forever, args=(0.2,), daemon=True).start()
 
     def start_page(self) -> str:
-        """Start the web viewer and give the address at which it shows the recording.
+        """Start the web viewer and return the address at which it shows the recording.
 
         Raises:
-            MachineError: it does not start.
+            MachineError: the web viewer does not start.
         """
         self.web_viewer = WebViewer()
         return self.address
 
     def open_window(self) -> subprocess.Popen[bytes] | None:
-        """Open a window on the recording; None if it closed before it asked for the recording."""
+        """Open a window with the recording; return None if it closed before requesting it."""
         arguments = ["--port", "auto", "--bind", HOST, self.window_address + RECORDING]
         t_ns = opening_time_ns(self.path)
         if t_ns is None:
@@ -115,7 +114,7 @@ class RecordingServer:
         self.finished.set()
 
     def drain(self) -> None:
-        """Give downloads in progress a moment to reach the end of the file."""
+        """Wait a moment for downloads in progress to reach the end of the file."""
         deadline = time.monotonic() + _DRAIN_S
         while self._downloads and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -138,7 +137,7 @@ class RecordingServer:
 
         Args:
             secret: first part of the path.
-            user: gives the user id of who asks.
+            user: returns the user id of the requesting process.
         """
         if _same(secret, self._secret):
             return True
@@ -158,7 +157,7 @@ class RecordingServer:
 
 
 def _same(secret: str, wanted: str) -> bool:
-    """Whether two secrets are the same, in a time that tells nothing about where they differ."""
+    """Whether two secrets are equal, compared in constant time."""
     return secrets.compare_digest(secret.encode(), wanted.encode())
 
 
@@ -179,7 +178,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not (self.path.isascii() and self.path.isprintable()):
             self.send_error(400)
         elif not _OWN_HOST.fullmatch(self.headers.get("Host", "")):
-            self.send_error(403)  # a foreign name made to resolve to loopback
+            self.send_error(403)  # DNS rebinding: a foreign name that resolves to loopback
         elif found is None or not recording.admits(found[1], lambda: peer_user(self.connection)):
             self.send_error(404)
         elif (name := found[2]) == RECORDING:
@@ -190,20 +189,20 @@ class _Handler(BaseHTTPRequestHandler):
             self._send_file(recording.web_viewer, name)
 
     def handle(self) -> None:
-        """Serve one connection; a viewer may break it at any time, as may the web viewer's."""
+        """Serve one connection; the viewer or the web viewer's program may close it at any time."""
         with contextlib.suppress(ConnectionError, TimeoutError, HTTPException):
             super().handle()
 
     def end_headers(self) -> None:
-        """Keep the page's address from the servers of what the page loads from elsewhere."""
+        """Add a header that hides the page's address from other servers whose content it loads."""
         self.send_header("Referrer-Policy", "no-referrer")
         super().end_headers()
 
     def log_message(self, *_: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
     def _send_to_recording(self, path: str, query: str) -> None:
-        """Send the browser to the page with the recording's address, as the browser reaches it."""
+        """Redirect the browser to the page with the recording's address as the browser sees it."""
         address = quote(f"http://{self.headers['Host']}{path}{RECORDING}", safe="")
         self.send_response(302)
         self.send_header("Location", f"{path}?url={address}" + (f"&{query}" if query else ""))
@@ -221,7 +220,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
             while True:
-                # Asked before reading, so that what was written before it was set is still sent.
+                # Checked before reading, so that data written before it was set are still sent.
                 finished = recording.finished.is_set()
                 if block := file.read(_BLOCK):
                     self.wfile.write(block)

@@ -1,8 +1,7 @@
-"""The web viewer's files, which rerun's program contains and serves on a port of its own.
+"""The web viewer's files, which rerun's program contains and serves on its own port.
 
-Any user of the machine could listen on that port once the program has ended. So the port is the
-one that the kernel gave to the program, and an answer is used only if it comes from a process of
-this user.
+Any user of the machine could listen on that port once the program has ended. Therefore the kernel
+selects the port, and an answer is used only if it comes from a process of this user.
 """
 
 import contextlib
@@ -24,16 +23,16 @@ _SERVED_AT = re.compile(rb"(?<!\+)http://127\.0\.0\.1:(\d+)")
 
 
 class WebViewer:
-    """Serves the web viewer's files while it lasts.
+    """Serves the web viewer's files until it is closed.
 
     Raises:
         MachineError: rerun's program does not start.
     """
 
     def __init__(self) -> None:
-        # Named a recording that a page can load by itself, the program serves the page and no
-        # more; named a file it spins, and named nothing it opens another port for data. The page
-        # is told elsewhere where the recording is: everybody can read a command line.
+        # With the address of a recording that a page can load, the program only serves the page.
+        # With a file it uses a whole core, and without either it opens another data port. The page
+        # gets the recording's real address otherwise: every user can read a command line.
         arguments = ["--serve-web", "--bind", HOST, "--web-viewer-port", "0"]
         with tempfile.TemporaryFile() as output:
             self.process = start_rerun([*arguments, f"http://{HOST}/recording.rrd"], output=output)
@@ -45,10 +44,10 @@ class WebViewer:
 
     @contextlib.contextmanager
     def file(self, name: str) -> Iterator[http.client.HTTPResponse]:
-        """Give the answer to a request for a file, while the context lasts.
+        """Yield the answer to a request for a file; it is valid within the context.
 
         Raises:
-            PeerError: the program has ended, or what answers is not a process of this user.
+            PeerError: the program has ended, or the answering process is not this user's.
         """
         source = http.client.HTTPConnection(HOST, self.port, timeout=_TIMEOUT_S)
         with contextlib.closing(source):
@@ -59,8 +58,8 @@ class WebViewer:
                 answer = source.getresponse()
             except (OSError, http.client.HTTPException):
                 raise PeerError("rerun's web viewer does not answer") from None
-            # Asked now, as a connection has no user before it is accepted. The answer comes over
-            # this very connection, whoever may listen on the port meanwhile.
+            # Checked now, since a connection has no user before it is accepted. The answer comes
+            # over this same connection, even if another process listens on the port meanwhile.
             if self.process.poll() is not None or peer_user(connection) != os.getuid():
                 raise PeerError("rerun's web viewer has ended, or another user's program answers")
             yield answer

@@ -1,1 +1,1 @@
-"""The plant itself as a picture that moves, one kind per file, and the network's packets."""
+"""Animated pictures of plants, one kind per file, and of the network's packets."""

@@ -1,6 +1,6 @@
-"""A car on its lane, seen from above, and where its two models believe it to be.
+"""A car on its lane, seen from above, and the positions of its two models.
 
-The picture goes along with the car: the lane's markings pass by.
+The picture moves with the car: the lane's markings pass by.
 """
 
 from collections.abc import Mapping
@@ -30,27 +30,27 @@ _GLASS: Colour = (58, 62, 70)
 
 
 class VehiclePose(NamedTuple):
-    """Where a vehicle's own state z has what the picture shows, as indices."""
+    """Indices in a vehicle's own state z of the quantities that the picture shows."""
 
     x_position: int
-    """Along the lane, m."""
+    """Position along the lane, m."""
     y_position: int
-    """Across, m, 0 in the middle of the lane."""
+    """Position across the lane, m; 0 in the middle of the lane."""
     steering_angle: int
-    """Of the front wheels, rad."""
+    """Steering angle of the front wheels, rad."""
     yaw: int
     """Heading, rad."""
 
 
 class LanePicture:
-    """A car on a straight lane, by its lateral offset and yaw.
+    """A car on a straight lane, drawn from its lateral offset and yaw.
 
     Args:
         lateral, yaw: index of the lateral offset (m) and of the yaw (rad) in x.
-        forward_mps: U of the model's dY_g/dt = V + U ψ. Where it is negative, as in the paper, the
-            picture is mirrored, so that the car goes to the right and a positive Y_g is up.
-        place: of a vehicle that has a state of its own, which says more than x; it is turned
-            anticlockwise by its yaw, and is mirrored with the rest.
+        forward_mps: U of the model's dY_g/dt = V + U ψ. If it is negative, as in the paper, the
+            picture is mirrored, so that the car moves to the right and a positive Y_g is up.
+        place: indices in the state of a vehicle with its own state, which contains more than x; the
+            vehicle is turned anticlockwise by its yaw, and mirrored with the rest.
     """
 
     title = "The car on its lane"
@@ -65,11 +65,11 @@ class LanePicture:
         self._hand = -1.0 if forward_mps < 0 else 1.0
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """The lane and its neighbours, more ahead than behind."""
+        """Return the visible area: the lane and its neighbours, more ahead than behind."""
         return -_BEHIND_M, _AHEAD_M, -_HIGH_M, _HIGH_M
 
     def scenery(self) -> Mapping[str, Shape]:
-        """The road, three cars, and who is who."""
+        """Return the road, three cars, and the legend."""
         edge, between = 1.5 * _LANE_M, 0.5 * _LANE_M
         left, right = -_BEHIND_M - _POSTS_EVERY_M, _AHEAD_M + 2 * _POSTS_EVERY_M
         marks = np.arange(round(left / _MARKS_EVERY_M), round(right / _MARKS_EVERY_M))
@@ -101,7 +101,7 @@ class LanePicture:
         } | legend(_AHEAD_M - 3.9, _HIGH_M - 0.6, 1.1)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Where cars and markings are."""
+        """Return the poses of cars and markings."""
         k = len(frames.t_s)
         zero = np.zeros(k)
         found: dict[str, Columns] = {}
@@ -147,6 +147,6 @@ def _wheel(x: float, y: float) -> list[tuple[float, float]]:
 
 
 def _corners(beyond: float) -> list[tuple[float, float]]:
-    """An outline around the car, with a nose that says which way it goes."""
+    """Return an outline around the car, with a nose that shows its direction."""
     x, y = _LENGTH_M / 2 + beyond, _WIDTH_M / 2 + beyond
     return [(-x, -y), (x - 0.5, -y), (x, -y + 0.5), (x, y - 0.5), (x - 0.5, y), (-x, y)]

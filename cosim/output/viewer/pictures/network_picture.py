@@ -1,8 +1,8 @@
 """The loop as a diagram that animates every update until it arrives or is lost.
 
-A real flight takes microseconds. It is drawn as if each leg took ``LEG_S`` of simulated time, so
-that it can be followed at the speed of the run: a dot leaves the sensor at the broadcast, and what
-is to be seen of the delivery in the states comes before the dot arrives.
+A real transmission takes microseconds. Each leg is drawn with a duration of ``LEG_S`` of simulated
+time, so that it is visible at the speed of the run: a dot leaves the sensor at the broadcast, and
+the effect of the delivery on the states appears before the dot arrives.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ from noack.protocol.record_tables import Fate, effective
 
 DIAGRAM = "network"
 LEG_S = 0.15
-"""Simulated time that a packet is drawn to take from the sensor to the network, and onward."""
+"""Drawn duration, in simulated time, from the sensor to the network, and from there onward."""
 _FALL_S = 0.45
 _APART_S = 0.025
 _LEG_NS, _FALL_NS, _APART_NS = (round(s * NS_PER_S) for s in (LEG_S, _FALL_S, _APART_S))
@@ -48,18 +48,18 @@ class Moving(NamedTuple):
 
 
 class _InFlight(NamedTuple):
-    """Packets that are in flight, in the drawing (p,)."""
+    """Packets that are in flight in the drawing, (p,)."""
 
     t_ns: Times
     out_ns: Times
-    """When they leave the network; of those that are lost, when they begin to fall."""
+    """Time at which they leave the network; for lost packets, time at which they start to fall."""
     fate: NDArray[np.int64]
     reverse: NDArray[np.bool_]
-    """Whether they go from the controller to the sensor."""
+    """Whether they are sent from the controller to the sensor."""
 
     @property
     def end_ns(self) -> Times:
-        """When nothing more is to be seen of them."""
+        """Time from which they are no longer visible."""
         return self.out_ns + np.where(effective(self.fate), _LEG_NS, _FALL_NS)
 
     def of(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "_InFlight":
@@ -73,10 +73,10 @@ _NONE = np.zeros(0, np.int64)
 
 
 class NetworkDiagram:
-    """Boxes, the ways between them, and packets.
+    """Boxes, arrows between them, and packets.
 
     Args:
-        acknowledged: whether packets also go reverse.
+        acknowledged: whether packets also travel in the reverse direction.
     """
 
     def __init__(self, *, acknowledged: bool = False) -> None:
@@ -88,7 +88,7 @@ class NetworkDiagram:
 
     @staticmethod
     def panel() -> rrb.Spatial2DView:
-        """The view of the diagram."""
+        """Return the view of the diagram."""
         return rrb.Spatial2DView(
             origin=DIAGRAM,
             name=f"Packets (drawn {LEG_S:g} s a leg)",
@@ -98,7 +98,7 @@ class NetworkDiagram:
         )
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Boxes, arrows, words, and how packets look."""
+        """Return boxes, arrows, labels, and the packets' styles."""
         colours = [PLANT, SENSOR, NETWORK, CONTROLLER]
         found: dict[str, Shape] = {}
         words = ("plant x", "sensor x_s", "network", "controller x_c")
@@ -136,15 +136,15 @@ class NetworkDiagram:
     def add(
         self, t_ns: Times, release_ns: Times, fate: NDArray[np.int64], *, reverse: bool = False
     ) -> None:
-        """Take packets (p,) that follow those added before.
+        """Add packets (p,) that follow the previously added ones.
 
         Args:
-            t_ns: their broadcasts, or of acknowledgements, when they reached the network.
-            release_ns: when they leave the network.
-            fate: what the network did with them.
-            reverse: they are acknowledgements.
+            t_ns: times of their broadcasts; for acknowledgements, times of arrival at the network.
+            release_ns: times at which they leave the network.
+            fate: their fates in the network.
+            reverse: whether they are acknowledgements.
 
-        Of packets that are closer to each other than a dot's size, the first is drawn.
+        If packets are closer to each other than a dot's size, only the first is drawn.
         """
         drawn = np.zeros(len(t_ns), np.bool_)
         for i, sent_ns in enumerate(t_ns.tolist()):
@@ -184,7 +184,7 @@ class NetworkDiagram:
     def _moving(
         self, pairs: _InFlight, frame: Times, first: int, last: int
     ) -> Mapping[str, Moving]:
-        """Rows of all entities; ``pairs`` are packets, each at a frame (q,), in order of frames."""
+        """Return the rows of all entities; ``pairs`` (q,) are packets at frames, by frame."""
         now_ns = frame * _FRAME_NS
         survives, leaves = effective(pairs.fate), now_ns >= pairs.out_ns
         there = np.clip((now_ns - pairs.t_ns) / _LEG_NS, 0.0, 1.0)
@@ -212,7 +212,7 @@ class NetworkDiagram:
             shapes = np.bincount(frame[which] - first, minlength=last - first + 1)
             before = np.concatenate([[self._shown.get(entity, 0)], shapes[:-1]])
             self._shown[entity] = int(shapes[-1])
-            rows = (shapes > 0) | (before > 0)  # one without any ends what was to be seen
+            rows = (shapes > 0) | (before > 0)  # a row without shapes removes the previous ones
             if rows.any():
                 t_ns = (first + np.flatnonzero(rows)) * _FRAME_NS
                 found[entity] = Moving(t_ns, _shapes(entity, places[which], shapes[rows]))
@@ -221,11 +221,11 @@ class NetworkDiagram:
 
 _DIAMOND = 1.3 * _SIZE * np.array([[0, -1], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]])
 _CROSS = _SIZE * np.array([[-1, -1], [1, 1], [0, 0], [-1, 1], [1, -1]])
-"""One line, that goes over its middle twice."""
+"""One line that passes its middle twice."""
 
 
 def _shapes(entity: str, places: Reals, counts: NDArray[np.int64]) -> Columns:
-    """Shapes at places (q, 2), so many of them in each row."""
+    """Return shapes at places (q, 2); ``counts`` is the number of shapes in each row."""
     if entity in ("forced", "lost"):
         shape = _DIAMOND if entity == "forced" else _CROSS
         points = (places[:, None, :] + shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A pendulum that stands upright on a pivot, or on a cart that runs on a rail; and a cart alone.
+"""An upright pendulum on a pivot, or on a cart on a rail; or a cart alone.
 
 The angle is measured from upright, in radians; positive is a lean to the right, towards +position.
 """
@@ -27,13 +27,13 @@ _ORDERS: Mapping[str, float] = {"plant": 2.0, "sensor": 4.0, "controller": 3.0}
 
 
 class PendulumPicture:
-    """Poles and carts: the plant's solid, the sensor model's in outline, the controller's dashed.
+    """Poles and carts: plant solid, sensor's model outlined, controller's model dashed.
 
     Args:
         position: index of the cart's position in x, in metres; None for a fixed pivot.
         angle: index of the pole's angle in x, in radians; None for a cart alone.
-        reach_m: how far the cart will go to either side.
-        pole_m: length of the pole; where the cart goes far, cart and pole are drawn larger.
+        reach_m: maximum distance of the cart from 0.
+        pole_m: length of the pole; if the cart moves far, cart and pole are drawn larger.
     """
 
     rate_hz = 60.0
@@ -53,18 +53,18 @@ class PendulumPicture:
             (True, True): "The cart and its pole",
             (True, False): "The cart on its rail",
         }[position is not None, angle is not None]
-        # Of all lengths of the drawing, which are in units of the pole.
+        # Scale of the drawing; its lengths are in units of the pole's length.
         self._scale = max(reach_m / 1.8, pole_m)
         self._wide = (2.3 if position is not None else 1.6) * self._scale
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """The rail, as far as the cart is expected to go, and the pole's whole circle above it."""
+        """Return the visible area: the cart's expected range, and the pole's circle."""
         high = 1.35 * self._scale
         low = (-0.55 if self._position is not None else -0.4) * self._scale
         return -self._wide, self._wide, low, high
 
     def scenery(self) -> Mapping[str, Shape]:
-        """The rail or the pivot, three of what moves, and who is who."""
+        """Return the rail or the pivot, three moving bodies, and the legend."""
         scale = self._scale
         found: dict[str, Shape] = {}
         if self._position is None:
@@ -92,7 +92,7 @@ class PendulumPicture:
         return found | legend(left + 0.7 * scale, top - 0.05 * scale, 0.22 * scale)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Where carts and poles are."""
+        """Return the poses of carts and poles."""
         found: dict[str, Columns] = {}
         for who in WHO:
             x = frames.of(who)

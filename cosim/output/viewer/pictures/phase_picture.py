@@ -1,7 +1,7 @@
-"""A phase plot for a plant of which no picture is known: one state against another.
+"""A phase plot, for a plant without its own picture: one state against another.
 
-Both axes are scaled to what the model's closed loop goes through from x(0). A plant of one state
-has a line of its own for each of the three.
+Both axes are scaled to the range of the model's closed loop from x(0). For a plant with one state,
+each of the three states has its own line.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,11 +30,11 @@ _WIDTHS: Mapping[str, float] = {"plant": 0.022, "sensor": 0.009, "controller": 0
 
 
 class PhasePicture:
-    """The first state to the right, the second up, with a trail of the last seconds.
+    """The first state on the horizontal axis, the second on the vertical, with a trail.
 
     Args:
-        names: of the states.
-        reach: how far each of them will go, (n,), above 0.
+        names: names of the states.
+        reach: (n,) expected maximum of each |x_i|, above 0.
     """
 
     rate_hz = 60.0
@@ -49,11 +49,11 @@ class PhasePicture:
         self._last: dict[str, Reals] = {}
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Both axes, and room for words on the right."""
+        """Return the visible area: both axes, and room for labels on the right."""
         return -1.25, 2.8, -1.5, 1.25
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Axes with the values at their ends, three points, and who is who."""
+        """Return axes with the values at their ends, three points, and the legend."""
         square = outline([(-1, -1), (1, -1), (1, 1), (-1, 1)])
         found: dict[str, Shape] = {
             "axes": lines([*square, [(-1, 0), (1, 0)], [(0, -1), (0, 1)]], STILL, 0.006)
@@ -67,7 +67,7 @@ class PhasePicture:
             found[f"axes/{i}"] = label(f"{name} = {reach:.3g}", at, STILL)
         for who, colour in WHO.items():
             width, order = _WIDTHS[who], _ORDERS[who]
-            if who == "plant":  # filled by its own width
+            if who == "plant":  # filled by its line width
                 found[f"{who}/point"] = lines([[(-1e-3, 0), (1e-3, 0)]], colour, 0.06, order=order)
             else:
                 around = np.linspace(0, 2 * np.pi, 17)[:-1]
@@ -82,14 +82,14 @@ class PhasePicture:
         return found | legend(1.95, 1.0, 0.3)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """The three points, and the piece by which each trail grows."""
+        """Return the three points, and the new part of each trail."""
         found: dict[str, Columns] = {}
         for i, who in enumerate(WHO):
             points = self._scaled(frames.of(who), 0.3 - 0.3 * i)
             found[f"{who}/point"] = poses(points[:, 0], points[:, 1])
             if self.trails:
                 before = np.vstack([self._last.get(who, points[:1]), points[:-1]])
-                # No line to or from where there is no state.
+                # No line to or from an unknown state.
                 whole = np.isfinite(before + points).all(axis=1, keepdims=True)
                 before = np.where(whole, before, points)
                 found[f"{who}/trail"] = strips(np.stack([before, points], axis=1))

@@ -1,9 +1,8 @@
-"""What a picture of the plant is: still shapes, and what moves them, as columns for the recording.
+"""Interface of a plant's picture: static shapes, and their motion as columns of the recording.
 
-Pictures are drawn in two dimensions: they are the same for every plant of a kind, sharp at every
-size, and cost a viewer without a graphics processor little. A picture's lengths are those of the
-plant; up is +y here, and down in the viewer, so every shape and pose is turned over on its way
-(:func:`upright`, :func:`poses`).
+Pictures are two-dimensional: they are the same for every plant of a kind, sharp at every size, and
+cheap for a viewer without a graphics processor. A picture has the plant's lengths. Here, +y is up;
+in the viewer, +y is down, so that every shape and pose is flipped (:func:`upright`, :func:`poses`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,16 +20,16 @@ Reals = NDArray[np.float64]
 
 TIMELINE = "t"
 PICTURE = "picture"
-"""What all entities of a picture are below."""
+"""Parent of all entities of a picture."""
 WHO: Mapping[str, Colour] = {"plant": PLANT, "sensor": SENSOR, "controller": CONTROLLER}
-"""Whose state a body shows: the plant's own, and where the two models believe it to be."""
+"""The bodies of a picture and their colours: the state of the plant, and of the two models."""
 NAMES: Mapping[str, str] = {
     "plant": "x plant",
     "sensor": "x_s sensor model",
     "controller": "x_c controller model",
 }
 STILL: Colour = (128, 132, 138)
-"""Of what does not move: roads, rails, axes."""
+"""Colour of static shapes: roads, rails, axes."""
 
 TRAIL_S = 3.0
 
@@ -47,26 +46,26 @@ class Frames(NamedTuple):
     t_s: Reals
     """(k,) ascending."""
     x: Reals
-    """(k, n) the plant's."""
+    """(k, n) state of the plant."""
     x_s: Reals
-    """(k, n) the sensor model's."""
+    """(k, n) state of the sensor's model."""
     x_c: Reals
-    """(k, n) the controller model's; NaN where it is not on record."""
+    """(k, n) state of the controller's model; NaN if it was not recorded."""
     z: Reals | None = None
-    """(k, N) the system's own, of a plant that is not linear; NaN where it is not on record."""
+    """(k, N) internal state of a nonlinear plant; NaN if it was not recorded."""
 
     def at(self, which: NDArray[np.bool_]) -> "Frames":
-        """Some of them."""
+        """Return a subset."""
         z = None if self.z is None else self.z[which]
         return Frames(self.t_s[which], self.x[which], self.x_s[which], self.x_c[which], z)
 
     def of(self, who: str) -> Reals:
-        """The state, in the loop's coordinates, that one of ``WHO`` has or believes, (k, n)."""
+        """Return the state (k, n) of one of ``WHO``, in the loop's coordinates."""
         return {"plant": self.x, "sensor": self.x_s, "controller": self.x_c}[who]
 
 
 def joined(batches: Sequence[Frames]) -> Frames:
-    """Frames that follow each other, as one batch."""
+    """Return successive batches of frames as one batch."""
     own = [frames.z for frames in batches if frames.z is not None]
     return Frames(
         np.concatenate([frames.t_s for frames in batches]),
@@ -81,27 +80,27 @@ class Picture(Protocol):
     """One plant's picture; entities are named below ``PICTURE``."""
 
     title: str
-    """Of its panel."""
+    """Title of its panel."""
     rate_hz: float
     """Frames per second of simulated time."""
     trails: tuple[str, ...]
-    """Entities of which the last ``TRAIL_S`` are in sight, not only the newest."""
+    """Entities for which the last ``TRAIL_S`` are visible, not only the newest row."""
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """What is in sight: left, right, bottom, top."""
+        """The visible area: left, right, bottom, top."""
         ...
 
     def scenery(self) -> Mapping[str, Shape]:
-        """The shapes, by entity; each is recorded once."""
+        """Return the static shapes, by entity; each is recorded once."""
         ...
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """What moves them: columns of k rows, by entity."""
+        """Return the motion of the shapes: columns of k rows, by entity."""
         ...
 
 
 def panel(picture: Picture) -> rrb.Spatial2DView:
-    """The view of a picture."""
+    """Return the view of a picture."""
     left, right, bottom, top = picture.bounds()
     past = rrb.VisibleTimeRange(
         TIMELINE,
@@ -119,7 +118,7 @@ def panel(picture: Picture) -> rrb.Spatial2DView:
 
 
 def upright(points: Sequence[Sequence[float]] | Reals) -> Reals:
-    """Points (..., 2) with up for +y, for the viewer."""
+    """Return points (..., 2), for which +y is up, in the viewer's coordinates."""
     return np.asarray(points, dtype=np.float64) * (1.0, -1.0)
 
 
@@ -130,28 +129,28 @@ def lines(
     *,
     order: float = 0.0,
 ) -> rr.LineStrips2D:
-    """Lines through points, as wide as ``width``; what is of higher ``order`` is in front."""
+    """Return lines through points, of this ``width``; a higher ``order`` is in front."""
     return rr.LineStrips2D(
         [upright(strip) for strip in strips], radii=width / 2, colors=colour, draw_order=order
     )
 
 
 def style(colour: Colour, width: float, *, order: float = 0.0) -> rr.LineStrips2D:
-    """How lines look that each frame draws anew (:func:`strips`)."""
+    """Return the style of lines that each frame redraws (:func:`strips`)."""
     return rr.LineStrips2D.from_fields(radii=width / 2, colors=colour, draw_order=order)
 
 
 def label(
     text: str, at: tuple[float, float], colour: Colour, *, order: float = _FRONT
 ) -> rr.Points2D:
-    """A text below a point."""
+    """Return a text below a point."""
     return rr.Points2D(
         upright([at]), radii=0.0, colors=colour, labels=text, show_labels=True, draw_order=order
     )
 
 
 def legend(left: float, top: float, step: float) -> dict[str, Shape]:
-    """Say whose is which, one below the other, centred on the place given."""
+    """Return the legend of the bodies, one below the other, centred on the given place."""
     return {
         f"legend/{who}": label(NAMES[who], (left, top - i * step), colour)
         for i, (who, colour) in enumerate(WHO.items())
@@ -159,9 +158,9 @@ def legend(left: float, top: float, step: float) -> dict[str, Shape]:
 
 
 def poses(x: Reals, y: Reals, angle_rad: Reals | None = None) -> Columns:
-    """Transforms that put a shape at places (k,), turned anticlockwise by angles (k,) if any.
+    """Return transforms to places (k,), with anticlockwise rotations by angles (k,), if given.
 
-    What is not a number, or far out of sight, is put where nobody looks.
+    A shape at NaN, or far outside the visible area, is moved to a place that is never visible.
     """
     place = np.nan_to_num(np.column_stack([x, -y, np.zeros_like(x)]), nan=_FAR, posinf=_FAR)
     translation = np.clip(place, -_FAR, _FAR).astype(np.float32)
@@ -174,21 +173,21 @@ def poses(x: Reals, y: Reals, angle_rad: Reals | None = None) -> Columns:
 
 
 def strips(points: Reals) -> Columns:
-    """One line a frame, through points (k, p, 2)."""
+    """Return one line per frame, through points (k, p, 2)."""
     return rr.LineStrips2D.columns(strips=clipped(upright(points)))
 
 
 def clipped(points: Reals) -> NDArray[np.float32]:
-    """Points as the recording keeps them; what is no place is put where nobody looks."""
+    """Return points in the recording's format; invalid ones get a place that is never visible."""
     return np.clip(np.nan_to_num(points, nan=_FAR), -_FAR, _FAR).astype(np.float32)
 
 
 def outline(
     corners: Sequence[Sequence[float]], dash: float | None = None
 ) -> list[list[list[float]]]:
-    """A closed line through corners, or dashes along it of the length given.
+    """Return a closed line through corners, or dashes of a given length along it.
 
-    Beside a whole line, one of dashes can be told apart without colours.
+    A dashed line can be distinguished from a solid one without colours.
     """
     ends = [*corners, corners[0]]
     if dash is None:

@@ -1,4 +1,4 @@
-"""Which picture a plant has, by its kind or by the names of its states."""
+"""Selects a plant's picture by its kind or by the names of its states."""
 
 from collections.abc import Sequence
 
@@ -21,7 +21,7 @@ _ROOM = 1.25
 
 
 def picture_of(scenario: Scenario) -> Picture:
-    """The picture of a resolved scenario's plant: one of its kind, or a phase plot."""
+    """Return the picture of a resolved scenario's plant: one of its kind, or a phase plot."""
     loop, system = loop_of(scenario), scenario.plant.system
     kind: str = system.kind
     own = system.internal_names
@@ -33,15 +33,15 @@ def picture_of(scenario: Scenario) -> Picture:
     if kind == "four_tank" and (at := _places(own, _LEVELS)):
         return TanksPicture(range(4), at)
     if kind == "vehicle" and (at := _places(own, VehiclePose._fields)):
-        # x is that of the lane models: V, r, psi, Y_g.
+        # x is the state of the lane models: V, r, psi, Y_g.
         return LanePicture(3, 2, forward_mps=float(loop.A_model[3, 2]), place=VehiclePose(*at))
     return _of_states(loop, reach)
 
 
 def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
-    """How far each state goes from 0 in the model's closed loop from x(0), and some room, (n,).
+    """Return (n,) max |x_i| of the model's closed loop from x(0), plus a margin.
 
-    Where a state stays at 0, it is given 1.
+    It is 1 for a state that stays at 0.
     """
     step = Propagator(loop.A_model + loop.B_model @ loop.K).transition(
         max(horizon_ns // _SAMPLES, 1)
@@ -57,7 +57,7 @@ def reach_of(loop: LoopMatrices, horizon_ns: int) -> Reals:
 
 
 def _of_states(loop: LoopMatrices, reach: Reals) -> Picture:
-    """The picture of a plant that is known by what its states are called."""
+    """Return a picture according to the names of the states, else a phase plot."""
     names = loop.state_names
     if at := _places(names, ("psi", "Y_g")):
         # The paper's dY_g/dt = V + U ψ.
@@ -72,7 +72,7 @@ def _of_states(loop: LoopMatrices, reach: Reals) -> Picture:
 
 
 def _places(names: Sequence[str], wanted: Sequence[str]) -> tuple[int, ...]:
-    """Where the wanted names are, if all of them are there."""
+    """Return the indices of the wanted names, if all of them exist."""
     if not set(wanted) <= set(names):
         return ()
     return tuple(names.index(name) for name in wanted)

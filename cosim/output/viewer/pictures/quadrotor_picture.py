@@ -1,4 +1,4 @@
-"""A quadrotor that hovers, from above and from the side, and where its models believe it is."""
+"""A hovering quadrotor, from above and from the side, and the positions of its two models."""
 
 from collections.abc import Mapping, Sequence
 
@@ -27,9 +27,9 @@ class QuadrotorPicture:
     """Two drawings side by side: from above (x to the right, y up) and from the side (x and z).
 
     Args:
-        states: index in x of the positions x, y, z (m, from where it is to hover) and of roll,
-            pitch and yaw (rad).
-        reach_m: how far it will go from where it is to hover; if far, it is drawn larger.
+        states: indices in x of the positions x, y, z (m, relative to the hovering position) and of
+            roll, pitch and yaw (rad).
+        reach_m: maximum distance from the hovering position; if it is large, the body is enlarged.
     """
 
     title = "The quadrotor"
@@ -43,12 +43,12 @@ class QuadrotorPicture:
         self._apart = 1.1 * self._reach
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Both drawings, their titles, and room for words on the right."""
+        """Return the visible area: both drawings, their titles, room for labels on the right."""
         apart, reach = self._apart, self._reach
         return -2 * apart, 3.3 * apart, -1.1 * reach, 1.4 * reach
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Two frames, three bodies in each, and who is who."""
+        """Return two frames, three bodies in each, and the legend."""
         found: dict[str, Shape] = {}
         thin, edge = 0.008 * self._reach, self._reach
         for view, side in (("above", -1), ("side", 1)):
@@ -75,19 +75,19 @@ class QuadrotorPicture:
         return found | legend(2.65 * self._apart, self._reach, 0.3 * self._reach)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """Where the bodies are, and how they lean."""
+        """Return the positions and angles of the bodies."""
         found: dict[str, Columns] = {}
         for who in WHO:
             state = frames.of(who)
             x, y, z, _, pitch, yaw = (state[:, self._at[name]] for name in _STATES)
             found[f"above/{who}"] = poses(x - self._apart, y, yaw)
-            # A positive pitch about +y turns the x axis down, where z is up.
+            # With z up, a positive pitch about +y turns the x axis down.
             found[f"side/{who}"] = poses(x + self._apart, z, -pitch)
         return found
 
 
 def _above(*, dashed: bool) -> list[list[list[float]]]:
-    """Four rotors, their arms, and a nose, in lengths of an arm."""
+    """Return four rotors, their arms, and a nose, in units of an arm's length."""
     found: list[list[list[float]]] = [[[0.0, 0.0], [0.6, 0.0]]]
     for x in (-0.7, 0.7):
         for y in (-0.7, 0.7):
@@ -100,7 +100,7 @@ def _above(*, dashed: bool) -> list[list[list[float]]]:
 
 
 def _side(*, dashed: bool) -> list[list[list[float]]]:
-    """Two arms, with a mast and a rotor at the end of each, in lengths of an arm."""
+    """Return two arms with mast and rotor at each end, in units of an arm's length."""
     found: list[list[list[float]]] = []
     for side in (-1.0, 1.0):
         found.append([[side - 0.4, 0.25], [side + 0.4, 0.25]])

@@ -1,4 +1,4 @@
-"""Four tanks, of which two empty into the others: the levels, and what the models believe."""
+"""Four tanks, two of which drain into the others: the levels of plant and models."""
 
 from collections.abc import Mapping, Sequence
 
@@ -20,7 +20,7 @@ from cosim.output.viewer.pictures.picture import (
 
 _WIDE, _HIGH = 1.0, 1.6
 _PLACES = ((-0.9, 0.0), (0.9, 0.0), (-0.9, 2.3), (0.9, 2.3))
-"""Left and lower corner of the tanks 1 to 4: the upper two are 3 and 4."""
+"""Lower left corners of the tanks 1 to 4; the upper two are 3 and 4."""
 _HATCH, _TALLEST_CM = 7, 20.0
 _STYLES: Mapping[str, tuple[float, float]] = {
     "plant": (0.07, 2.0), "sensor": (0.06, 4.0), "controller": (0.09, 3.0),
@@ -28,11 +28,11 @@ _STYLES: Mapping[str, tuple[float, float]] = {
 
 
 class TanksPicture:
-    """Levels as bars; the models' as a line each, which goes beyond the tank on its own side.
+    """Levels as bars; each model's level is a line, which protrudes from the tank on one side.
 
     Args:
-        levels: index in x of the four levels' deviations from the operating point, in centimetres.
-        own: index in z of the four levels, in centimetres.
+        levels: indices in x of the four levels' deviations from the operating point, in cm.
+        own: indices in z of the four levels, in centimetres.
     """
 
     title = "The tanks"
@@ -43,11 +43,11 @@ class TanksPicture:
         self._levels, self._own = list(levels), list(own)
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """All four, and room for words on the left."""
+        """Return the visible area: all four tanks, and room for labels on the left."""
         return -3.6, 2.6, -0.35, 4.25
 
     def scenery(self) -> Mapping[str, Shape]:
-        """Walls, spouts, and how levels look."""
+        """Return walls, spouts, and the styles of levels."""
         walls = [
             [(left, low + _HIGH), (left, low), (left + _WIDE, low), (left + _WIDE, low + _HIGH)]
             for left, low in _PLACES
@@ -66,7 +66,7 @@ class TanksPicture:
         return found | legend(-2.6, 4.1, 0.45)
 
     def frames(self, frames: Frames) -> Mapping[str, Columns]:
-        """The levels, by what of each the sensor and the controller believe."""
+        """Return the levels of the plant and of the two models."""
         found: dict[str, Columns] = {}
         if frames.z is None:
             return found
@@ -80,7 +80,7 @@ class TanksPicture:
 
 
 def _level(who: str, left: float, low: float, height: Reals) -> Reals:
-    """The line that is a level (k, p, 2): a hatched bar, or a stroke."""
+    """Return the line of a level (k, p, 2): a hatched bar, or a stroke."""
     k = len(height)
     if who == "plant":
         across = np.repeat(np.linspace(left + 0.09, left + _WIDE - 0.09, _HATCH), 2)
