@@ -1,10 +1,10 @@
-"""The controller: runs the model x_c, reset only by the updates that are delivered (eq:ModCont).
+"""The controller: runs the model x_c, which only a delivered update resets (eq:ModCont).
 
-At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late packet still restores x_c = x_s. At every
-tick it sends the input of its control law, u = K x_c unless the scenario names another law. Before
-its first update it sends a declared safe input, unless it knows x(0). The model's time advances
-with ticks and updates and never runs backward: an update older than the last tick is propagated to
-the tick; a newer one advances the model.
+At an update x_c ← e^{H(t−t_i)} x(t_i), so that a late update still restores x_c = x_s. At every
+tick the controller sends the input of its control law: u = K x_c, unless the scenario names another
+law. Before its first update it sends a declared safe input, unless x(0) is given. The model's time
+advances with ticks and updates and never runs backward. An update older than the last tick is
+propagated to the time of that tick. A newer update advances the model to its own time.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,11 +43,11 @@ class Controller:
         phase_ns: time of the first.
         horizon_ns: no tick is due after this time.
         mansd: M − 1; more consecutive losses violate the assumption.
-        x0: the state that sensor and controller both know at t = 0; None if they do not.
-        acknowledges: whether it acknowledges the updates that it takes, as the baseline does.
-        start: from where in the run it works.
-        safe_input: the input while it knows no state, shape (m,); by default 0.
-        predictive: whether an actuation carries x_c, too, for the plant's watchdog.
+        x0: x(0), if sensor and controller start from it; else None.
+        acknowledges: whether it acknowledges each update, as the acknowledgement baseline does.
+        start: the step of the run at which this process starts.
+        safe_input: the input before the first update, shape (m,); by default 0.
+        predictive: whether an actuation also carries x_c, for the plant's watchdog.
         setpoint: x_r and u_r, shapes (n,) and (m,): u = K(x_c − x_r) + u_r; None is 0.
         schedule: the announced changes of its settings; None if they cannot change.
     """
@@ -90,7 +90,7 @@ class Controller:
         self._step = max(-(-(start.from_ns - phase_ns) // period_ns), 0)
         # After a restart the updates before it are unknown.
         self._newest: int | None = None if start.is_restart else -1
-        # A model without a state starts at the first tick, which is recorded; its start is not.
+        # A model without a state starts at the first tick: the tick is recorded, the start is not.
         self._model_ns = phase_ns + self._step * period_ns if start.is_restart else 0
         self.x_c = np.zeros(H.shape[0]) if x0 is None else x0
 
@@ -100,9 +100,9 @@ class Controller:
         return t_ns if t_ns <= self._horizon_ns else None
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Schedule a change; it takes effect at the first tick that is not before its time T.
+        """Schedule a change; it takes effect at the first tick at or after its time T.
 
-        x_c follows another set point from T itself on.
+        x_c follows the new set point from T itself on.
         """
         if self._schedule is None:
             raise CallerError("this controller's settings cannot be changed")
@@ -210,7 +210,7 @@ class Controller:
 
 
 def _between(newest: int, sequence: int) -> int:
-    """The number of updates between two; those before a restart of the sensor are unknown."""
+    """The number of updates lost between two; losses before a restart of the sensor are unknown."""
     restarted = sequence // GENERATION != newest // GENERATION
     return sequence % GENERATION if restarted else sequence - newest - 1
 
@@ -219,14 +219,14 @@ def law_of(resolved: Scenario) -> ControlLaw:
     """Return the control law of a resolved scenario.
 
     Raises:
-        CallerError: the user's class does not exist, raises, or lacks what it must offer.
+        CallerError: the user's class does not exist, raises, or lacks a required method.
     """
     loop, period_s = loop_of(resolved), resolved.timing.controller_period_ns / NS_PER_S
     return resolved.controller.law(ControlModel(loop.A_model, loop.B_model, loop.K, period_s))
 
 
 def controller_of(resolved: Scenario, start: Start = BEGINNING) -> Controller:
-    """Return the controller of a resolved scenario; of the plant it knows at most x(0)."""
+    """Return the controller of a resolved scenario; of the plant's data it uses at most x(0)."""
     loop = loop_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     safe_input = resolved.controller.safe_input

@@ -1,4 +1,4 @@
-"""The sum of a plant's disturbances, as a function of the number of its step."""
+"""The sum of a plant's disturbances, as a function of the step number."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,18 +10,18 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.disturbances.disturbance_settings import Place, SignalSource
 
 _BLOCK = 256
-"""Steps that are computed at once. A random value depends on its step's number, not on this."""
+"""Number of steps computed at once. A random value depends on its step's number only."""
 
 Signal = Callable[[range], Matrix]
-"""Steps → what is added during each of them, (k, entries)."""
+"""Steps → the value added during each step, (k, entries)."""
 
 
 class Disturbance:
     """The sum of all disturbances at the input, and of all at the state.
 
     Args:
-        at_input: each one at the input.
-        at_state: each one at the state.
+        at_input: the disturbances at the input.
+        at_state: the disturbances at the state.
     """
 
     def __init__(self, at_input: list[Signal], at_state: list[Signal]) -> None:
@@ -30,13 +30,13 @@ class Disturbance:
         self._d = self._w = np.zeros((0, 0))
 
     def __call__(self, step: int) -> tuple[Vector, Vector]:
-        """Return d, shape (m,), and w, shape (n,), of a step; (0,) where nothing is added."""
+        """Return d, shape (m,), and w, shape (n,), of a step; shape (0,) without a disturbance."""
         first = step - step % _BLOCK
         if first != self._first:
             self._first = first
             steps = range(first, first + _BLOCK)
             self._d, self._w = (_sum(signals, steps) for signals in self._parts)
-        # A copy has the memory layout of a replay that begins at another step.
+        # A slice is copied: its memory layout then equals that of a replay from another step.
         return self._d[step - first].copy(), self._w[step - first].copy()
 
 

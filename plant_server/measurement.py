@@ -1,4 +1,4 @@
-"""What is measured of a plant: y = C x + v, v a function of the measurement's number."""
+"""The measurement of a plant: y = C x + v, where v is a function of the measurement's number."""
 
 import numpy as np
 
@@ -7,16 +7,16 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.core.random_streams import normals, uniforms
 
 _BLOCK = 256
-"""Measurements whose noise is computed at once."""
+"""Number of measurements with noise computed at once."""
 
 
 class MeasurementModel:
-    """Measures, with noise.
+    """Measures the state, with noise.
 
     Args:
-        C: shape (p, n); None for the identity, whose y = x + v is exact.
+        C: shape (p, n); None is the identity, with exactly y = x + v.
         std: standard deviation of the normally distributed part of v, shape (p,).
-        bound: bound of the uniformly distributed part, shape (p,).
+        bound: bound of the uniformly distributed part of v, shape (p,).
         seed: of the noise.
     """
 
@@ -48,7 +48,7 @@ class MeasurementModel:
 
 
 def measurement_model_of(resolved: Scenario) -> MeasurementModel | None:
-    """Return how the plant of a resolved scenario is measured; None: x itself, and exactly."""
+    """Return the measurement model of a resolved scenario; None if y is exactly x."""
     settings, n = resolved.plant.measurement, resolved.model.dimensions[0]
     if settings.selects_all(n) and not settings.is_noisy:
         return None

@@ -1,13 +1,12 @@
 """The plant: a system on a time grid, under held inputs.
 
-At grid time t_k = k h the plant advances its system to t_k under the input that was held since
-t_{k−1}, measures, and latches the newest actuation received, which it then holds until t_{k+1}. A
-step is always one h long: a late step is a late step of the same length, and is caught up. What is
-held when no actuation has come for too long is the watchdog's to say (``watchdog.py``); what the
-system is, the scenario's (``systems/``), as is what disturbs it from then until t_{k+1}
-(``disturbance_signal.py``), and what is measured of it (``measurement.py``). A
-system that fails has no state any more: x is NaN from then on, as in a plant that diverges, and a
-notice says why.
+At grid time t_k = k h the plant advances its system to t_k under the input held since t_{k−1}. Then
+it measures, and latches the newest actuation received, which it holds until t_{k+1}. A late step
+has the same length h, and the plant catches up. The watchdog chooses the input when no actuation
+has been received for too long (``watchdog.py``). The scenario defines the system
+(``noack.plants``), its disturbance from t_k until t_{k+1} (``disturbance_signal.py``) and its
+measurement (``measurement.py``). If the system fails, x is NaN from then on, as in a plant that
+diverges, and a notice gives the reason.
 """
 
 from collections.abc import Sequence
@@ -31,15 +30,15 @@ class Plant:
     """The machine of the plant server.
 
     Args:
-        system: what is stepped, at x(0).
-        watchdog: looks at the age of the newest actuation.
+        system: the system to advance, at x(0).
+        watchdog: checks the age of the newest actuation.
         period_ns: step h.
         horizon_ns: no step is due after this time.
-        measure_every: a measurement is sent every so many steps.
-        disturbance: what is added to u, and to ẋ; None for nothing.
-        measuring: what is measured of x; None: x itself.
-        reports_inputs: whether a measurement carries the inputs of the steps since the one before,
-            too, as latched at the actuator: what disturbs them comes after it.
+        measure_every: number of steps per measurement.
+        disturbance: is added to u and to ẋ; None if there is none.
+        measuring: the measurement model; None if y = x.
+        reports_inputs: whether a measurement also carries the inputs of the steps since the last
+            measurement. These are the latched inputs, without the disturbance.
     """
 
     def __init__(
@@ -69,13 +68,13 @@ class Plant:
         self._x, self._z = system.x, system.z
         self.u = watchdog.newest.u
         self._applied_input = self.u
-        """What the system is under: u, and what disturbs it."""
+        """The input of the system: u with its disturbance."""
         self._held = [self.u] * measure_every
-        """The inputs since the last measurement; before the first there were none."""
+        """The inputs since the last measurement; 0 before the first step."""
 
     @property
     def x(self) -> Vector:
-        """The state, as the loop calls it, shape (n,)."""
+        """The state, shape (n,)."""
         return self._x
 
     def next_deadline_ns(self) -> int | None:
@@ -84,7 +83,7 @@ class Plant:
         return t_ns if t_ns <= self._horizon_ns else None
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Take an actuation; it is applied from the next step on."""
+        """Receive an actuation; it is applied from the next step on."""
         newest = self._watchdog.take(message.vector, message.t_ns, message.sequence)
         row = (self._count(), message.sequence, message.t_ns, now_ns, newest.u)
         return (Record(PLANT_ACTUATION, (*row, newest.x_c) if len(newest.x_c) else row),)
@@ -124,7 +123,7 @@ class Plant:
         return ()
 
     def _disturb(self, step: int) -> tuple[Vector, ...]:
-        """Take what disturbs the system during a step; return what goes on record of it."""
+        """Set the disturbed input of a step; return the disturbances for the record."""
         if self._disturbance is None:
             self._applied_input = self.u
             return ()
@@ -155,10 +154,12 @@ def plant_of(resolved: Scenario) -> Plant:
 def system_of(resolved: Scenario) -> PlantSystem:
     """Return the system of a resolved scenario's plant, at x(0).
 
-    A disturbed state is a further input of a linear plant: ẋ = Ax + [B I][u; w].
+    If the state of a linear plant is disturbed, the disturbance is a further input: ẋ = Ax + [B
+    I][u; w].
 
     Raises:
-        CallerError: what the system needs is missing, or differs from the settings.
+        CallerError: a file or module that the system needs is missing, or differs from the
+            settings.
     """
     loop, plant = loop_of(resolved), resolved.plant
     B: Matrix = loop.B

@@ -1,14 +1,15 @@
-"""The plant's watchdog: which input is in force when no actuation has come for too long.
+"""The plant's watchdog: the input that is applied when no actuation has arrived for too long.
 
-At t_k the newest actuation is too old if t_k − t > timeout, t the time of the model state x_c that
-it was computed from; before the first one, t = 0. The input is then, by the declared policy,
+At t_k the newest actuation is too old if t_k − t > timeout. Here t is the time of the model state
+x_c from which the actuation was computed; before the first actuation, t = 0. The policy then
+determines the input:
 
-* ``hold``: the newest one, still;
+* ``hold``: the newest input, unchanged;
 * ``zero``: 0;
-* ``model``: what the controller would put out if nothing had reached it since, the predictive
-  actuator: u + K(x̂ − x_c) with x̂ = e^{H(t_k − t)} x_c. An actuation carries [u; x_c] for this.
-  Since u = K x_c this is K x̂; if the controller knew no state, x_c = 0 and u is its safe input,
-  it is that; and if the model holds (H = 0), it is u.
+* ``model``: a predictive actuator. It applies the controller's input for the case that no update
+  has arrived since t: u + K(x̂ − x_c) with x̂ = e^{H(t_k − t)} x_c. For this an actuation carries
+  [u; x_c]. Since u = K x_c, the input equals K x̂. Before the controller's first update, x_c = 0
+  and u is the safe input, so the input is the safe input. With zero-order hold (H = 0) it is u.
 """
 
 from collections.abc import Callable
@@ -28,37 +29,37 @@ NEVER_NS = 2**63 - 1
 
 
 class Actuation(NamedTuple):
-    """An actuation as the plant has it."""
+    """An actuation as received by the plant."""
 
     u: Vector
-    """(m,)"""
+    """The input, (m,)."""
     x_c: Vector
-    """(n,) the controller's model state at ``t_ns``, with policy ``model``; else (0,)."""
+    """The controller's model state at ``t_ns``, (n,), with policy ``model``; else (0,)."""
     t_ns: int
     sequence: int
 
 
 Fallback = Callable[[Actuation, int], Vector]
-"""A policy: the newest actuation and a time at which it is too old, in ns → the input, (m,)."""
+"""A policy: newest actuation and a time in ns at which it is too old → the input, (m,)."""
 
 
 def hold(newest: Actuation, t_ns: int) -> Vector:
-    """The newest input, however old."""
+    """Return the newest input, of any age."""
     return newest.u
 
 
 def zero(newest: Actuation, t_ns: int) -> Vector:
-    """No input."""
+    """Return zero."""
     return np.zeros_like(newest.u)
 
 
 class PredictedInput:
-    """The input that the controller's model asks for, from the last state of it that came.
+    """The input of the controller's model, propagated from the last model state received.
 
     Args:
-        H: what the controller's model integrates, shape (n, n), per second.
+        H: the matrix that the controller's model integrates, shape (n, n), per second.
         K: gain, shape (m, n).
-        period_ns: the plant's step, by which the state is advanced from one to the next.
+        period_ns: the plant's step, over which the state is advanced each time.
     """
 
     def __init__(self, H: Matrix, K: Matrix, period_ns: int) -> None:
@@ -69,7 +70,7 @@ class PredictedInput:
         self._x = NO_VECTOR
 
     def __call__(self, newest: Actuation, t_ns: int) -> Vector:
-        """Return u + K(e^{H(t − t_j)} x_c − x_c) of an actuation of time t_j."""
+        """Return u + K(e^{H(t − t_j)} x_c − x_c) for an actuation of time t_j."""
         if newest.sequence == NO_SEQUENCE:
             return newest.u
         if newest.sequence != self._from:
@@ -92,13 +93,13 @@ def too_old(t_ns: Any, newest_ns: Any, timeout_ns: int) -> Any:
 
 
 class Watchdog:
-    """Chooses the plant's input at each step, and says when the newest actuation is too old.
+    """Chooses the plant's input at each step, and reports when the newest actuation is too old.
 
     Args:
         inputs: m.
-        timeout_ns: how old an actuation may be.
-        fallback: what is done about one that is older.
-        said: what the input is then, in words.
+        timeout_ns: largest permitted age of an actuation.
+        fallback: chooses the input if the newest actuation is older.
+        said: describes that input in notices.
     """
 
     def __init__(
@@ -116,14 +117,14 @@ class Watchdog:
         self.newest = Actuation(np.zeros(inputs), NO_VECTOR, 0, NO_SEQUENCE)
 
     def take(self, vector: Vector, t_ns: int, sequence: int) -> Actuation:
-        """Take what an actuation carries, u or [u; x_c]."""
+        """Store the vector of an actuation, u or [u; x_c]."""
         u, x_c = vector[: self._inputs], vector[self._inputs :]
-        # A part of an array may lie in memory otherwise than a copy, and replay has copies.
+        # Slices are copied: a slice may have another memory layout than the vectors of a replay.
         self.newest = Actuation(u.copy(), x_c.copy(), t_ns, sequence)
         return self.newest
 
     def input(self, t_ns: int) -> tuple[Vector, tuple[Notice, ...]]:
-        """Return the input that is in force from ``t_ns`` on, shape (m,), and what is to be said.
+        """Return the input that is applied from ``t_ns`` on, shape (m,), and notices.
 
         Args:
             t_ns: time of the step; not before that of the last call.

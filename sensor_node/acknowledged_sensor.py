@@ -1,9 +1,9 @@
-"""The sensor of the acknowledgement baseline: x_s is reset only by what is acknowledged.
+"""The sensor of the acknowledgement baseline: only an acknowledged update resets x_s.
 
-A measurement in → propagate x_s → test → maybe one state update out, which is remembered.
-An acknowledgement of update k in → x_s ← e^{H(t−t_k)} x(t_k): what the controller's model is then.
-After a transmission it waits for the acknowledgement, at the longest for a timeout; then, if the
-policy still says so, it transmits what it measures then. Nothing is transmitted twice.
+At a measurement: propagate x_s → test → send at most one state update, and remember it. At an
+acknowledgement of update k: x_s ← e^{H(t−t_k)} x(t_k), which equals the controller's model then.
+After a transmission the sensor waits for the acknowledgement until a timeout. If the policy then
+still requires a transmission, it transmits the current measurement. Nothing is transmitted twice.
 """
 
 from collections.abc import Sequence
@@ -21,17 +21,19 @@ from noack.trigger.trigger_policy import Policy, new_trigger
 class AcknowledgedSensor(FixedMachine):
     """The machine of the sensor node, if updates are acknowledged.
 
-    Its time is the measurements' own here, too: an acknowledgement acts on the model at the time of
-    the last measurement, from where the next one takes it on.
+    Its time is the time of the measurements. An acknowledgement resets the model at the time of the
+    last measurement; the next measurement advances it from there.
 
     Args:
-        H: what the model integrates between updates, shape (n, n), per second.
-        policy: the event-triggering policy; its rule after an event begins when it is acknowledged.
-        x0: the state that sensor and controller both know at t = 0; None if they do not, in which
-            case the first measurement is an event, and x_s is 0 as x_c is until it is acknowledged.
+        H: the matrix that the model integrates between updates, shape (n, n), per second.
+        policy: the event-triggering policy; its state since the last event restarts when the event
+            is acknowledged.
+        x0: x(0), if sensor and controller start from it; else None. With None, the first
+            measurement is an event, and x_s is 0, as x_c is, until an update is acknowledged.
         timeout_ns: how long to wait for an acknowledgement.
-        period_ns: expected time between measurements, to prepare for; others are taken as well.
-        first_number: of its events and of its inputs.
+        period_ns: expected time between measurements, for precomputed matrices; others are
+            possible.
+        first_number: number of its first event and first input.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class AcknowledgedSensor(FixedMachine):
             self._trigger.start(0, x0)
 
     def next_deadline_ns(self) -> int | None:
-        """None: the sensor acts on what it receives only."""
+        """None: the sensor only reacts to messages."""
         return None
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
@@ -67,7 +69,7 @@ class AcknowledgedSensor(FixedMachine):
         return ()
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Take a measurement or an acknowledgement."""
+        """Process a measurement or an acknowledgement."""
         if message.flow is Flow.ACKNOWLEDGEMENT:
             return self._acknowledged(message, now_ns)
         return self._measured(message, now_ns)
@@ -99,7 +101,7 @@ class AcknowledgedSensor(FixedMachine):
         return (update, record)
 
     def _acknowledged(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Reset x_s to what was sent; the wire discards what is not newer than the newest."""
+        """Reset x_s to the acknowledged update; an acknowledgement is newer than all before it."""
         event_ns, before = message.t_ns, self.x_s
         x = self._sent.get(message.sequence)
         if x is not None:

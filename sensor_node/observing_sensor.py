@@ -1,14 +1,14 @@
 """A sensor with an observer: it estimates x from the measurements, and the trigger tests x̂.
 
-The observer needs the input that the plant applied. The sensor does not receive what the controller
-sends, and nothing is acknowledged; so the input is measured at the actuator, and a measurement
-carries [y; u of every step since the last measurement]. Sensor and actuator are at the plant, the
-controller is behind the network; Montestruque and Antsaklis (2003) place their observer likewise.
-Disturbances behind the actuator are not part of the measured input.
+The observer needs the input that the plant applied. The sensor does not receive the actuations, and
+nothing is acknowledged. So the input is measured at the actuator, and a measurement carries [y; u
+of every step since the last measurement]. Sensor and actuator are at the plant, the controller is
+on the other side of the network. Montestruque and Antsaklis (2003) place their observer likewise.
+Disturbances that enter after the actuator are not part of the measured input.
 
-At a measurement, x̂ is predicted over the plant's steps and corrected by y; the sensor behind the
+At a measurement, x̂ is predicted over the plant's steps and corrected by y. The sensor behind the
 observer then uses x̂ in place of x. The observer's time is the time of its measurements. If
-measurements are missing, the inputs of their steps are unknown, and the first known one is used.
+measurements are missing, the inputs of their steps are unknown, and the first known input is used.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,7 +27,7 @@ from noack.protocol.wire_format import Flow, Message
 
 
 class AppliedInputTracker:
-    """Advances an observer from measurement to measurement, under the inputs that were applied.
+    """Advances an observer from measurement to measurement, under the applied inputs.
 
     Args:
         observer: at its first estimate.
@@ -53,7 +53,7 @@ class AppliedInputTracker:
 
     def split(self, vector: Vector) -> tuple[Vector, Vector]:
         """Split the vector of a measurement into y and the inputs since the last measurement."""
-        # A copy has the memory layout of a replay's vectors; a slice may have another.
+        # Slices are copied: a slice may have another memory layout than the vectors of a replay.
         return vector[: self._outputs].copy(), vector[self._outputs :].copy()
 
     def take(self, t_ns: int, y: Vector, inputs: Vector) -> Vector:
@@ -77,7 +77,7 @@ class ObservingSensor:
     Args:
         tracker: estimates x.
         sensor: models and trigger; it receives x̂ in place of x.
-        restarted: whether it replaces a sensor that died, with that sensor's estimate lost.
+        restarted: whether it replaces a sensor that died; the estimate of that sensor is lost.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ def observer_of(resolved: Scenario, *, restarted: bool) -> AppliedInputTracker |
 
     Args:
         resolved: the scenario.
-        restarted: whether the sensor restarts during the run, when x(0) is of no use to it.
+        restarted: whether the sensor restarts during the run; x(0) is then not used.
     """
     settings, loop = resolved.observer, loop_of(resolved)
     if settings is None:

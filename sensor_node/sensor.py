@@ -1,7 +1,7 @@
-"""The sensor: runs the model x_s beside the plant and transmits when the two part (eq:ModSensor).
+"""The sensor: runs the model x_s in parallel to the plant and transmits at events (eq:ModSensor).
 
-A measurement in → propagate x_s → test → maybe one state update out. x_s is reset at *every* event,
-whether or not the update survives the network: nothing is acknowledged.
+At a measurement: propagate x_s → test → send at most one state update. x_s is reset at *every*
+event, whether or not the network delivers the update: nothing is acknowledged.
 """
 
 from collections.abc import Sequence
@@ -23,18 +23,19 @@ from sensor_node.observing_sensor import ObservingSensor, observer_of
 class Sensor:
     """The machine of the sensor node.
 
-    Its time is the measurements' own: what it sends depends on what was measured and when, not on
-    when the datagram was read.
+    Its time is the time of the measurements: its output depends on the measured values and their
+    times, not on when a datagram was read.
 
     Args:
-        H: what the model integrates between updates, shape (n, n), per second.
+        H: the matrix that the model integrates between updates, shape (n, n), per second.
         policy: the event-triggering policy.
-        x0: the state that sensor and controller both know at t = 0; None if they do not, in which
-            case the first measurement is an event.
-        period_ns: expected time between measurements, to prepare for; others are taken as well.
-        first_number: of its events and of its inputs.
+        x0: x(0), if sensor and controller start from it; else None, and the first measurement is an
+            event.
+        period_ns: expected time between measurements, for precomputed matrices; others are
+            possible.
+        first_number: number of its first event and first input.
         setpoint: x_r, shape (n,); None is 0.
-        schedule: what it knows of changes; None if there are none.
+        schedule: the announced changes of its settings; None if they cannot change.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class Sensor:
             self._trigger.start(0, x0)
 
     def next_deadline_ns(self) -> int | None:
-        """None: the sensor acts on measurements only."""
+        """None: the sensor only reacts to measurements."""
         return None
 
     def on_timer(self, now_ns: int) -> Sequence[Output]:
@@ -69,9 +70,9 @@ class Sensor:
         return ()
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Take a change; it is in force from the first measurement on that is not before T.
+        """Schedule a change; it takes effect at the first measurement at or after its time T.
 
-        x_s follows another set-point from T itself on.
+        x_s follows the new set point from T itself on.
         """
         if self._schedule is None:
             raise CallerError("this sensor's settings cannot be changed")
@@ -82,14 +83,14 @@ class Sensor:
         return said
 
     def _change(self, t_ns: int) -> None:
-        """Apply what is in force at a time."""
+        """Apply the changes that are due at a time."""
         while self._schedule is not None and (found := self._schedule.take(t_ns)) is not None:
             setpoint, policy = found.prepared
             self._flow.change(found.since_ns, setpoint)
             self._trigger.change(policy)
 
     def handle(self, message: Message, now_ns: int) -> Sequence[Output]:
-        """Take a measurement x(t); transmit it and reset x_s if the policy says so."""
+        """Process a measurement x(t); at an event, transmit it and reset x_s."""
         t_ns, x = message.t_ns, message.vector
         if self._schedule is not None and self._schedule.next_ns is not None:
             self._change(t_ns)
@@ -121,9 +122,9 @@ class Sensor:
 def sensor_of(
     resolved: Scenario, start: Start = BEGINNING
 ) -> Sensor | AcknowledgedSensor | ObservingSensor:
-    """Return the sensor of a resolved scenario; of the plant it learns x(0) at the most.
+    """Return the sensor of a resolved scenario; of the plant's data it uses at most x(0).
 
-    One that is started anew transmits its first measurement.
+    After a restart, the sensor transmits its first measurement.
     """
     observer = observer_of(resolved, restarted=start.is_restart)
     sensor = _triggering(resolved, start)
@@ -133,7 +134,7 @@ def sensor_of(
 
 
 def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor:
-    """What is behind the observer, if there is one: models, and the trigger."""
+    """Return the models and the trigger: the sensor, or the part of it behind the observer."""
     loop, policy = loop_of(resolved), policy_of(resolved)
     known = resolved.network.initial_sync == "known_state" and not start.is_restart
     x0 = loop.x0 if known else None
@@ -150,6 +151,6 @@ def _triggering(resolved: Scenario, start: Start) -> Sensor | AcknowledgedSensor
 
 
 def _prepared(resolved: Scenario) -> tuple[Vector | None, Policy]:
-    """What a sensor needs of another scenario: its set-point and its policy."""
+    """Return the parts of another scenario that a sensor needs: its set point and its policy."""
     setpoint = setpoint_of(resolved)
     return None if setpoint is None else setpoint[0], policy_of(resolved)

@@ -1,7 +1,7 @@
-"""The library: what ``import noack`` gives to programs and notebooks (``docs/library.md``).
+"""The library: the names that ``import noack`` offers to programs and notebooks.
 
-Importing it loads neither viewer nor control plane nor plots: what a function needs beyond the
-scenario comes with its first call.
+``docs/library.md`` documents it. The import loads neither viewer nor control plane nor plots. Each
+function imports these modules when it is first called.
 """
 
 from importlib.metadata import version

@@ -1,4 +1,4 @@
-"""What is guaranteed of a scenario, as a value."""
+"""The certificates of a scenario, as an object."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
 
 class Certificates:
-    """What is guaranteed of a scenario: of its plant, and of every plant of its uncertainty box.
+    """The certificates of a scenario's plant, and of all plants in its uncertainty box.
 
-    Each certificate has ``constants``, or None and in ``void`` the reason; ``conditions``, which it
-    presupposes of network and schedule; ``assumptions``, each with its verdict; ``inter_event_s``,
-    δ̲; and the bounds as functions of time in seconds, ``sensor_error``, ``controller_error`` and
-    ``state``. Among the constants are ``delta``, Δ of ‖e_c‖ ≤ Δβe^(−αt), ``state``, X of
-    ‖x‖ ≤ Xe^(−αt), and ``rate_per_s``, at which all bounds fall. ``docs/theory.md`` derives them.
+    A certificate has ``constants``, or None with the reason in ``void``. It has ``conditions`` on
+    network and schedule, which it assumes, and ``assumptions``, each with its verdict. It has
+    ``inter_event_s``, the minimum inter-event time δ̲, and three bounds as functions of time in
+    seconds: ``sensor_error``, ``controller_error`` and ``state``. The constants include ``delta``,
+    Δ of ‖e_c‖ ≤ Δβe^(−αt), ``state``, X of ‖x‖ ≤ Xe^(−αt), and ``rate_per_s``, the decay rate of
+    all bounds. ``docs/theory.md`` derives them.
     """
 
     def __init__(self, study: "Study") -> None:
@@ -28,49 +29,49 @@ class Certificates:
 
     @property
     def scenario(self) -> Scenario:
-        """The resolved scenario that they are of, with the weight that was asked for."""
+        """The resolved scenario of the certificates, with the requested weight."""
         return self._study.resolved
 
     @property
     def paper(self) -> "ScenarioCertificate":
-        """Under the paper's conditions: nothing is sampled, delayed or held."""
+        """Under the paper's conditions: no sampling, no delay and no held input."""
         return self._study.certificate("paper")
 
     @property
     def schedule(self) -> "ScenarioCertificate":
-        """Under the scenario's own schedule, late by what it allows."""
+        """Under the scenario's own schedule, with its permitted lateness."""
         return self._study.certificate("schedule")
 
     @property
     def paper_box(self) -> "ScenarioCertificate | None":
-        """Of every plant of the box, under the paper's conditions; None if there is no box."""
+        """For every plant in the box, under the paper's conditions; None if there is no box."""
         return self._study.box_certificate("paper")
 
     @property
     def schedule_box(self) -> "ScenarioCertificate | None":
-        """Of every plant of the box, under the scenario's schedule; None if there is no box."""
+        """For every plant in the box, under the scenario's schedule; None if there is no box."""
         return self._study.box_certificate("schedule")
 
     @property
     def limits(self) -> "NetworkLimits":
-        """How far the schedule could go, one thing at a time; of the scenario's plant, in s.
+        """Limits of the schedule's times for the scenario's plant, each varied alone, in s.
 
-        Found when it is first asked for, in a second or so.
+        They are computed at the first access, which takes about a second.
         """
         return next(iter(self._study.limits.values()))
 
     @property
     def theorem_2(self) -> "Theorem2 | None":
-        """The paper's Theorem 2 as it is printed; None where it cannot be evaluated."""
+        """The paper's Theorem 2, the paper's formula; None if it cannot be evaluated."""
         return self._study.theorem_2
 
     @property
     def weight(self) -> "Matrix | None":
-        """W of the trigger's norm, (n, n), if it was chosen here; None otherwise."""
+        """W of the trigger's norm, (n, n), if this call chose it; else None."""
         return self._study.weight
 
     def to_json(self) -> dict[str, Any]:
-        """Everything as one document, as ``noack certify --json`` prints it."""
+        """Return all certificates as one document, as ``noack certify --json`` prints it."""
         return self._study.to_json()
 
     def _rows(self) -> Rows:
@@ -90,18 +91,19 @@ class Certificates:
 
 
 def certify(scenario: Source, *, weight: str = "given", late: int | None = None) -> Certificates:
-    """Say what is guaranteed of a scenario, with which constants, under which conditions.
+    """Return the certificates of a scenario, with their constants and conditions.
 
     Args:
-        scenario: as :func:`noack.load` gives it, or takes it.
-        weight: of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` here,
-            which takes some seconds, so that more can be certified.
-        late: steps of the plant by which the schedule may be late, 0 to 1000; the scenario's own
-            allowance unless given.
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        weight: W of the trigger's norm: ``given`` by the scenario, ``identity``, or ``chosen`` so
+            that more can be certified, which takes some seconds.
+        late: plant steps by which the schedule may be late, 0 to 1000; by default the scenario's
+            own value.
 
     Raises:
-        NoackError: the scenario is wrong, or none of which there are certificates: its trigger is
-            not the paper's, its plant is not linear, or disturbed, or measured in part.
+        NoackError: the scenario is wrong, or there are no certificates for it: its trigger is not
+            the paper's, its plant is not linear or is disturbed, or the state is not fully
+            measured.
     """
     from cosim.output.certificate_report import study_scenario
 

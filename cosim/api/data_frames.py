@@ -1,4 +1,4 @@
-"""Tables of a run for data frames: Arrow tables, which pandas and polars take as they are."""
+"""Tables of a run for data frames: Arrow tables, which pandas and polars accept directly."""
 
 import numpy as np
 import pyarrow as pa
@@ -23,13 +23,13 @@ _UNDER_WAY = "in_flight"
 
 
 def with_seconds(table: pa.Table) -> pa.Table:
-    """Put ``t_s``, the time ``t_ns`` in seconds, before the columns of a table."""
+    """Insert ``t_s``, the time ``t_ns`` in seconds, before the columns of a table."""
     return table.add_column(0, "t_s", pa.array(_seconds(table["t_ns"].to_numpy())))
 
 
 @np.errstate(all="ignore")  # a run may diverge
 def samples(record: RunRecord) -> pa.Table:
-    """Plant, sensor and controller on the measurements' time grid; :meth:`noack.Run.samples`."""
+    """Return plant, sensor and controller on the measurements' grid; :meth:`noack.Run.samples`."""
     joined = join_all(record)
     columns: dict[str, NDArray[np.generic]] = {"t_s": _seconds(joined.t_ns), "t_ns": joined.t_ns}
     for name, states in (("x", joined.x), ("x_s", joined.x_s), ("x_c", joined.x_c)):
@@ -44,13 +44,13 @@ def samples(record: RunRecord) -> pa.Table:
 
 
 def events(record: RunRecord) -> pa.Table:
-    """The sensor's transmissions and what became of them; :meth:`noack.Run.events`."""
+    """Return the sensor's transmissions and their fates; :meth:`noack.Run.events`."""
     measurements = record[SENSOR_MEASUREMENT]
     sent = measurements[measurements["event"] != NO_SEQUENCE]
     t_s = _seconds(sent["t_ns"])
     crossed = packet_outcomes(record)
     fates = np.array([fate.name.lower() for fate in Fate], dtype=object)[crossed.rows["fate"]]
-    # Delivered, as far as the emulator could know, but not in the end.
+    # The emulator forwarded them, but they were not delivered.
     fates[effective(crossed.rows["fate"]) & crossed.lost] = _OVERTAKEN
     fates[crossed.in_flight] = _UNDER_WAY
     known = dict(zip(crossed.sequence.tolist(), fates.tolist(), strict=True))

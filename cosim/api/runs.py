@@ -1,4 +1,4 @@
-"""Runs: made, live or in virtual time, opened again, and looked at."""
+"""Runs: functions that run a scenario live or in virtual time, or open an earlier run."""
 
 import shutil
 import tempfile
@@ -32,14 +32,14 @@ Folder = str | PathLike[str]
 
 
 class Run:
-    """A run that is over: its settings, its summary, its record.
+    """A completed run: its settings, its summary, its record.
 
-    :func:`noack.simulate`, :func:`noack.run` and :func:`noack.open_run` give one. A run that was
-    made without ``runs`` lies in a temporary folder, which is there as long as this object is.
+    :func:`noack.simulate`, :func:`noack.run` and :func:`noack.open_run` return one. Without the
+    argument ``runs``, the run is in a temporary folder, which exists as long as this object.
     """
 
     directory: Path
-    """The run directory; ``docs/record.md`` says what is in it."""
+    """The run directory; ``docs/record.md`` describes its content."""
 
     def __init__(
         self, directory: Path, finalize: "Callable[[], Outcome]", temporary: Path | None = None
@@ -51,32 +51,33 @@ class Run:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What became of the run: ``summary.json``, whose keys ``docs/record.md`` documents.
+        """The results of the run: ``summary.json``; ``docs/record.md`` documents its keys.
 
-        Of a simulated run in a temporary folder it is made, and its claims judged, when it is first
-        asked for, by this or what follows from it; that takes a second or so.
+        For a simulated run in a temporary folder, the summary and the verdicts of the claims are
+        computed at the first access to this property, or to one that depends on it. This takes
+        about a second.
         """
         return self._outcome.summary
 
     @property
     def ok(self) -> bool:
-        """Whether the run reached its horizon, did not diverge, and all its rows are on record."""
+        """Whether the run reached its horizon, did not diverge, and all its rows are recorded."""
         return self._outcome.status is ExitStatus.OK
 
     @property
     def reason(self) -> str:
-        """Why it ended: ``horizon``, or what went wrong."""
+        """The reason for the end of the run: ``horizon``, or an error."""
         return self._outcome.reason
 
     @property
     def claims(self) -> list[dict[str, Any]]:
-        """What was claimed of the run, each with its ``verdict``: held, violated or void."""
+        """The claims about the run, each with its ``verdict``: held, violated or void."""
         claims: list[dict[str, Any]] = self.summary.get("claims") or []
         return claims
 
     @property
     def scenario(self) -> Scenario:
-        """The resolved scenario: what it left to a model's name, or to chance, is numbers here."""
+        """The resolved scenario, with numbers in place of model names and random draws."""
         return self._record.scenario
 
     @property
@@ -91,8 +92,9 @@ class Run:
             name: one of ``tables``, e.g. ``"plant_step"``.
 
         Returns:
-            Its columns as in ``docs/record.md``: times in nanoseconds of simulated time, vectors
-            one column per entry (``x_1``, ``x_2``, …). Before them ``t_s``, ``t_ns`` in seconds.
+            The table with the columns of ``docs/record.md``: times in nanoseconds of simulated
+                time, and one column per entry of a vector (``x_1``, ``x_2``, …). The first column
+                is ``t_s``, the time ``t_ns`` in seconds.
 
         Raises:
             NoackError: there is no such table, or its file is damaged.
@@ -111,10 +113,11 @@ class Run:
 
         Returns:
             ``t_s`` and ``t_ns``; x, x_s and x_c, one column per state (``x_1``, ``x_s_1``,
-            ``x_c_1``, …); ``e_s_norm`` before a reset, its ``threshold``, ``e_c_norm``, all in the
-            trigger's norm; ``event``, the number of the update that was sent, −1 for none. x_s is
-            shown after a reset; x_c is NaN where the controller's record does not reach. x is what
-            the sensor takes for the state: with noise or an observer not quite the plant's.
+                ``x_c_1``, …); ``e_s_norm`` before a reset, its ``threshold``, and ``e_c_norm``, all
+                in the trigger's norm; ``event``, the number of the transmitted update, or −1. x_s
+                is the value after a reset. x_c is NaN at times without controller records. x is the
+                state that the sensor uses; with noise or an observer it differs from the plant's
+                state.
         """
         from cosim.api.data_frames import samples
 
@@ -124,10 +127,11 @@ class Run:
         """Return the sensor's transmissions, one row each.
 
         Returns:
-            ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s`` since the one before, NaN of
-            the first; ``fate`` in the network: delivered, forced (by the bound on successive
-            drops), dropped, corrupted, overflowed, blacked_out, overtaken, in_flight at the end, or
-            none, if it did not get there; ``received``, whether the controller took it.
+            ``event``, its number; ``t_s`` and ``t_ns``; ``interval_s``, the inter-event time, NaN
+                for the first event; ``fate`` in the network: delivered, forced (delivered because M
+                − 1 was reached), dropped, corrupted, overflowed, blacked_out, overtaken (delivered
+                out of order), in_flight at the end, or none, if it did not reach the network;
+                ``received``, whether the controller processed it.
         """
         from cosim.api.data_frames import events
 
@@ -137,11 +141,11 @@ class Run:
         """Draw a figure of the report.
 
         Args:
-            figure: states, errors, state-norm, input or inter-event; of a live run also lateness or
-                latency. Certified bounds are drawn beside what they bound.
+            figure: states, errors, state-norm, input or inter-event; for a live run also lateness
+                or latency. Certified bounds are drawn next to the bounded quantity.
 
         Raises:
-            NoackError: there is no such figure of this run.
+            NoackError: the run has no such figure.
         """
         from cosim.output.report.run_figures import BOUNDED, pictures
 
@@ -154,7 +158,7 @@ class Run:
         """Write ``report.html``, a page with all figures, into the run directory; return its path.
 
         Raises:
-            NoackError: it cannot be written.
+            NoackError: the file cannot be written.
         """
         from cosim.live.finalize import rewrite_report
 
@@ -164,7 +168,7 @@ class Run:
         """Feed every machine its recorded inputs again and compare the outputs bit for bit.
 
         Returns:
-            The verdict: ``bit_exact``, ``first_difference``, ``gaps``, and more.
+            The result: ``bit_exact``, ``first_difference``, ``gaps``, and more.
         """
         from cosim.analysis.replay import replay
 
@@ -177,7 +181,7 @@ class Run:
             The differences: ``verdict`` in words, ``stages``, ``explained_relative``, and more.
 
         Raises:
-            NoackError: there is no ideal loop to compare it with, or the record has holes.
+            NoackError: the scenario has no ideal loop, or the record is incomplete.
         """
         from cosim.analysis.fidelity import compute_fidelity
 
@@ -200,7 +204,7 @@ class Run:
         return RunClaims(self._record).envelopes()
 
     def _facts(self) -> Iterator[tuple[str, str]]:
-        """What matters, in a few lines."""
+        """The most important facts, in a few lines."""
         found = self.summary
         mode = "model-based" if found["mode"] == "model" else "zero-order hold"
         yield "run", f"{found['scenario']}, {mode}, {found['kind']}, M − 1 = {found['mansd']}"
@@ -227,8 +231,8 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
     """Run a scenario in virtual time: the same machines and losses, no sockets, never late.
 
     Args:
-        scenario: as :func:`noack.load` gives it, or takes it.
-        runs: where its run directory is made; without it, in a temporary folder, and without the
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        runs: folder for the run directory. Without it, the run is in a temporary folder and has no
             recording for the viewer.
 
     Raises:
@@ -242,25 +246,25 @@ def simulate(scenario: Source, *, runs: Folder | None = None) -> Run:
         ending = simulate_run(loaded, folder, view=temporary is None)
         made = Run(ending.run_dir, lambda: finalize(ending, report=False), temporary)
     if temporary is None:
-        made.summary  # noqa: B018  # it belongs into the run directory
+        made.summary  # noqa: B018  # writes it into the run directory
     return made
 
 
 def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False) -> Run:
     """Run a scenario live: real processes over real UDP sockets on this machine.
 
-    It takes the scenario's ``horizon_s`` over its ``speed``, and a start of some seconds. A run
-    that is interrupted (Ctrl-C) ends in good order and is returned; ``ok`` is then false, as of a
-    run of which a process died.
+    It takes the scenario's ``horizon_s`` divided by its ``speed``, plus a start of some seconds. If
+    the run is interrupted (Ctrl-C), it is finalised and returned. ``ok`` is then false, as for a
+    run in which a process died.
 
     Args:
-        scenario: as :func:`noack.load` gives it, or takes it.
-        runs: where its run directory is made; without it, in a temporary folder.
+        scenario: a scenario, or a source that :func:`noack.load` accepts.
+        runs: folder for the run directory; without it, a temporary folder.
         progress: show a progress line on standard error.
 
     Raises:
-        NoackError: the scenario is wrong; the run could not begin, e.g. as a port is taken; or this
-            is not the main thread, which signals go to.
+        NoackError: the scenario is wrong; the run could not start, e.g. because a port is in use;
+            or the caller is not the main thread, which receives the signals.
     """
     from cosim.live.finalize import finalize
     from cosim.live.launcher import launch
@@ -280,14 +284,14 @@ def run(scenario: Source, *, runs: Folder | None = None, progress: bool = False)
 
 
 def open_run(directory: Folder = "runs/latest") -> Run:
-    """Open an earlier run, live or simulated; finish its record if nobody did.
+    """Open an earlier run, live or simulated; finalise an interrupted run first.
 
     Args:
-        directory: a run directory. ``runs/latest`` leads to the newest below ``runs``.
+        directory: a run directory. ``runs/latest`` is the newest one in ``runs``.
 
     Raises:
-        NoackError: it is no run directory, ``latest`` is another user's, its record is damaged, or
-            the run is still under way.
+        NoackError: it is not a run directory, ``latest`` belongs to another user, the record is
+            damaged, or the run is still active.
     """
     from cosim.live.finalize import reopen
 
@@ -299,29 +303,30 @@ def open_run(directory: Folder = "runs/latest") -> Run:
 
 
 def compare(*runs: Run | Folder) -> "RunComparison":
-    """Put two or more runs beside each other; :meth:`Run.fidelity` is against the ideal loop.
+    """Compare two or more runs; :meth:`Run.fidelity` compares a run with the ideal loop.
 
     Args:
         runs: two to seven, each as a :class:`Run` or a run directory, live or simulated.
 
     Returns:
-        The comparison: ``numbers`` side by side with their differences to the first run,
-        ``settings`` that differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
+        The comparison: ``numbers`` with their differences to the first run, ``settings`` that
+            differ, ``plot()`` for the overlay, ``save(path)``, ``to_json()``.
 
     Raises:
-        NoackError: they are too few or too many, or their plants have different numbers of states.
+        NoackError: there are fewer than two or more than seven runs, or their plants have different
+            numbers of states.
     """
     from cosim.studies.comparison.run_comparison import compare_runs
 
     for one in runs:
         if isinstance(one, Run):
-            one.summary  # noqa: B018  # a temporary run's is made when it is first asked for
+            one.summary  # noqa: B018  # a temporary run computes it at the first access
     return compare_runs([one.directory if isinstance(one, Run) else Path(one) for one in runs])
 
 
 @contextmanager
 def _folder(runs: Folder | None) -> Iterator[tuple[Path, Path | None]]:
-    """Where a run directory is made; the same again if it is temporary, gone if no run comes."""
+    """Yield the folder for a run directory, twice if it is temporary; after an error, remove it."""
     if runs is not None:
         yield Path(runs), None
         return

@@ -1,4 +1,4 @@
-"""Scenarios: of a file, of a table, of somebody's own matrices; and with other settings."""
+"""Scenarios from a file, a table or the user's own matrices, and with other settings."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from noack.config.state_space import matrices_of, model_of
 from noack.core.linear_systems import spectral_abscissa
 
 Source = Scenario | str | PathLike[str] | Mapping[str, Any]
-"""A scenario; or the name of a shipped one, a file, or a table of a scenario file's content."""
+"""A scenario; or the name of a shipped one, a file, or a table with a scenario file's content."""
 
 _BETA_SHARE = 0.1
 _ALPHA_SHARE = 0.5
@@ -29,9 +29,9 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
     """Load a scenario.
 
     Args:
-        source: the name of a shipped scenario (``"lane_following"``); or a scenario file, by its
-            path; or its content as a table, ``{"name": ..., "model": {...}, ...}``. Files that a
-            table names are looked for in the working directory. A scenario is taken as it is.
+        source: the name of a shipped scenario (``"lane_following"``); or the path of a scenario
+            file; or its content as a table, ``{"name": ..., "model": {...}, ...}``. Relative file
+            names in a table are relative to the working directory. A scenario is returned as it is.
         settings: values that replace the source's, as in :func:`with_settings`.
 
     Raises:
@@ -46,14 +46,14 @@ def load(source: Source, settings: Mapping[str, Any] | None = None) -> Scenario:
 
 
 def with_settings(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
-    """Return the scenario with other settings; the one given stays as it is.
+    """Return the scenario with other settings; the given scenario is not changed.
 
     Args:
         scenario: as loaded, or of a run.
         settings: values by the keys of a scenario file, with dots between their parts:
-            ``{"network.loss.probability": 0.8, "trigger.beta": 0.3}``. Arrays may be NumPy's. None
-            takes a key away, so that its default holds. What the keys mean, and their units, is in
-            ``docs/scenarios.md``.
+            ``{"network.loss.probability": 0.8, "trigger.beta": 0.3}``. NumPy arrays are accepted.
+            None restores the default of a key. ``docs/scenarios.md`` documents the keys and their
+            units.
 
     Raises:
         NoackError: one line per mistake, each with key, value and remedy.
@@ -73,24 +73,23 @@ def from_system(
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
 ) -> Scenario:
-    """Return a scenario around a linear model of one's own, with n states and m inputs.
+    """Return a scenario for the user's own linear model, with n states and m inputs.
 
-    Whatever ``settings`` do not say, it chooses: the trigger's α is half the decay rate of
-    Â + B̂K, its β a tenth of ‖x(0)‖ (0.1 if that is 0), the horizon the time in which e^(−αt) falls
-    to a hundredth, each to three digits; M − 1 is 4, and half of the updates are lost.
+    Without ``settings``, these values are chosen: the trigger's α is half the decay rate of Â +
+    B̂K; its β is a tenth of ‖x(0)‖ (0.1 if x(0) = 0); the horizon is the time in which e^(−αt)
+    falls to a hundredth. Each has three digits. M − 1 is 4, and half of the updates are lost.
 
     Args:
         system: the model ẋ = Âx + B̂u as a tuple (A, B) of matrices (n, n), per second, and (n, m);
             or ``control.StateSpace`` or ``scipy.signal.StateSpace``, in continuous time, whose
             output is the state.
-        gain: K of u = Kx, (m, n), with which the model is stable. ``control.lqr`` and
-            ``scipy.signal.place_poles`` give the K of u = −Kx.
+        gain: K of u = Kx, (m, n), which must stabilise the model. ``control.lqr`` and
+            ``scipy.signal.place_poles`` return the K of u = −Kx.
         initial_state: x(0), n entries.
-        plant: the true plant, as ``system``; by default it is the model, and then x_s never parts
-            from x.
+        plant: the true plant, as ``system``; by default it is the model, and x_s equals x.
         settings: as in :func:`with_settings`.
         name: of the scenario: letters, digits, _ and -.
-        state_names: n names, for plots; by default those of the ``system``, or x_1, x_2, ….
+        state_names: n names, for plots; by default the names in ``system``, or x_1, x_2, ….
         input_names: m names, likewise.
 
     Raises:
@@ -103,7 +102,7 @@ def from_system(
     start = _plain(initial_state)
     norm = (
         float(np.linalg.norm(start)) if _is_vector(start) else 0.0
-    )  # validation says what is wrong
+    )  # the validation reports the mistake
     content: dict[str, Any] = {
         "name": name,
         "horizon_s": _rounded(math.log(1 / _SETTLED) / alpha_per_s),
@@ -126,7 +125,7 @@ def from_system(
 
 
 def _completed(content: dict[str, Any], settings: Mapping[str, Any] | None, path: Path) -> Scenario:
-    """Put the settings in, validate, read the files that are named; ``path`` says where from."""
+    """Apply settings, validate, and read the named files, relative to ``path``."""
     for key, value in (settings or {}).items():
         if value is None:
             _take_away(content, key)
@@ -145,7 +144,7 @@ def _take_away(content: dict[str, Any], key: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A value as a TOML parser would give it: NumPy's arrays and numbers as lists and numbers."""
+    """Return a value as from a TOML parser: NumPy arrays and numbers become lists and numbers."""
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

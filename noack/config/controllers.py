@@ -1,4 +1,4 @@
-"""The controller of a scenario: of any kind."""
+"""The controller section of a scenario: one of the kinds in :mod:`noack.controllers`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""The disturbances of a scenario's plant: of any kind, and several at once."""
+"""The disturbances of a scenario's plant: any number, each of any kind."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -37,7 +37,7 @@ def require_disturbances(
         linear: whether the plant is linear.
 
     Raises:
-        ValueError: one does not; the message begins with the key.
+        ValueError: a disturbance does not fit; the message begins with the key.
     """
     for number, one in enumerate(disturbances):
         place = f"plant.disturbances.{number}"

@@ -1,6 +1,7 @@
-"""Matrices from a ``.mat`` file, read by SciPy in a process of its own.
+"""Matrices from a ``.mat`` file, read by SciPy in a separate process.
 
-SciPy's reader is compiled, and what is damaged in the right place crashes it: only this process.
+SciPy's reader is compiled code. A damaged file may crash it, and then only the separate process
+ends.
 """
 
 import io
@@ -26,10 +27,10 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
 
     Args:
         content: of the file.
-        most_entries: larger ones are left out, as is what is not of numbers.
+        most_entries: arrays with more entries are left out, as are arrays that are not numeric.
 
     Raises:
-        NotImplementedError: it is of MATLAB's v7.3.
+        NotImplementedError: the file has the format of MATLAB's v7.3.
         ValueError: it cannot be read.
     """
     command = python_command("-m", __name__, most_entries)
@@ -47,14 +48,14 @@ def matrices_as_npz(content: bytes, most_entries: int) -> bytes:
 
 
 def _main() -> int:
-    from scipy.io import loadmat, whosmat  # not in the processes that only ask
+    from scipy.io import loadmat, whosmat  # not imported by the parent process
 
     file, most_entries = io.BytesIO(sys.stdin.buffer.read()), int(sys.argv[1])
     warnings.simplefilter("ignore")
     try:
         names = [
             name
-            for name, shape, kind in whosmat(file)  # type: ignore[arg-type] # it takes files, too
+            for name, shape, kind in whosmat(file)  # type: ignore[arg-type] # accepts files, too
             if np.prod(shape, dtype=float) <= most_entries and kind in _OF_NUMBERS
         ]
         file.seek(0)

@@ -1,7 +1,8 @@
 """Matrices from files: NumPy's ``.npz``, and ``.mat`` up to MATLAB's v7.
 
-A system ẋ = A x + B u, with the gain K of u = K x if it has one. Of a state space that a file holds
-whole, C must be the identity, D zero and the time continuous: the loop measures x.
+A file has a system ẋ = A x + B u and, optionally, the gain K of u = K x. If a file has a complete
+state-space model, C must be the identity, D zero and the time continuous, because the loop measures
+x.
 """
 
 import io
@@ -22,23 +23,23 @@ GAIN = "gain"
 _GAINS = (GAIN, "K")
 _MOST_ENTRIES = MAX_DIMENSION**2
 _MOST_BYTES = 16 * _MOST_ENTRIES + 65_536
-"""Of an array within an archive, its header included."""
+"""Largest size of an array within an archive, including its header."""
 _NUMBERS = "fiub"
 
 
 def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapping[str, Any]:
-    """Return a scenario's content in which matrices stand in the place of files that have them.
+    """Return a scenario's content with the matrices of the files that it names.
 
-    ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` A and B.
-    What is no table, or otherwise no scenario, is returned as it is.
+    ``model.file`` gives A, B and, unless the scenario has one, the gain; ``plant.file`` gives A and
+    B. Invalid content is returned unchanged.
 
     Args:
         content: of a scenario file.
-        folder: where relative names begin.
+        folder: relative names are relative to it.
         source: names the content in error messages.
 
     Raises:
-        CallerError: one line; a file cannot be read, or has no such matrices.
+        CallerError: one line; a file cannot be read, or lacks a matrix.
     """
     read = dict(content)
     for table, keys in (("model", ("A", "B", GAIN)), ("plant", ("A", "B"))):
@@ -50,7 +51,7 @@ def with_matrices(content: Mapping[str, Any], folder: Path, source: str) -> Mapp
 
 
 def _can_be_read(section: Mapping[str, Any]) -> bool:
-    """Whether a file is named, as it should be; what is not is the validation's to refuse."""
+    """Whether a section names a file correctly; incorrect entries are refused by the validation."""
     names = section.get("names", {})
     return (
         isinstance(section.get("file"), str)
@@ -75,12 +76,12 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
     """Read A, B and, if there is one, the gain.
 
     Args:
-        file: of arrays A, B, and gain or K.
-        names: of the arrays, where they are others.
+        file: has the arrays A, B, and gain or K.
+        names: names of the arrays that differ from these.
 
     Raises:
-        CallerError: the file cannot be read, or has no such matrices; or C is not the identity, D
-            not zero, or dt not.
+        CallerError: the file cannot be read or lacks a matrix; or C is not the identity, D is not
+            zero, or the time is not continuous.
     """
     names = names or {}
     arrays = _arrays(file)
@@ -104,7 +105,7 @@ def read_matrices(file: NamedFile, names: Mapping[str, str] | None = None) -> di
 
 
 def unfit(C: Any, D: Any, dt: Any, n: int) -> str | None:
-    """Why the rest of a state space is not what the loop is about; None if nothing is wrong.
+    """Return why the loop cannot use a state-space model's C, D or dt; None if it can.
 
     Args:
         C: output matrix, or None.
@@ -136,7 +137,7 @@ def write_matrices(path: Path, matrices: Mapping[str, Matrix]) -> None:
     if path.suffix == NPZ:
         np.savez(path, allow_pickle=False, **matrices)
     elif path.suffix == MAT:
-        from scipy.io import savemat  # which takes time and memory, in every process
+        from scipy.io import savemat  # imported here: it takes time and memory
 
         savemat(path, dict(matrices))
     else:
@@ -156,12 +157,12 @@ def _arrays(file: NamedFile) -> dict[str, Any]:
         return _of_npz(content)
     except NotImplementedError:
         file.wrong("is of MATLAB's v7.3, which is HDF5; save it as v7: save(name, '-v7')")
-    except Exception:  # whatever the libraries meet in what is no such file
+    except Exception:  # an invalid file can raise any error
         file.wrong(f"is no {file.path.suffix} file, or a damaged one")
 
 
 def _of_npz(content: bytes) -> dict[str, Any]:
-    """The arrays that are not too large, by name."""
+    """Return the arrays that are not too large, by name."""
     found = {}
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for entry in archive.infolist():

@@ -1,4 +1,4 @@
-"""How many numbers the messages of a run carry."""
+"""The number of vector entries in each message of a run."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MessageSizes:
-    """Numbers per message of a scenario, by flow."""
+    """Number of vector entries per message of a scenario, by flow."""
 
     scenario: "Scenario"
 
@@ -22,9 +22,9 @@ class MessageSizes:
 
     @property
     def inputs_reported(self) -> int:
-        """Numbers of a measurement that are applied inputs: m per plant step since the last one.
+        """Number of applied inputs in a measurement: m per plant step since the last measurement.
 
-        An observer needs them; without an observer there are none.
+        An observer needs them; without an observer it is 0.
         """
         if self.scenario.observer is None:
             return 0
@@ -32,7 +32,7 @@ class MessageSizes:
 
     @property
     def measurement_entries(self) -> int:
-        """Numbers of a measurement: y, or y and the applied inputs since the last one."""
+        """Number of entries of a measurement: y, or y and the applied inputs since the last one."""
         return self.outputs + self.inputs_reported
 
     @property
@@ -42,12 +42,12 @@ class MessageSizes:
 
     @property
     def actuation_entries(self) -> int:
-        """Numbers of an actuation: u, or u and x_c."""
+        """Number of entries of an actuation: u, or u and x_c."""
         n, m = self.scenario.model.dimensions
         return n + m if self.is_predictive else m
 
     def entries(self, flow: Flow) -> int:
-        """Numbers of a message of a flow."""
+        """Number of entries of a message of a flow."""
         return {
             Flow.MEASUREMENT: self.measurement_entries,
             Flow.UPDATE: self.scenario.model.dimensions[0],

@@ -56,23 +56,25 @@ SINGLE_TRACK_LANE_DEFAULTS: Mapping[str, float] = {
     "front_n_per_rad": 129_697.0, "rear_n_per_rad": 105_400.0,
     "speed_m_per_s": 15.0, "look_ahead_m": 20.0, "gain": 0.5,
 }  # fmt: skip
-"""The BMW 320i of CommonRoad's vehicle models, its tyres under its weight at rest."""
+"""The BMW 320i of CommonRoad's vehicle models; its tyres carry its weight at rest."""
 
 
 def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
-    """A car beside its lane by the linear single-track model (Riekert and Schunck, 1940).
+    """A car on a lane, as the linear single-track model (Riekert and Schunck, 1940).
 
-    Of mass m, moment of inertia I about the vertical, axles a and b in front of and behind the
-    centre of gravity with cornering stiffnesses c_f and c_r, at speed v with steering angle δ:
+    The car has mass m and moment of inertia I about the vertical axis. Its axles are at distances a
+    and b in front of and behind the centre of gravity, with cornering stiffnesses c_f and c_r. At
+    speed v and steering angle δ:
 
         m (v̇_y + v r) = F_f + F_r,  I ṙ = a F_f − b F_r,
         F_f = c_f (δ − (v_y + a r)/v),  F_r = −c_r (v_y − b r)/v.
 
-    States as of :func:`lane_following`, whose lateral axis points the other way: V = −v_y, yaw rate
-    r, yaw ψ, lateral position Y_g with Ẏ_g = V − v ψ. Input: δ = gain · (Y_g/look_ahead − ψ).
+    The states are those of :func:`lane_following`, with its lateral axis, which has the opposite
+    direction: V = −v_y, yaw rate r, yaw ψ, lateral position Y_g with Ẏ_g = V − v ψ. Input: δ = gain
+    · (Y_g/look_ahead − ψ).
 
     Raises:
-        ValueError: a parameter that is divided by is 0.
+        ValueError: a parameter that is a divisor is 0.
     """
     p = {**SINGLE_TRACK_LANE_DEFAULTS, **parameters}
     for name in ("mass_kg", "inertia_kg_m2", "speed_m_per_s", "look_ahead_m"):
@@ -95,7 +97,7 @@ def single_track_lane(parameters: Mapping[str, float]) -> NamedModel:
 
 
 def double_integrator(parameters: Mapping[str, float]) -> NamedModel:
-    """A unit mass pushed by a force: ``ẍ = u``, with ``u = −stiffness·x − damping·ẋ``."""
+    """A unit mass driven by a force: ``ẍ = u``, with ``u = −stiffness·x − damping·ẋ``."""
     p = {"stiffness": 1.0, "damping": 1.5, **parameters}
     return NamedModel(
         np.array([[0.0, 1.0], [0.0, 0.0]]),

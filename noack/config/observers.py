@@ -1,4 +1,4 @@
-"""The observer of a scenario: of any kind."""
+"""The observer section of a scenario: one of the kinds in :mod:`noack.observers`."""
 
 from typing import TYPE_CHECKING
 

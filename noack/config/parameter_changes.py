@@ -1,9 +1,10 @@
-"""Changes of a run's settings while it goes on, and what a machine knows of them.
+"""Changes of a run's settings during the run, and the changes that a machine has received.
 
-A change is announced before it is in force, with the simulated time T from which on it is. Each
-machine takes the announcement as an input, and applies the change at its own time, the first that
-is not before T. So what happens does not depend on when exactly it heard of it. One that hears of
-it after its own time has passed T applies it late, and says so.
+A change is announced before it takes effect, together with the simulated time T at which it takes
+effect. Each machine takes the announcement as an input, and applies the change at its own first
+time at or after T. So the result does not depend on when exactly the announcement arrived. If it
+arrives after the machine's own time has passed T, the machine applies the change late and logs a
+notice.
 """
 
 import json
@@ -29,26 +30,26 @@ LATE = "violation"
 
 
 class ParameterChange(NamedTuple):
-    """Settings that are in force from a time on."""
+    """Settings that take effect at a time."""
 
     number: int
-    """Of the run's changes, as they were announced."""
+    """Number of the change, in the order in which the run's changes were announced."""
     t_ns: int
-    """T."""
+    """T, the time from which the settings are in force."""
     settings: Mapping[str, Any]
     """Values by keys of the scenario."""
 
     @property
     def data(self) -> bytes:
-        """The settings as they stand in the record."""
+        """The settings as stored in the record."""
         return settings_bytes(self.settings)
 
 
 def settings_bytes(settings: Mapping[str, Any]) -> bytes:
-    """Settings as JSON, filled up with zeros to the width that the record has for them.
+    """Return settings as JSON, padded with zeros to the width of the record's column.
 
     Raises:
-        CallerError: they do not fit.
+        CallerError: they are too long for the column.
     """
     data = json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()
     if len(data) > CHANGE_BYTES:
@@ -59,10 +60,10 @@ def settings_bytes(settings: Mapping[str, Any]) -> bytes:
 
 
 def settings_of(data: bytes) -> dict[str, Any]:
-    """Read settings back from the record.
+    """Read settings from the record.
 
     Raises:
-        ValueError: these are none.
+        ValueError: the data are not settings.
     """
     found = json.loads(data.rstrip(b"\0"))
     if not isinstance(found, dict):
@@ -90,7 +91,7 @@ def changed(scenario: Scenario, settings: Mapping[str, Any]) -> Scenario:
 
 
 def current_parameters(scenario: Scenario) -> dict[str, Any]:
-    """What can be changed during a run, and its values."""
+    """Return the parameters that can be changed during a run, with their values."""
     trigger = scenario.trigger
     loss = scenario.network.loss.model_dump(mode="json", exclude_none=True)
     values = {
@@ -102,7 +103,7 @@ def current_parameters(scenario: Scenario) -> dict[str, Any]:
 
 
 def scheduled(scenario: Scenario) -> list[ParameterChange]:
-    """The changes that a scenario has written down."""
+    """Return the changes that a scenario schedules."""
     return [
         ParameterChange(number, one.at_ns, dict(one.set))
         for number, one in enumerate(scenario.changes)
@@ -114,7 +115,7 @@ CHANGED = "change"
 
 
 def said_of(change: ParameterChange, more: str = "") -> Notice:
-    """The line of the run's log that tells of a change."""
+    """Return the notice of a change for the run's log."""
     text = f"{text_of(change.settings)} from {change.t_ns / NS_PER_S:.3f} s on{more}"
     return Notice(change.t_ns, CHANGED, text)
 
@@ -123,19 +124,19 @@ class ReconfigurableMachine(Machine[T], Protocol[T]):
     """A machine whose settings may change during a run."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Take a change that is in force from its time on; answers with one row.
+        """Process the announcement of a change; return one row and its notices.
 
         Raises:
-            CallerError: with it, the scenario would not be a valid one; nothing is changed.
+            CallerError: the scenario with this change would be invalid; nothing is changed.
         """
         ...
 
 
 class FixedMachine:
-    """Part of machines whose settings stay as they are: those of the acknowledgement baseline."""
+    """Base of machines with constant settings: those of the acknowledgement baseline."""
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Refuse a change.
+        """Refuse the announcement of a change.
 
         Raises:
             CallerError: always.
@@ -144,23 +145,23 @@ class FixedMachine:
 
 
 class AppliedParameters(NamedTuple):
-    """A scenario, and since when it is in force in a machine's own time."""
+    """A scenario, and the machine's own time from which it is in force."""
 
     since_ns: int
     number: int
-    """Of the change; −1 for the run's own scenario."""
+    """Number of the change; −1 for the run's initial scenario."""
     settings: Mapping[str, Any]
     scenario: Scenario
     prepared: Any
-    """What the machine made of the scenario when it was told."""
+    """Data that the machine computed from the scenario when the change was announced."""
 
 
 class ChangeSchedule:
-    """The scenarios of a run, one after the other, as a machine has been told.
+    """The scenarios of a run in the order of time, as announced to a machine.
 
     Args:
-        scenario: the resolved scenario that the run begins with.
-        prepare: makes what the machine will need of a scenario, before it is in force.
+        scenario: the resolved scenario at the start of the run.
+        prepare: computes the data that the machine needs of a scenario, before it is in force.
     """
 
     def __init__(
@@ -170,22 +171,23 @@ class ChangeSchedule:
         self._all = [AppliedParameters(-(2**63), -1, {}, scenario, None)]
         self._taken = 1
         self.next_ns: int | None = None
-        """From when on the next one is in force that has not been taken; None if none is known."""
+        """Time at which the next scenario that is not yet applied takes effect; None if there is
+        none."""
 
     def announce(
         self, table: str, change: ParameterChange, number: int, now_ns: int, reached_ns: int
     ) -> list[Record | Notice]:
-        """Take a change; return its row, and what is to be said of it.
+        """Schedule a change; return its row, and a notice if it is late.
 
         Args:
-            table: of the machine, for its changes.
+            table: the machine's table of changes.
             change: the change.
             number: of the machine's input.
-            now_ns: when it is told.
-            reached_ns: how far the machine's own time has come, with the settings before.
+            now_ns: time of the announcement.
+            reached_ns: the machine's own time up to which it has used the previous settings.
 
         Raises:
-            CallerError: with it, the scenario would not be a valid one; nothing is changed.
+            CallerError: the scenario with this change would be invalid; nothing is changed.
         """
         since_ns = max(change.t_ns, reached_ns + 1)
         entry = AppliedParameters(
@@ -211,7 +213,7 @@ class ChangeSchedule:
         return outputs
 
     def take(self, t_ns: int) -> AppliedParameters | None:
-        """The next scenario that is in force at a time and has not been taken; None if none is."""
+        """Return the next scenario that is due at a time and not yet applied, or None."""
         if self.next_ns is None or self.next_ns > t_ns:
             return None
         found = self._all[self._taken]
@@ -221,11 +223,11 @@ class ChangeSchedule:
 
     @property
     def last(self) -> Scenario:
-        """The scenario with all changes that are known."""
+        """The scenario with all announced changes."""
         return self._all[-1].scenario
 
     def between(self, first_ns: int, last_ns: int) -> Iterator[Scenario]:
-        """The scenarios that are in force at any time from one to another."""
+        """Return the scenarios that are in force at any time within an interval."""
         for place, one in enumerate(self._all):
             ended = place + 1 < len(self._all) and self._all[place + 1].since_ns <= first_ns
             if one.since_ns <= last_ns and not ended:

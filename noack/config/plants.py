@@ -1,4 +1,4 @@
-"""The plant of a scenario: of any kind."""
+"""The plant system of a scenario: one of the kinds in :mod:`noack.plants`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
-"""From a scenario to a run: named models become matrices, drawn quantities become numbers.
+"""From a scenario to a run: named models become matrices, random draws become numbers.
 
-The resolved scenario is a scenario again; running it repeats the run's draws exactly.
+The result is again a scenario: the resolved scenario. Running it repeats the run's draws exactly.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,8 @@ from noack.trigger.policy_settings import ModelMatrices
 from noack.trigger.trigger_policy import Policy
 
 _SURELY_FINITE = 600.0
-"""‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is still a number; beyond, the exponential itself must tell."""
+"""‖e^{At}‖ ≤ e^{‖A‖t}, and e^700 is finite; above this limit, the exponential itself is
+computed."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,12 @@ class LoopMatrices:
     K: Matrix
     """Gain, (m, n)."""
     H: Matrix
-    """What both models integrate between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
+    """The matrix that both models integrate between updates, (n, n): Â + B̂K, or 0 in
+    zero-order-hold mode."""
     A: Matrix
-    """True plant, (n, n); Â where the plant is not linear."""
+    """True plant, (n, n); Â if the plant is not linear."""
     B: Matrix
-    """True plant, (n, m); B̂ where the plant is not linear."""
+    """True plant, (n, m); B̂ if the plant is not linear."""
     x0: Vector
     """x(0), (n,)."""
     weight: Matrix | None
@@ -65,12 +67,12 @@ class LoopMatrices:
 
 
 def resolve(scenario: Scenario) -> Scenario:
-    """Return the scenario with every named or drawn quantity made explicit.
+    """Return the scenario with matrices and numbers in place of names and random draws.
 
     Raises:
-        CallerError: the numbers are so large that one step of the plant or model is not finite; no
-            observer can see in the measured outputs what it would have to; or what the plant's
-            system needs is not installed.
+        CallerError: the numbers are so large that one step of the plant or model is not finite; an
+            observer is set, but an unstable mode is unobservable in the measurement; or a module
+            that the plant needs is not installed.
     """
     scenario.plant.system.require_installed()
     model = _explicit_model(scenario.model)
@@ -136,7 +138,7 @@ def policy_of(resolved: Scenario) -> Policy:
 
 
 def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
-    """The set-point x_r, (n,), of a resolved scenario, and u_r, (m,); None if it is 0."""
+    """Return the set point x_r, (n,), of a resolved scenario, and u_r, (m,); None if it is 0."""
     given = resolved.controller.setpoint
     if not any(given or ()):
         return None
@@ -145,7 +147,7 @@ def setpoint_of(resolved: Scenario) -> tuple[Vector, Vector] | None:
 
 
 def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
-    """The row types of the tables that runs of a resolved scenario have."""
+    """Return the row types of the tables in runs of a resolved scenario."""
     n, m = resolved.model.dimensions
     acknowledged, predictive = resolved.protocol.acknowledges, resolved.message_sizes.is_predictive
     internal = len(resolved.plant.system.internal_names)
@@ -159,7 +161,7 @@ def tables_of(resolved: Scenario) -> Mapping[str, np.dtype[np.void]]:
 
 
 def _observer(scenario: Scenario, model: ModelSection) -> AnyObserver | None:
-    """The observer with its gain; refused if the measurement does not show an unstable mode."""
+    """Return the observer with its gain; refuse it if an unstable mode is unobservable."""
     observer = scenario.observer
     if observer is None:
         return None
@@ -189,7 +191,7 @@ def _require_finite(key: str, A: Matrix, B: Matrix, step_ns: int) -> None:
             return
         try:
             finite = all(np.isfinite(block).all() for block in discretise(A, B, step_ns))
-        except ValueError:  # scipy's word for an exponential of infinite entries
+        except ValueError:  # scipy raises it for infinite entries
             finite = False
     if not finite:
         sizes = ", ".join(f"{name} to {np.abs(M).max():.3g}" for name, M in (("A", A), ("B", B)))
@@ -220,12 +222,13 @@ def _explicit_model(model: ModelSection) -> ModelSection:
 
 
 def _perturbation(
-    rng: np.random.Generator,
+    rng: "np.random.Generator",
     draw: Literal["uniform", "vertex"],
     halfwidth: tuple[tuple[float, ...], ...] | None,
     shape: tuple[int, int],
 ) -> Matrix:
-    # Drawn for every entry, so that widening one entry's interval leaves the other draws alone.
+    # One draw per entry of the matrix: a change of one entry's interval leaves the other draws
+    # unchanged.
     unit = rng.uniform(-1.0, 1.0, shape)
     if draw == "vertex":
         unit = np.where(unit < 0, -1.0, 1.0)

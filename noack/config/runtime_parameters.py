@@ -1,7 +1,7 @@
-"""What can be changed while a run goes on: keys of the scenario, and short names for them.
+"""The runtime parameters: keys of the scenario that can be changed during a run, and short names.
 
 A change is a table of keys and values. It is applied to the whole scenario, which is then validated
-as one that was read from a file; so nothing can be set that could not be started with.
+like a scenario file. So a change can only set values that a run could also start with.
 """
 
 import json
@@ -33,7 +33,7 @@ def full_key(name: str) -> str:
 
 
 def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
-    """The keys of a trigger's numbers: policy and norm stay what they are."""
+    """Return the keys of a trigger's numbers; its policy and norm cannot change."""
     return tuple(
         f"trigger.{name}"
         for name, field in type(trigger).model_fields.items()
@@ -42,14 +42,14 @@ def trigger_parameters(trigger: PolicySettings) -> tuple[str, ...]:
 
 
 def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySettings) -> None:
-    """Check that all keys are such as can be changed during a run.
+    """Check that all keys are runtime parameters.
 
     Args:
         settings: values by keys.
         trigger: the run's.
 
     Raises:
-        ValueError: one is not; the message says which are.
+        ValueError: a key is not; the message lists the runtime parameters.
     """
     known = (LOSS, MANSD, *trigger_parameters(trigger), SETPOINT)
     for key, value in settings.items():
@@ -64,11 +64,11 @@ def require_runtime_parameters(settings: Mapping[str, Any], trigger: PolicySetti
 
 
 def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
-    """Put settings into the content of a scenario; another loss model begins without keys.
+    """Write settings into the content of a scenario; a new loss model replaces all its keys.
 
     Args:
         content: of a scenario, as from JSON; changed in place.
-        settings: values by keys that :func:`require_runtime_parameters` has let pass.
+        settings: values by keys, as checked by :func:`require_runtime_parameters`.
     """
     model = f"{LOSS}.model"
     if model in settings and settings[model] != content["network"]["loss"].get("model"):
@@ -86,12 +86,12 @@ def put_settings(content: dict[str, Any], settings: Mapping[str, Any]) -> None:
 
 
 def is_of_loss_alone(settings: Mapping[str, Any]) -> bool:
-    """Whether a change touches nothing that is claimed of a run: what is lost below the cap."""
+    """Whether a change concerns the loss model only, on which no claim about the run depends."""
     return all(key == LOSS or key.startswith(f"{LOSS}.") for key in settings)
 
 
 def text_of(settings: Mapping[str, Any]) -> str:
-    """In words: ``network.mansd = 2, trigger.beta = 0.3``."""
+    """Return settings as text: ``network.mansd = 2, trigger.beta = 0.3``."""
     return ", ".join(f"{key} = {_value(value)}" for key, value in sorted(settings.items()))
 
 

@@ -1,8 +1,7 @@
 """The scenario: everything that defines a run, validated into frozen objects.
 
 A scenario file is TOML; every key is documented here and in the exported JSON Schema. Unknown keys
-are errors. :mod:`noack.config.resolution` turns a scenario into one in which nothing is left to
-chance.
+are errors. :mod:`noack.config.resolution` replaces names and random draws by numbers.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -35,7 +34,7 @@ from noack.settings.section import ScenarioSection
 from noack.trigger.decaying import DecayingSettings
 
 MOST_CHANGES = 256
-"""In a run."""
+"""Largest number of scheduled changes in a run."""
 
 
 class Scenario(ScenarioSection):
@@ -59,20 +58,20 @@ class Scenario(ScenarioSection):
     trigger: AnyTrigger
     """When the sensor transmits."""
     observer: AnyObserver | None = None
-    """How the sensor estimates the state from what is measured: a table with ``kind``; unless
-    given, what is measured is the state."""
+    """How the sensor estimates the state from the measurements: a table with ``kind``. Without it,
+    the measurement must be the state."""
     network: NetworkSection
     controller: AnyController = LinearFeedbackSettings()
     certificate: CertificateSection = CertificateSection()
     recovery: RecoverySection = RecoverySection()
     changes: Annotated[tuple[ScheduledChange, ...], Field(max_length=MOST_CHANGES)] = ()
-    """What changes while the run goes on, in the order of time."""
+    """Changes of settings during the run, in the order of time."""
     seeds: SeedsSection = SeedsSection()
     ports: PortsSection = PortsSection()
     realtime: RealtimeSection = RealtimeSection()
 
     def __str__(self) -> str:
-        """What matters, in a few lines."""
+        """The most important settings, in a few lines."""
         n, m = self.model.dimensions
         lines = {
             "scenario": self.name + (f": {self.description}" if self.description else ""),
@@ -85,7 +84,7 @@ class Scenario(ScenarioSection):
         return "\n".join(f"{name:<10} {text}" for name, text in lines.items())
 
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
-        """Show it so in IPython and notebooks."""
+        """Show the same text in IPython and notebooks."""
         printer.text(str(self))
 
     @property
@@ -95,20 +94,20 @@ class Scenario(ScenarioSection):
 
     @property
     def message_sizes(self) -> MessageSizes:
-        """How many numbers its messages carry."""
+        """The number of vector entries in its messages."""
         return MessageSizes(self)
 
     @property
     def coverage(self) -> TheoryCoverage:
-        """What the theory covers of it."""
+        """The parts of the theory that apply to it."""
         return TheoryCoverage(self)
 
     @property
     def decaying(self) -> DecayingSettings:
-        """The trigger, if it is the paper's.
+        """Return the trigger, if it is the paper's.
 
         Raises:
-            CallerError: it is another.
+            CallerError: it is another policy.
         """
         if not isinstance(self.trigger, DecayingSettings):
             raise CallerError(
@@ -119,7 +118,7 @@ class Scenario(ScenarioSection):
 
     @property
     def protocol(self) -> LoopProtocol:
-        """What depends on whether updates are acknowledged."""
+        """The settings that depend on whether updates are acknowledged."""
         return PROTOCOLS[self.network.protocol]
 
     @model_validator(mode="after")
@@ -130,7 +129,7 @@ class Scenario(ScenarioSection):
 
 
 def _said(section: ScenarioSection, kind: str) -> str:
-    """What a section is, and its values that are not the defaults."""
+    """Describe a section by its kind, and its values that differ from the defaults."""
     given = section.model_dump(mode="json", exclude_defaults=True, exclude={kind})
     values = (
         f"{key} = {'…' if isinstance(value, dict | list) else value}"

@@ -1,4 +1,4 @@
-"""A scenario with other values of the settings that may change during a run."""
+"""A scenario with other values of its runtime parameters."""
 
 import json
 from collections.abc import Mapping
@@ -85,7 +85,7 @@ def check_changes(scenario: "Scenario") -> None:
     """Check the changes that a scenario schedules: their order, times and settings.
 
     Raises:
-        ValueError: one is not possible.
+        ValueError: a change is not possible.
     """
     for (place, one), (_, other) in pairwise(enumerate(scenario.changes)):
         if other.at_s < one.at_s:
@@ -105,7 +105,7 @@ def check_changes(scenario: "Scenario") -> None:
 def _changed_network(
     scenario: "Scenario", content: Mapping[str, Any], changes_loss: bool
 ) -> NetworkSection:
-    """The network with another cap or loss model; nothing else of it may change."""
+    """Return the network with another cap or loss model; its other settings cannot change."""
     update: dict[str, Any] = {}
     if "mansd" in content:
         update["mansd"] = _validated(MANSD, content["mansd"])

@@ -18,7 +18,7 @@ def check_sections(scenario: "Scenario") -> None:
     """Check the sections of a scenario against each other.
 
     Raises:
-        ValueError: two do not fit together; the message begins with the key.
+        ValueError: two sections do not fit together; the message begins with the key.
     """
     timing = scenario.timing
     if timing.horizon_ns < timing.plant_period_ns:
@@ -45,7 +45,7 @@ def check_trigger(scenario: "Scenario") -> None:
 
 
 def check_setpoint(scenario: "Scenario") -> None:
-    """Check that an input exists that holds the model at the set point.
+    """Check that an input exists at which the model rests at the set point.
 
     Raises:
         ValueError: there is none, or another setting excludes a set point.

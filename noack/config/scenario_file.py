@@ -1,4 +1,4 @@
-"""Scenario files: TOML in, frozen scenario out, and one clear line for every mistake."""
+"""Scenario files: a TOML file is read into a frozen scenario, with one line per mistake."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,11 +17,11 @@ from noack.settings.user_files import file_tables, located, with_tables
 
 _ENTRY = r"""[-+\w.]+|"[^"\\\n]*\""""
 _ROW = re.compile(rf"\[\n((?:\s*(?:{_ENTRY}),\n)+)\s*\]")
-"""Numbers or names in a row, which the TOML writer puts on a line each."""
+"""Rows of numbers or names; the TOML writer puts each entry on its own line."""
 
 
 MOST_RECORDED_BYTES = 2**28
-"""Of the scenario file that a run writes, in which losses and delays of files are numbers."""
+"""Largest size of a run's scenario file, which includes the losses and delays read from files."""
 
 
 def load(
@@ -32,7 +32,7 @@ def load(
     Args:
         path: the TOML file.
         overrides: ``key=value`` settings that replace the file's, e.g. ``trigger.beta=0.3``.
-        most_bytes: that the file may have.
+        most_bytes: largest size of the file.
 
     Raises:
         CallerError: one line per mistake, each with file (or ``--set``), key, value and remedy.
@@ -50,8 +50,8 @@ def completed(content: Mapping[str, Any], path: Path, source: str | None = None)
 
     Args:
         content: of a scenario file.
-        path: of the scenario file; the files that it names lie beside it.
-        source: names the content in error messages; the path unless given.
+        path: of the scenario file; relative names in the content are relative to its folder.
+        source: names the content in error messages; by default the path.
 
     Raises:
         CallerError: one line per mistake.
@@ -71,7 +71,7 @@ def validate(content: Mapping[str, Any], source: str) -> Scenario:
 
 
 def _with_files(scenario: Scenario, path: Path, source: str) -> Scenario:
-    """Replace the names of files by what they say; relative ones lie beside the scenario."""
+    """Replace file names by the files' content; they are relative to the scenario file."""
     network, place = scenario.network, f"{source}: network"
     update: dict[str, Any] = _read(network, path.parent, place)
     if (back := network.acknowledgements) is not None:
@@ -107,12 +107,12 @@ def json_schema() -> dict[str, Any]:
 
 
 def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
-    """Name ``--set`` where a key that was set is wrong, or the file would be right without it.
+    """Name ``--set`` if a key that was set is wrong, or if the file without it is valid.
 
     Args:
         lines: mistakes of a file with settings.
         path: of the file.
-        keys: that were set.
+        keys: the keys that were set.
     """
     try:
         completed(toml_file.read(path), path)
@@ -137,7 +137,7 @@ def _attributed(lines: str, path: Path, keys: Sequence[str]) -> str:
 
 
 def _shared(one: Sequence[str], other: Sequence[str]) -> int:
-    """How many parts two keys begin with alike."""
+    """Return the number of equal parts at the beginning of two keys."""
     return sum(
         1 for _ in takewhile(lambda parts: parts[0] == parts[1], zip(one, other, strict=False))
     )
@@ -154,10 +154,10 @@ def _apply(content: dict[str, Any], override: str) -> str:
 
 
 def value_of(text: str, source: str) -> Any:
-    """Return the value that a text on the command line stands for; a bare word is a string.
+    """Return the value of a text on the command line; a bare word is a string.
 
     Raises:
-        CallerError: it is none of TOML; ``source`` names it.
+        CallerError: the text is not a TOML value; ``source`` names it.
     """
     try:
         return toml_file.parsed(f"value = {text}", source)["value"]
@@ -168,7 +168,7 @@ def value_of(text: str, source: str) -> Any:
 
 
 def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
-    """Put a value in the place of a key, whose parts dots divide; tables are made as needed.
+    """Set the value of a key, whose parts are separated by dots; missing tables are created.
 
     Args:
         content: of a scenario file, changed in place.
@@ -177,7 +177,7 @@ def put(content: dict[str, Any], key: str, value: Any, source: str) -> None:
         source: names the setting in error messages.
 
     Raises:
-        CallerError: part of the key is a value, not a table; or it has too many parts.
+        CallerError: a part of the key is a value, not a table; or the key has too many parts.
     """
     table = content
     *path, last = key.split(".")

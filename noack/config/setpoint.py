@@ -1,8 +1,8 @@
-"""Set-points: states other than 0 at which a loop is to rest.
+"""Set points: states other than 0 at which a loop is to rest.
 
-In deviations from an equilibrium of the model, Âx_r + B̂u_r = 0, nothing is new: with
-u = K(x_c − x_r) + u_r both models follow dx/dt = H(x − x_r), and all that is said of x, x_s and x_c
-is said of x − x_r, x_s − x_r and x_c − x_r.
+A set point is an equilibrium of the model, Âx_r + B̂u_r = 0. With u = K(x_c − x_r) + u_r both
+models follow dx/dt = H(x − x_r). All statements about x, x_s and x_c then hold for x − x_r, x_s −
+x_r and x_c − x_r.
 """
 
 import numpy as np
@@ -10,14 +10,14 @@ import numpy as np
 from noack.core.linear_systems import Matrix, Vector
 
 _ROUNDING = 1e-9
-"""Of the larger term: what Âx_r + B̂u_r may differ from 0 by."""
+"""Largest Âx_r + B̂u_r that is taken as 0, relative to the larger term."""
 
 
 def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
-    """Return u_r, (m,), with which a model rests at x_r, (n,): the least that does.
+    """Return u_r, (m,), with which a model rests at x_r, (n,): the solution of smallest norm.
 
     Raises:
-        ValueError: it cannot rest there; the message says where it could.
+        ValueError: it cannot rest there; the message names possible states.
     """
     drift = A @ x_r
     u_r = np.asarray(np.linalg.lstsq(B, -drift, rcond=None)[0], dtype=np.float64)
@@ -37,7 +37,7 @@ def input_at(A: Matrix, B: Matrix, x_r: Vector) -> Vector:
 
 
 def _equilibria(A: Matrix, B: Matrix) -> Matrix:
-    """An orthonormal basis of all x with Âx in the range of B̂, (n, k)."""
+    """Return an orthonormal basis of all x with Âx in the range of B̂, (n, k)."""
     blocked = A - B @ (np.linalg.pinv(B) @ A)
     _, sizes, directions = np.linalg.svd(blocked)
     scale = max(float(np.abs(A).max()), np.finfo(float).tiny)

@@ -1,4 +1,4 @@
-"""The estimation error of a resolved scenario: models with and without the observer's assumptions.
+"""The estimation error of a resolved scenario: true noise covariances, and the observer's own.
 
 The model and the observers are in :mod:`noack.observers`.
 """
@@ -19,11 +19,11 @@ class SteadyState(NamedTuple):
     gain: Matrix
     """The observer's gain, (n, p)."""
     radius: float
-    """Spectral radius of (I − L C)Â^(T), by which the error shrinks per measurement; infinite if no
-    steady state is found."""
+    """Spectral radius of (I − L C)Â^(T), the factor by which the error shrinks per measurement;
+    infinite if no steady state is found."""
     covariance: Matrix
-    """Of x̂ − x right after a measurement, (n, n), caused by random disturbances and noise alone;
-    infinite if the error does not decay."""
+    """Covariance of x̂ − x right after a measurement, (n, n), caused by random disturbances and
+    noise only; infinite if the error does not decay."""
 
 
 def true_model(resolved: Scenario) -> EstimationModel:
@@ -51,10 +51,11 @@ def assumed_model(resolved: Scenario) -> EstimationModel:
 def steady_state(resolved: Scenario) -> SteadyState:
     """Return the steady state of the estimation error of a resolved scenario.
 
-    The covariance P solves P = F P Fᵀ + (I − LC) Q (I − LC)ᵀ + L R Lᵀ with F = (I − LC)Â^(T), where
-    Q and R are the scenario's own, whatever the observer assumes. Without an observer x̂ = y, L = I.
+    The covariance P solves P = F P Fᵀ + (I − LC) Q (I − LC)ᵀ + L R Lᵀ with F = (I − LC)Â^(T). Q and
+    R are the scenario's own, even if the observer assumes others. Without an observer x̂ = y, L =
+    I.
     """
-    # A large import for a sensor.
+    # Imported here: a sensor without an observer does not need this large module.
     from scipy.linalg import solve_discrete_lyapunov
 
     true, observer = true_model(resolved), resolved.observer

@@ -1,9 +1,9 @@
-"""Models from state-space objects of python-control and SciPy, and files of them.
+"""Models from state-space objects of python-control and SciPy, and files with such models.
 
-An object has the matrices A, B, C and D and, in discrete time, dt: ``control.StateSpace``,
-``scipy.signal.StateSpace``, or a tuple (A, B, C, D) or (A, B). The loop is in continuous time and
-measures the state, so that C must be the identity and D zero. Its input is u = K x: the gain that
-``control.lqr`` and ``scipy.signal.place_poles`` give is that of u = -K x.
+An object has the matrices A, B, C and D and, in discrete time, dt. It is a ``control.StateSpace``,
+a ``scipy.signal.StateSpace``, or a tuple (A, B, C, D) or (A, B). The loop is in continuous time and
+measures the state, so C must be the identity and D zero. The loop's input is u = K x, but
+``control.lqr`` and ``scipy.signal.place_poles`` return the gain of u = -K x.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ def model_of(
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
 ) -> ModelSection:
-    """Return the model of a loop, to be put into a scenario.
+    """Return the model section of a scenario.
 
     Args:
         system: A, (n, n) per second, and B, (n, m), as above.
         gain: K of u = K x, (m, n).
-        state_names: for plots; by default those of a python-control object that has its own.
+        state_names: for plots; by default the names in a python-control object, if it has any.
         input_names: likewise.
 
     Raises:
-        CallerError: the object is no such system; the shapes do not fit; or u = K x does not
+        CallerError: the object is not such a system; the shapes do not fit; or u = K x does not
             stabilise it.
     """
     states = state_names or _labels(system, "state_labels")
@@ -61,7 +61,7 @@ def save_model(path: str | Path, system: Any, gain: Any = None) -> None:
     Args:
         path: ends in ``.npz`` or ``.mat``.
         system: as in :func:`model_of`.
-        gain: K of u = K x, (m, n); without it the scenario has to give it.
+        gain: K of u = K x, (m, n); without it, the scenario must give the gain.
 
     Raises:
         CallerError: as in :func:`model_of`; or the file cannot be written.
@@ -128,6 +128,6 @@ def _rows(matrix: Matrix) -> tuple[tuple[float, ...], ...]:
 
 
 def _labels(system: Any, key: str) -> Sequence[str] | None:
-    """Names that somebody has given, and not those that python-control numbers by itself."""
+    """Return the names that the user chose; None for the default names of python-control."""
     labels = getattr(system, key, None)
     return None if not labels or any("[" in label for label in labels) else labels

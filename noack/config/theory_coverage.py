@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TheoryCoverage:
-    """What the paper's theorems, the certificates and the exact simulation cover of a scenario."""
+    """Which of the paper's theorems, the certificates and the exact simulation cover a scenario."""
 
     scenario: "Scenario"
 
@@ -74,7 +74,7 @@ class TheoryCoverage:
         """Check that the settings stay the same and the set point is 0.
 
         Raises:
-            CallerError: one of these is not so.
+            CallerError: the settings change, or the set point is not 0.
         """
         if self.scenario.changes:
             raise CallerError(
@@ -100,7 +100,7 @@ class TheoryCoverage:
         """Check that exact simulation covers the plant, controller, measurement and trigger.
 
         Raises:
-            CallerError: one of these is not so.
+            CallerError: it does not cover one of these.
         """
         self.require_linear()
         scenario = self.scenario

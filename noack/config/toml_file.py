@@ -1,4 +1,4 @@
-"""Settings files: TOML in, a frozen model out, and one clear line for every mistake."""
+"""Settings files: a TOML file is read into a frozen model, with one line per mistake."""
 
 import json
 import re
@@ -18,9 +18,9 @@ from noack.core.regular_file import read_regular
 M = TypeVar("M", bound=BaseModel)
 
 MOST_BYTES = 2**20
-"""Of a settings file."""
+"""Largest size of a settings file."""
 MOST_LEVELS = 32
-"""Parts of a key with dots; and tables and lists that lie one within the other."""
+"""Largest number of parts of a dotted key, and of nested tables and lists."""
 
 _STRING = re.compile(
     r"""
@@ -32,7 +32,7 @@ _STRING = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
-"""Strings and comments of TOML; one that does not end where it must ends where it could have."""
+"""Strings and comments of TOML; an unterminated one ends at the last possible place."""
 _TOO_DEEP = f"tables and lists lie within each other more than {MOST_LEVELS} levels deep"
 _TOO_LARGE = "an integer is too large"
 _MOST_LOOKED_AT = 100
@@ -46,11 +46,12 @@ def read(
 
     Args:
         path: of the file.
-        model: what it describes; where there is no such file, the message names files that do.
-        most_bytes: that it may have.
+        model: the type of the content; if the file does not exist, the message names files of this
+            type.
+        most_bytes: largest size of the file.
 
     Raises:
-        CallerError: there is no such file, it is too large, no regular file, or no TOML.
+        CallerError: the file does not exist, is too large, is not a regular file, or is not TOML.
     """
     try:
         text = read_regular(path, most_bytes).decode("utf-8")
@@ -64,11 +65,11 @@ def read(
 def parsed(text: str, source: str) -> dict[str, Any]:
     """Parse TOML; ``source`` names it in error messages.
 
-    A key of n parts takes :mod:`tomllib` memory for n² of them, so that long ones are refused
-    before it sees the text.
+    :mod:`tomllib` needs memory for n² parts for a key of n parts. So keys with too many parts are
+    refused before the text is parsed.
 
     Raises:
-        CallerError: it is no TOML, or a key in it has too many parts.
+        CallerError: the text is not TOML, or a key in it has too many parts.
     """
     bare = _STRING.sub(lambda found: "" if found["comment"] else "_", text)
     if _LONG_KEY.search(bare):
@@ -79,7 +80,7 @@ def parsed(text: str, source: str) -> dict[str, Any]:
         raise CallerError(f"{source}: {_TOO_DEEP}") from None
     except tomllib.TOMLDecodeError as error:
         raise CallerError(printable(f"{source}: not valid TOML: {error}")) from None
-    except ValueError:  # Python parses no integer of thousands of digits
+    except ValueError:  # an integer has thousands of digits
         raise CallerError(f"{source}: {_TOO_LARGE}") from None
 
 
@@ -95,10 +96,10 @@ def validated(model: type[M], content: Mapping[str, Any], source: str) -> M:
         text = json.dumps(content, default=_unfit)
     except TypeError as error:
         raise CallerError(printable(f"{source}: {error}")) from None
-    except ValueError:  # Python writes no integer of thousands of digits
+    except ValueError:  # an integer has thousands of digits
         raise CallerError(f"{source}: {_TOO_LARGE}") from None
     try:
-        # Through JSON, because strict validation takes arrays for tuples only there.
+        # Via JSON, because strict validation accepts an array as a tuple only there.
         return model.model_validate_json(text)
     except ValidationError as error:
         raise CallerError("\n".join(explain(error, source, model))) from None
@@ -110,7 +111,7 @@ def json_schema(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists lie within each other more than so many levels deep."""
+    """Whether tables and lists are nested more than this number of levels deep."""
     if not isinstance(value, dict | list | tuple):
         return False
     inner = value.values() if isinstance(value, dict) else value
@@ -118,7 +119,7 @@ def _is_deeper(value: Any, levels: int) -> bool:
 
 
 def _missing(path: Path, model: type[BaseModel]) -> str:
-    """Say that there is no such file, and which files of the same kind are in its folder."""
+    """Return a message that the file does not exist, with files of the same kind in its folder."""
     needed = {name for name, field in model.model_fields.items() if field.is_required()}
     others = []
     for other in sorted(path.parent.glob("*.toml"))[:_MOST_LOOKED_AT]:
@@ -130,7 +131,7 @@ def _missing(path: Path, model: type[BaseModel]) -> str:
 
 
 def _unfit(value: object) -> None:
-    """Say why a value is none that JSON has.
+    """Report that a value has no equivalent in JSON.
 
     Raises:
         TypeError: always.

@@ -1,4 +1,4 @@
-"""The trigger of a scenario: of any policy."""
+"""The trigger section of a scenario: one of the policies in :mod:`noack.trigger`."""
 
 from typing import TYPE_CHECKING
 

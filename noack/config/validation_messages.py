@@ -1,4 +1,4 @@
-"""Words for mistakes in a settings file: ``file: key = value: what is wrong; what is right``."""
+"""Messages for mistakes in a settings file: ``file: key = value: what is wrong; what is right``."""
 
 import difflib
 import json
@@ -28,17 +28,17 @@ _LISTS = {
     str: 'should be a list of names, e.g. ["a", "b"]',
     tuple: _MATRIX,
 }
-"""By what an entry of the list is."""
+"""By the type of the list's entries."""
 _PERCENT = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*%\s*")
 
 
 def explain(error: ValidationError, source: str, root: type[BaseModel]) -> list[str]:
-    """Return one line per mistake, and one for all beyond the first fifty.
+    """Return one line per mistake, and one line for all mistakes beyond the first fifty.
 
     Args:
-        error: what the validation raised.
+        error: the error of the validation.
         source: names the file.
-        root: the model that the whole file was validated against.
+        root: the model for the validation of the whole file.
     """
     mistakes = error.errors(include_url=False)
     places = [mistake["loc"] for mistake in mistakes]
@@ -60,7 +60,7 @@ def brief(error: ValidationError) -> str:
 
 
 def _has_inner(place: Sequence[Any], places: Iterable[Sequence[Any]]) -> bool:
-    """Whether an entry of this list is itself wrong, which is why the list seems too short."""
+    """Whether an entry of this list is itself wrong, so that the list seems too short."""
     return any(len(other) > len(place) and other[: len(place)] == place for other in places)
 
 
@@ -92,22 +92,22 @@ def _explain(mistake: ErrorDetails, root: type[BaseModel]) -> str:
 
 
 class _Place(NamedTuple):
-    """Where in a file something is wrong."""
+    """The place of a mistake in a file."""
 
     path: Sequence[Any]
-    """Of the key."""
+    """Path of the key."""
     section: type[BaseModel] | None
-    """In which the key lies."""
+    """The section that contains the key."""
     choices: Mapping[str, type[BaseModel]]
-    """What a table there may be, by the value of the key that chooses."""
+    """The types of table that are possible at this place, by the value of the discriminator."""
     discriminator: str
-    """The key that chooses."""
+    """The key that selects the type of table."""
     kind: Any
     """The annotation of the value."""
 
 
 def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
-    """Find a place; pydantic names chosen tables within the path, which are no keys of the file."""
+    """Find a place; pydantic's path also has the names of selected tables, which are not keys."""
     kind: Any = root
     path: list[Any] = []
     section: type[BaseModel] | None = None
@@ -124,7 +124,7 @@ def _locate(place: Sequence[Any], root: type[BaseModel]) -> _Place:
 
 
 def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
-    """The annotation of an entry of ``kind``, and the section that it lies in."""
+    """Return the annotation of an entry of ``kind``, and the section that contains the entry."""
     section = _section_of(kind)
     if section is not None:
         field = section.model_fields.get(str(part))
@@ -134,7 +134,7 @@ def _within(kind: Any, part: Any) -> tuple[Any, type[BaseModel] | None]:
 
 
 def _entry_of(at: _Place) -> Any:
-    """What the entries of the list are that a value should be; of a row, what it is itself."""
+    """Return the entry type of the expected list; for an entry of a row, ``tuple``."""
     lists = [one for one in _alternatives(at.kind) if get_origin(one) is tuple]
     if isinstance(at.path[-1], int) or not lists:
         return tuple
@@ -143,7 +143,7 @@ def _entry_of(at: _Place) -> Any:
 
 
 def _share(value: Any, at: _Place) -> str:
-    """Suggest a share where a percentage was given for a number that is at most 1."""
+    """Suggest a share if a percentage was given for a number that is at most 1."""
     field = at.section.model_fields.get(str(at.path[-1])) if at.section and at.path else None
     limits = [] if field is None else [*field.metadata, *_metadata(field.annotation)]
     if not any(1 in (getattr(one, "le", None), getattr(one, "lt", None)) for one in limits):
@@ -156,13 +156,13 @@ def _share(value: Any, at: _Place) -> str:
 
 
 def _metadata(kind: Any) -> list[Any]:
-    """What is said of the alternatives of an annotation, e.g. that they are at most 1."""
+    """Return the metadata of an annotation's alternatives, e.g. that they are at most 1."""
     found = [one for inner in get_args(kind) for one in getattr(inner, "__metadata__", ())]
     return [one for entry in found for one in getattr(entry, "metadata", (entry,))]
 
 
 def _alternatives(kind: Any) -> list[Any]:
-    """What a value may be, without metadata: A and B for ``Annotated[A | B, ...]``."""
+    """Return a value's possible types, without metadata: A and B for ``Annotated[A | B, ...]``."""
     if get_origin(kind) is Annotated:
         return _alternatives(get_args(kind)[0])
     if get_origin(kind) in (Union, UnionType):
@@ -183,7 +183,7 @@ def _section_of(kind: Any) -> type[BaseModel] | None:
 
 
 def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
-    """The tables that a value may be, by the key that all of them have a name of their own for."""
+    """Return the possible tables of a value by their discriminator, and the discriminator."""
     sections = sections_of(kind)
     if len(sections) < 2:
         return {}, ""
@@ -195,7 +195,7 @@ def _choices(kind: Any) -> tuple[Mapping[str, type[BaseModel]], str]:
 
 
 def _own_check(key: str, value: Any, message: str) -> str:
-    """A section's own check says ``inner key: what is wrong``."""
+    """Split the message of a section's own check, ``inner key: what is wrong``."""
     inner, colon, rest = message.partition(": ")
     if not colon or not isinstance(value, Mapping):
         shown = f" = {_show(value)}" if isinstance(value, str) else ""
@@ -221,7 +221,7 @@ def _choice(key: str, value: Any, at: _Place) -> str:
 
 
 def _table_example(value: Any, at: _Place) -> str:
-    """An example of the table: of the kind that the value names, or for a class of the user's."""
+    """Return an example of the table: of the kind that the value names, or for a user's class."""
     known = isinstance(value, str) and value in at.choices
     if not known and "python" in at.choices and str(value).isidentifier():
         file = f"my_{at.path[0]}.py"
@@ -238,7 +238,7 @@ def _table_example(value: Any, at: _Place) -> str:
 
 
 def _purpose(section: type[BaseModel] | None, key: str) -> str:
-    """What a missing key is for."""
+    """Return the purpose of a missing key."""
     field = section.model_fields.get(key) if section is not None else None
     inner = _section_of(field.annotation) if field is not None else None
     text = (inner.__doc__ if inner is not None else field.description if field else None) or ""

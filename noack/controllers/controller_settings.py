@@ -1,4 +1,4 @@
-"""What every kind of controller has."""
+"""The settings and the interface that every kind of controller has."""
 
 from typing import Annotated, ClassVar, NamedTuple, Protocol, Self
 
@@ -12,7 +12,7 @@ from noack.settings.section import ScenarioSection
 
 
 class ControlModel(NamedTuple):
-    """What a control law knows of the loop."""
+    """The data that a control law receives about the loop."""
 
     A: Matrix
     """Â, (n, n)."""
@@ -25,17 +25,17 @@ class ControlModel(NamedTuple):
 
 
 class ControlFailedError(NoackError):
-    """A control law cannot continue; the message is one line that names it."""
+    """A control law cannot continue; the message is one line that names the law."""
 
 
 class ControlLaw(Protocol):
     """Computes the control input."""
 
     def update(self, t_s: float, x: Vector) -> None:
-        """Process a state x(t), shape (n,), that the sensor has sent.
+        """Process a state x(t), shape (n,), of a received update.
 
         Raises:
-            ControlFailedError: it cannot; the law must not be used again.
+            ControlFailedError: the law cannot continue; it must not be used again.
         """
         ...
 
@@ -48,7 +48,7 @@ class ControlLaw(Protocol):
             setpoint: x_r and u_r, shapes (n,) and (m,); None is 0.
 
         Raises:
-            ControlFailedError: it cannot; the law must not be used again.
+            ControlFailedError: the law cannot continue; it must not be used again.
         """
         ...
 
@@ -64,8 +64,8 @@ class ControllerSettings(ScenarioSection):
     rate_hz: RateHz = 500.0
     """Control inputs per second of simulated time."""
     phase: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
-    """Offset of its ticks from the plant's, in periods; half a period lets a fresh update act
-    within the same period."""
+    """Offset of the controller's ticks from the plant's steps, in periods; with half a period, a
+    fresh update takes effect within the same period."""
     safe_input: Row | None = None
     """The input before the first update, m entries; by default 0."""
     setpoint: Row | None = None
@@ -81,6 +81,6 @@ class ControllerSettings(ScenarioSection):
         """Return the control law.
 
         Raises:
-            CallerError: it cannot be made.
+            CallerError: the law cannot be created.
         """
         raise NotImplementedError

@@ -1,7 +1,7 @@
-"""A control law of the user's own: a class.
+"""A control law from a user's class.
 
-Its code runs in the controller's process. If it raises, the controller sends its safe input from
-then on, and the run ends with status 1.
+The class's code runs in the controller's process. If it raises, the controller sends its safe input
+from then on, and the run ends with status 1.
 """
 
 from typing import Any, ClassVar, Literal
@@ -27,9 +27,9 @@ _PLACE = "controller"
 
 
 class PythonControllerSettings(ClassSettings, ControllerSettings):
-    """A class of the user's own, from an installed package or from a file.
+    """A class of the user, from an installed package or from a file.
 
-    docs/plants.md says what the class must offer.
+    docs/plants.md lists the methods that it must have.
     """
 
     group: ClassVar = "noack.controllers"
@@ -50,7 +50,7 @@ class PythonLaw:
 
     Args:
         settings: of a loaded scenario.
-        model: what the law knows of the loop.
+        model: the data that the law receives about the loop.
 
     Raises:
         CallerError: the class does not exist, raises, or has no ``on_tick``.

@@ -1,7 +1,8 @@
-"""What every kind of disturbance has.
+"""The settings and the interface that every kind of disturbance has.
 
-A disturbance is a function of time, constant over each step of the plant. At the input it is added
-to u behind the actuator, where it is not measured. At the state it is w in ẋ = Ax + Bu + w.
+A disturbance is a function of time, constant over each step of the plant. A disturbance at the
+input is added to u after the actuator, where it is not measured. A disturbance at the state is w in
+ẋ = Ax + Bu + w.
 """
 
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -16,7 +17,7 @@ Place = Literal["input", "state"]
 
 
 class SignalSource(NamedTuple):
-    """What a signal is computed from, beside its settings."""
+    """The data, besides its settings, from which a signal is computed."""
 
     period_ns: int
     """Step of the plant."""
@@ -50,5 +51,5 @@ class DisturbanceSettings(ScenarioSection):
         return np.zeros(len(self.entries))
 
     def signal(self, steps: range, source: SignalSource) -> Matrix:
-        """Return the values that are added during some steps, shape (len(steps), entries)."""
+        """Return the values that are added during the given steps, shape (len(steps), entries)."""
         raise NotImplementedError

@@ -20,7 +20,7 @@ class GaussianDisturbance(DisturbanceSettings):
     kind: Literal["gaussian"]
     """What the disturbance is."""
     std: Row
-    """Standard deviation, entry by entry, of the value that a step holds."""
+    """Standard deviation of the value of a step, entry by entry."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

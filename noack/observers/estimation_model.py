@@ -1,7 +1,7 @@
 """The discrete-time model that an observer uses.
 
-Over a step h of the plant the model is x⁺ = Âd x + B̂d u + q, y = C x + v. There are ``steps`` of
-them between two measurements: T = steps · h.
+Over a step h of the plant the model is x⁺ = Âd x + B̂d u + q, y = C x + v. The time between two
+measurements is T = steps · h.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from noack.core.linear_systems import Matrix, Vector
 
 
 class NoiseVariances(NamedTuple):
-    """Variances of what is random in a scenario, entry by entry."""
+    """Variances of the random disturbances and the noise of a scenario, entry by entry."""
 
     at_state: Vector
     """Of the disturbances at = "state", (n,)."""
@@ -30,7 +30,7 @@ class EstimationModel(NamedTuple):
     Bd: Matrix
     """B̂d, (n, m)."""
     Gd: Matrix
-    """Effect of a disturbance w of ẋ that is held for a step, (n, n)."""
+    """Effect of a disturbance w of ẋ that is constant over a step, (n, n)."""
     C: Matrix
     """(p, n)"""
     Q: Matrix
@@ -41,11 +41,11 @@ class EstimationModel(NamedTuple):
     """Steps of the plant between two measurements."""
 
     def process_covariance(self, at_state: Vector, at_input: Vector) -> Matrix:
-        """Return the covariance of q that independent disturbances with these variances have."""
+        """Return the covariance of q for independent disturbances with these variances."""
         return _covariance(self.Gd, at_state) + _covariance(self.Bd, at_input)
 
     def between_measurements(self) -> tuple[Matrix, Matrix]:
-        """Return Â^(T), and the covariance of what is random over T, (n, n) each."""
+        """Return Â^(T), and the covariance of the process noise over T, (n, n) each."""
         A, Q = np.eye(len(self.Ad)), np.zeros_like(self.Q)
         for _ in range(self.steps):
             A, Q = self.Ad @ A, self.Ad @ Q @ self.Ad.T + self.Q

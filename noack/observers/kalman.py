@@ -1,8 +1,8 @@
-"""The Kalman filter (Kalman 1960), its covariance corrected in the form of Bucy and Joseph.
+"""The Kalman filter (Kalman 1960), with the covariance update of Bucy and Joseph.
 
-At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At a measurement S = C P Cᵀ + R,
-L = P Cᵀ S⁻¹, x̂ ← x̂ + L (y − C x̂), P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ, which stays symmetric and
-positive semidefinite however L is rounded.
+At every step of the plant x̂ ← Âd x̂ + B̂d u, P ← Âd P Âdᵀ + Q. At a measurement S = C P Cᵀ + R, L
+= P Cᵀ S⁻¹, x̂ ← x̂ + L (y − C x̂), P ← (I − L C) P (I − L C)ᵀ + L R Lᵀ. With this update P stays
+symmetric and positive semidefinite for any rounding error of L.
 """
 
 from typing import ClassVar, Literal, Self
@@ -17,7 +17,7 @@ from noack.settings.matrices import Row, Rows, require_length, require_shape, re
 
 
 class KalmanSettings(ObserverSettings):
-    """The time-varying Kalman filter of the model, its covariance in Joseph's form."""
+    """The time-varying Kalman filter of the model, with Joseph's covariance update."""
 
     example: ClassVar = {
         "kind": "kalman", "input_std": [0.2], "noise_std": [0.01], "initial_std": [1.0, 1.0],
@@ -26,17 +26,18 @@ class KalmanSettings(ObserverSettings):
     kind: Literal["kalman"]
     """What the observer is."""
     process_std: Row | None = None
-    """Standard deviation of w in ẋ = Âx + B̂u + w, held over a step of the plant, n entries; by
+    """Standard deviation of w in ẋ = Âx + B̂u + w, constant over a step of the plant, n entries; by
     default that of the random disturbances at = "state"."""
     input_std: Row | None = None
-    """Standard deviation of what is added to u, held likewise, m entries; by default that of the
-    random disturbances at = "input"."""
+    """Standard deviation of the disturbance of u, constant over a step, m entries; by default that
+    of the random disturbances at = "input"."""
     Q: Rows | None = None
-    """Or: covariance of what is added to x in a step of the plant, n x n."""
+    """Instead of process_std and input_std: covariance of the noise added to x in a plant step, n x
+    n."""
     noise_std: Row | None = None
     """Standard deviation of v, p entries; by default that of the measurement."""
     R: Rows | None = None
-    """Or: covariance of v, p x p."""
+    """Instead of noise_std: covariance of v, p x p."""
     initial_std: Row
     """Standard deviation of x − x̂ before the first measurement, n entries: P(0) = diag(·²)."""
 
@@ -51,7 +52,7 @@ class KalmanSettings(ObserverSettings):
         return self
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
-        """Require shapes that fit, covariances, and noise in every output and in the process."""
+        """Require shapes that fit, valid covariances, and noise in all outputs and the process."""
         super().check(n, m, p, noise)
         for key, expected, what in (
             ("process_std", n, "state"), ("input_std", m, "input"), ("noise_std", p, "output"),
@@ -77,7 +78,7 @@ class KalmanSettings(ObserverSettings):
             )
 
     def assumed_model(self, model: EstimationModel, noise: NoiseVariances) -> EstimationModel:
-        """Return the model with the filter's own covariances where they are given."""
+        """Return the model with the filter's own covariances, if they are given."""
         Q, R = model.Q, model.R
         if self.Q is not None:
             Q = np.array(self.Q)
@@ -92,14 +93,14 @@ class KalmanSettings(ObserverSettings):
         return model._replace(Q=Q, R=R)
 
     def steady_gain(self, assumed: EstimationModel) -> Matrix | None:
-        """L of the discrete algebraic Riccati equation; None if its solver fails."""
-        # A large import for a sensor.
+        """Return L from the discrete algebraic Riccati equation; None if its solver fails."""
+        # Imported here: a sensor does not need this large module.
         from scipy.linalg import solve_discrete_are
 
         (A, Q), C, R = assumed.between_measurements(), assumed.C, assumed.R
         try:
             predicted = solve_discrete_are(A.T, C.T, Q, R)
-        except (np.linalg.LinAlgError, ValueError):  # entries of too different sizes
+        except (np.linalg.LinAlgError, ValueError):  # the entries' magnitudes differ too much
             return None
         return np.asarray(np.linalg.solve(C @ predicted @ C.T + R, C @ predicted).T)
 

@@ -29,8 +29,9 @@ class LuenbergerSettings(ObserverSettings):
     gain: Rows | None = None
     """L by rows, n x p."""
     poles_per_s: tuple[Pole, ...] | None = None
-    """Or: n poles of the error in continuous time, s; a pair [re, im] stands for re ± im·j. L gives
-    (I − LC)e^(ÂT) the eigenvalues e^(sT), where T is the time between measurements."""
+    """Instead of gain: n poles s of the error in continuous time; a pair [re, im] stands for re ±
+    im·j. With L, (I − LC)e^(ÂT) has the eigenvalues e^(sT), where T is the time between
+    measurements."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -81,7 +82,7 @@ class LuenbergerSettings(ObserverSettings):
         return self.model_copy(update={"gain": rows, "poles_per_s": None})
 
     def steady_gain(self, assumed: EstimationModel) -> Matrix:
-        """L."""
+        """Return L."""
         return np.array(self.gain)
 
     def estimator(self, assumed: EstimationModel, x: Vector) -> "LuenbergerObserver":

@@ -16,7 +16,7 @@ def unobservable_mode(A: Matrix, C: Matrix, *, stable_too: bool = False) -> comp
     Args:
         A: shape (n, n).
         C: shape (p, n).
-        stable_too: test modes that decay as well (observability); else only the others
+        stable_too: if true, test all modes (observability); else only modes that do not decay
             (detectability).
     """
     n = len(A)
@@ -35,7 +35,7 @@ def observer_gain(A: Matrix, C: Matrix, poles: tuple[complex, ...]) -> Matrix:
     """Return L, shape (n, p), for which (I − L C) A has these eigenvalues.
 
     L is the state feedback of the dual pair (Aᵀ, (CA)ᵀ), by the method of Tits and Yang, which is
-    robust where there is more than one output.
+    robust if there is more than one output.
 
     Args:
         A: shape (n, n).
@@ -43,9 +43,9 @@ def observer_gain(A: Matrix, C: Matrix, poles: tuple[complex, ...]) -> Matrix:
         poles: n eigenvalues, each complex one with its conjugate.
 
     Raises:
-        ValueError: they cannot be placed.
+        ValueError: the eigenvalues cannot be placed.
     """
-    # A large import for observers without poles to place.
+    # Imported here: observers with a given gain do not need this large module.
     from scipy.signal import place_poles
 
     if unobservable_mode(A, C, stable_too=True) is not None:

@@ -1,4 +1,4 @@
-"""What every kind of observer has."""
+"""The settings and the interface that every kind of observer has."""
 
 from typing import Any, ClassVar, Protocol, Self
 
@@ -32,18 +32,19 @@ class ObserverSettings(ScenarioSection):
     kind: str
     """What the observer is."""
     initial_estimate: Row | None = None
-    """x̂ before the first measurement, n entries; by default 0, or x(0) if the sensor knows it."""
+    """x̂ before the first measurement, n entries; by default x(0) if the sensor starts from it,
+    else 0."""
 
     def check(self, n: int, m: int, p: int, noise: NoiseVariances) -> None:
         """Require settings that fit n states, m inputs, p outputs and the scenario's noise.
 
         Raises:
-            ValueError: one does not; the message begins with the key.
+            ValueError: a setting does not fit; the message begins with the key.
         """
         require_length(self.initial_estimate, "observer.initial_estimate", n, "one per state")
 
     def resolved(self, A: Matrix, C: Matrix, period_ns: int) -> Self:
-        """Return settings that name the gain itself, where they gave what it is computed from.
+        """Return settings with an explicit gain, in place of data from which the gain is computed.
 
         Args:
             A: Â^(T) between two measurements, shape (n, n).

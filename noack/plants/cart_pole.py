@@ -26,9 +26,9 @@ class CartPoleSettings(EquationSettings):
     pole_kg: Positive = 0.2
     """Mass of the pole."""
     length_m: Positive = 0.3
-    """From the pivot to the pole's centre of mass."""
+    """Distance from the pivot to the pole's centre of mass."""
     inertia_kg_m2: NonNegative = 0.006
-    """Of the pole, about its centre of mass."""
+    """Moment of inertia of the pole about its centre of mass."""
     friction_n_s_per_m: NonNegative = 0.1
     """Viscous friction of the cart."""
     gravity_m_per_s2: Positive = 9.8

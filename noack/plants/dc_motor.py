@@ -3,7 +3,7 @@
 L di/dt = V − R i − Ke ω, J dω/dt = Kt i − b ω − T_f, dθ/dt = ω. While the shaft turns, the friction
 torque T_f is T_c sign(ω). While it stands, T_f balances Kt i up to T_c: the shaft sticks as long as
 |Kt i| ≤ T_c. So the motor is linear between two changes of the friction's direction. Each linear
-motion is computed in closed form, and the time of each change is a root of ω(t), or of |Kt i| − T_c
+motion is computed in closed form. The time of each change is a root of ω(t), or of |Kt i| − T_c
 while the shaft sticks. Nothing is smoothed and no integrator is used: the electrical time constant
 L/R may be arbitrarily short.
 """
@@ -21,10 +21,10 @@ from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.section import NonNegative, Positive
 
 _MAX_CHANGES = 10_000
-"""Changes of the friction's direction within a step."""
+"""Largest number of changes of the friction's direction within a step."""
 _BISECTIONS = 100
 _REAL = 1e-9
-"""A time with a relative imaginary part above this is no extremum."""
+"""A time with a larger relative imaginary part is not an extremum."""
 
 
 class DcMotorSettings(PlantSettings):
@@ -53,7 +53,7 @@ class DcMotorSettings(PlantSettings):
     friction_n_m_s: NonNegative = 3.5077e-6
     """b, viscous friction."""
     coulomb_friction_n_m: NonNegative = 0.0
-    """T_c, Coulomb friction, which also is the largest torque at which the shaft sticks."""
+    """T_c, Coulomb friction; also the largest torque at which the shaft sticks."""
 
     def linearisation(self) -> tuple[Matrix, Matrix]:
         """Return A and B without Coulomb friction, which has no linearisation at standstill."""
@@ -131,7 +131,7 @@ class DcMotor:
         return int(math.copysign(1, current)) if grows and steady * current > 0 else 0
 
     def _stick(self, current: float, voltage: float, left_s: float) -> tuple[float, float]:
-        """Return how long the shaft sticks, and the current then."""
+        """Return how long the shaft sticks, and the current at the end of that time."""
         time_constant_s = self._settings.inductance_h / self._settings.resistance_ohm
         steady = voltage / self._settings.resistance_ohm
         limit = math.copysign(self._breakaway_a, steady)
@@ -143,9 +143,9 @@ class DcMotor:
 
     @staticmethod
     def _stop_s(motion: "_Motion", direction: int, left_s: float) -> float | None:
-        """Return the first time in (0, left_s] at which the speed changes its sign; None if none.
+        """Return the first time in (0, left_s] at which the speed changes its sign, or None.
 
-        Between two extrema the speed is monotone, so that a change of sign brackets one root.
+        Between two extrema the speed is monotone, so a change of sign brackets one root.
         """
         low = 0.0
         for high in motion.extrema(left_s):

@@ -11,7 +11,7 @@ from noack.settings.user_files import FileSettings
 
 
 class FmuSettings(FileSettings, PlantSettings):
-    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: an exported model of another tool.
+    """A Functional Mock-up Unit for co-simulation, FMI 2 or 3: a model exported by another tool.
 
     It is native code that runs in the plant's process; see docs/plants.md.
     """
@@ -21,33 +21,34 @@ class FmuSettings(FileSettings, PlantSettings):
     kind: Literal["fmu"]
     """What the plant is."""
     file: str
-    """The FMU; relative names begin at the scenario file."""
+    """The FMU; a relative name is relative to the scenario file."""
     state_variables: Annotated[Names, Field(min_length=1)]
-    """Its variables that make up x: outputs or locals, real."""
+    """The FMU's variables that make up x: real outputs or locals."""
     input_variables: Annotated[Names, Field(min_length=1)]
-    """Its inputs that make up u, real."""
+    """The FMU's real inputs that make up u."""
     initial_variables: Names | None = None
-    """Its variables that are set to x(0), in x's order; by default the state variables. An empty
-    list: the FMU begins where it wants, which must be plant.initial_state."""
+    """The FMU's variables that are set to x(0), in x's order; by default the state variables. With
+    an empty list, the FMU starts from its own initial state, which must equal
+    plant.initial_state."""
     operating_state: Row | None = None
-    """What the state variables are where x = 0; by default 0."""
+    """Values of the state variables at x = 0; by default 0."""
     operating_input: Row | None = None
-    """What the inputs are where u = 0; by default 0."""
+    """Values of the inputs at u = 0; by default 0."""
     parameters: dict[str, bool | int | FiniteFloat | str] = Field({})
-    """Start values of further variables of it."""
+    """Start values of further variables of the FMU."""
     on_record: Names = ()
-    """Further variables of it that are on record, as z."""
+    """Further variables of the FMU that are recorded, as z."""
 
     @property
     def internal_names(self) -> tuple[str, ...]:
-        """Names of the variables that are on record beside x."""
+        """Names of the variables that are recorded in addition to x."""
         return self.on_record
 
     def check(self, n: int, m: int) -> None:
-        """Require a variable for each of n states and m inputs.
+        """Require one variable for each of n states and m inputs.
 
         Raises:
-            ValueError: there are more, or fewer.
+            ValueError: the numbers differ.
         """
         why = f"the model has {n} states and {m} inputs"
         require_length(self.state_variables, "plant.system.state_variables", n, why)

@@ -14,11 +14,11 @@ Share = Annotated[FiniteFloat, Field(gt=0, lt=1)]
 
 
 class FourTankSettings(EquationSettings):
-    """Two tanks that two pumps fill, each pump also through a tank above the other one.
+    """Two tanks that two pumps fill; each pump also fills a tank above the other pump's tank.
 
     Johansson, "The Quadruple-Tank Process", IEEE Trans. Control Systems Technology 8(3), 2000; the
-    default parameters are its minimum-phase P₋. x and u are deviations from the levels that the
-    operating voltages maintain, and from these voltages.
+    default parameters are its minimum-phase P₋. u is the deviation from the operating voltages, x
+    the deviation from the levels that these voltages maintain.
     """
 
     states: ClassVar = ("level 1, cm", "level 2, cm", "level 3, cm", "level 4, cm")
@@ -28,9 +28,9 @@ class FourTankSettings(EquationSettings):
     kind: Literal["four_tank"]
     """What the plant is."""
     areas_cm2: tuple[Positive, Positive, Positive, Positive] = (28.0, 32.0, 28.0, 32.0)
-    """Cross-sections of the tanks; 1 and 2 are below 3 and 4."""
+    """Cross-sections of the tanks; tanks 1 and 2 are below tanks 3 and 4."""
     holes_cm2: tuple[Positive, Positive, Positive, Positive] = (0.071, 0.057, 0.071, 0.057)
-    """Cross-sections of their outlets."""
+    """Cross-sections of the tanks' outlets."""
     pumps_cm3_per_v_s: tuple[Positive, Positive] = (3.33, 3.35)
     """Flow of each pump per volt."""
     valves: tuple[Share, Share] = (0.70, 0.60)
@@ -76,7 +76,7 @@ class FourTankSettings(EquationSettings):
             )
 
         in1, in2, in3, in4 = inflows(*voltages.tolist())
-        with np.errstate(over="ignore"):  # extreme settings have infinite levels
+        with np.errstate(over="ignore"):  # extreme settings lead to infinite levels
             speeds = np.array((in1 + in3, in2 + in4, in3, in4)) / holes
             levels = speeds**2 / twice_gravity
         return PlantEquations(

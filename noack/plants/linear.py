@@ -1,4 +1,4 @@
-"""A linear system, advanced exactly under a held input."""
+"""A linear system, advanced exactly under a constant input."""
 
 from typing import ClassVar, Literal
 
@@ -11,7 +11,7 @@ _EMPTY = np.zeros(0)
 
 
 class LinearSettings(PlantSettings):
-    """ẋ = A x + B u, with A and B as the plant's other keys draw them."""
+    """ẋ = A x + B u; plant.draw and the related keys set A and B."""
 
     scenario: ClassVar = "lane_following"
 

@@ -1,7 +1,7 @@
-"""What every kind of plant has.
+"""The settings that every kind of plant has.
 
-The loop sees a plant through x and u, deviations from an operating point. The plant's own state z
-may have other coordinates, and more of them.
+The loop uses x and u, the deviations from an operating point. The plant's own state z may have
+other coordinates, and more of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,19 +19,19 @@ from noack.settings.section import ScenarioSection
 
 Names = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(max_length=MAX_DIMENSION)]
 Derivative = Callable[[float, Vector, Vector], Sequence[float] | Vector]
-"""dz/dt = f(t, z, v): seconds, (N,), and the physical input v, (m,)."""
+"""dz/dt = f(t, z, v), with t in seconds, z (N,) and the physical input v (m,)."""
 
 
 class PlantStart(NamedTuple):
-    """What a run gives a plant, beside its settings."""
+    """The inputs of a plant besides its settings."""
 
     x0: Vector
     """x(0), (n,)."""
     A: Matrix
     """The true A of a linear plant, (n, n); Â for other plants."""
     B: Matrix
-    """The true B of a linear plant, B̂ for other plants, (n, m); (n, m + n) with a disturbed state,
-    which then is a further input."""
+    """The true B of a linear plant, B̂ for other plants, (n, m). If the state is disturbed, the
+    disturbance is a further input: (n, m + n)."""
     step_ns: int
     """Step of the plant."""
 
@@ -40,22 +40,22 @@ class PlantSettings(ScenarioSection):
     """Settings of a plant."""
 
     states: ClassVar[tuple[str, ...]] = ()
-    """The entries of x, with units; empty if the model names them."""
+    """Names of the entries of x, with units; empty if the model names them."""
     inputs: ClassVar[tuple[str, ...]] = ()
-    """The entries of u, with units; empty if the model names them."""
+    """Names of the entries of u, with units; empty if the model names them."""
     needs: ClassVar[tuple[str, str] | None] = None
     """The module that this kind needs, and the extra of noack that installs it."""
     scenario: ClassVar[str | None] = None
     """A shipped scenario with this kind, for tests and benchmarks."""
     variants: ClassVar[tuple[dict[str, Any], ...]] = ({},)
-    """Settings that tests and benchmarks try one by one."""
+    """Settings that tests and benchmarks use one after the other."""
 
     kind: str
     """What the plant is."""
 
     @property
     def settling_s(self) -> float:
-        """Time after which x and u determine z; 0 if they always do."""
+        """Time after which x and u determine z; 0 if they determine it at all times."""
         return 0.0
 
     @property
@@ -64,7 +64,7 @@ class PlantSettings(ScenarioSection):
         return ()
 
     def check(self, n: int, m: int) -> None:
-        """Require that the plant can have n states and m inputs.
+        """Require that this kind of plant can have n states and m inputs.
 
         Raises:
             ValueError: it cannot.
@@ -91,22 +91,23 @@ class PlantSettings(ScenarioSection):
     def linearisation(self) -> tuple[Matrix, Matrix] | None:
         """Return A and B at the operating point, (n, n) and (n, m), if they are known exactly.
 
-        None: finite differences of the system's motion give them.
+        If it returns None, A and B are computed by finite differences of the system's motion.
         """
         return None
 
     def prepare(self) -> None:
-        """Do what takes long once per machine, before a run: compile equations.
+        """Do the slow work that is needed once per machine, before a run: compile equations.
 
         Raises:
-            CallerError: what the plant needs is not installed.
+            CallerError: a module that the plant needs is not installed.
         """
 
     def system(self, start: PlantStart) -> PlantSystem:
         """Return the system at x(0).
 
         Raises:
-            CallerError: what the plant needs is missing, or differs from the settings.
+            CallerError: a file or module that the plant needs is missing, or differs from the
+                settings.
         """
         raise NotImplementedError
 
@@ -142,13 +143,14 @@ class EquationSettings(PlantSettings):
         """Return the equations.
 
         Raises:
-            CallerError: what the plant needs is not installed, or the settings exclude each other.
+            CallerError: a module that the plant needs is not installed, or the settings exclude
+                each other.
         """
         raise NotImplementedError
 
     def system(self, start: PlantStart) -> PlantSystem:
-        """Return the equations, integrated from x(0) on."""
-        # The integrator takes time to import and 40 MB, which other plants do not need.
+        """Return a system that integrates the equations from x(0) on."""
+        # The import of the integrator takes time and 40 MB. Other plants do not need it.
         from noack.plants.systems.ode_integrator import OdeSystem
 
         return OdeSystem(self.equations(), start.x0)

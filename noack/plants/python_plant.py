@@ -1,6 +1,7 @@
-"""A class of the user's own: equations, or an object that advances itself.
+"""A plant from a user's class: equations, or an object that advances itself.
 
-Its code runs in the plant's process. An exception of the user's code stops the motion, not the run.
+The class's code runs in the plant's process. An exception in this code stops the plant's motion,
+but not the run.
 """
 
 from collections.abc import Callable
@@ -22,13 +23,13 @@ from noack.settings.user_class import (
 
 _PLACE = "plant.system"
 _START_TOLERANCE = 1e-6
-"""Relative difference that x(0) of the scenario and of the class may have."""
+"""Largest relative difference between x(0) of the scenario and x(0) of the class."""
 
 
 class PythonPlantSettings(ClassSettings, PlantSettings):
-    """A class of the user's own, from an installed package or from a file.
+    """A class of the user, from an installed package or from a file.
 
-    Its code runs in the plant's process; docs/plants.md says what the class must offer.
+    Its code runs in the plant's process; docs/plants.md lists the methods that it must have.
     """
 
     group: ClassVar = "noack.plants"
@@ -36,7 +37,7 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
     kind: Literal["python"]
     """What the plant is."""
     on_record: Names = ()
-    """Names of the entries of its own state z; z is recorded if they are given."""
+    """Names of the entries of the class's own state z; if they are given, z is recorded."""
 
     @property
     def internal_names(self) -> tuple[str, ...]:
@@ -51,9 +52,10 @@ class PythonPlantSettings(ClassSettings, PlantSettings):
 class PythonSystem:
     """An object of a user's class, at x(0).
 
-    It has either ``derivative(t_s, z, u)``, dz/dt under the held input, and if z is not x also
-    ``state(x0)`` and ``output(z)``; or ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, and
-    ``z`` if z is to be recorded. ``docs/plants.md`` has examples.
+    The class has one of two interfaces. The first is ``derivative(t_s, z, u)``, which returns dz/dt
+    under the constant input u. If z differs from x, it also needs ``state(x0)`` and ``output(z)``.
+    The second is ``start(x0)``, ``advance(u, t_s, dt_s)`` and ``x``, with ``z`` if z is to be
+    recorded. ``docs/plants.md`` has examples.
 
     Args:
         settings: of a loaded scenario.
@@ -61,7 +63,7 @@ class PythonSystem:
         m: number of inputs.
 
     Raises:
-        CallerError: the class does not exist, raises, or lacks what it must offer.
+        CallerError: the class does not exist, raises, or lacks a required method.
     """
 
     def __init__(self, settings: PythonPlantSettings, x0: Vector, m: int) -> None:

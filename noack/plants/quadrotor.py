@@ -12,7 +12,7 @@ class QuadrotorSettings(EquationSettings):
     """A hovering rigid body: thrust along its own axis, torques about its axes, drag in the air.
 
     The default parameters are those of Luukkonen, "Modelling and Control of Quadcopter", Aalto
-    University, 2011. u is the thrust beyond the weight, and the torques.
+    University, 2011. u is the thrust in excess of the weight, and the torques.
     """
 
     states: ClassVar = (
@@ -31,17 +31,17 @@ class QuadrotorSettings(EquationSettings):
     inertia_kg_m2: tuple[Positive, Positive, Positive] = (4.856e-3, 4.856e-3, 8.801e-3)
     """Principal moments of inertia."""
     drag_kg_per_s: tuple[NonNegative, NonNegative, NonNegative] = (0.25, 0.25, 0.25)
-    """Drag per velocity, along the axes of the world."""
+    """Drag force per velocity, along the axes of the world."""
     gravity_m_per_s2: Positive = 9.81
     """Gravity."""
 
     def equations(self) -> PlantEquations:
         """Return the equations; z is x: position, roll φ, pitch θ, yaw ψ, velocity, rates.
 
-        With R = R_z(ψ) R_y(θ) R_x(φ) from body to world and thrust T = mg + u₁:
-        m v̇ = R (0, 0, T) − (0, 0, mg) − D v and I ω̇ = τ − ω × Iω; the rates of the angles are those
-        that turn R by the body's rates ω = (p, q, r): Luukkonen (2011), Sections 2.1 and 2.3,
-        without the rotors' own momentum. At a pitch of ±90° the angles are not defined.
+        With R = R_z(ψ) R_y(θ) R_x(φ) from body to world and thrust T = mg + u₁: m v̇ = R (0, 0, T)
+        − (0, 0, mg) − D v and I ω̇ = τ − ω × Iω. The rates of the angles follow from the rotation
+        of R at the body's rates ω = (p, q, r). Source: Luukkonen (2011), Sections 2.1 and 2.3,
+        without the angular momentum of the rotors. At a pitch of ±90° the angles are not defined.
         """
         mass, gravity = self.mass_kg, self.gravity_m_per_s2
         inertia_x, inertia_y, inertia_z = self.inertia_kg_m2

@@ -1,8 +1,9 @@
 """A road vehicle: the vehicle models of CommonRoad, steered by a servo, along a lane.
 
-The library's equations and parameters are used unchanged. The lane is its x-axis. The lateral axis
-of the lane models (:mod:`noack.config.named_models`) points the other way: V and Y_g have the
-opposite sign of its lateral velocity and y; yaw, yaw rate and steering angle have the same sign.
+The library's equations and parameters are used unchanged. The lane is the library's x-axis. The
+lateral axis of the lane models (:mod:`noack.config.named_models`) has the opposite direction: V and
+Y_g are minus the library's lateral velocity and y. Yaw, yaw rate and steering angle have the same
+sign.
 """
 
 import math
@@ -37,10 +38,10 @@ _PARAMETERS = {"ford_escort": 1, "bmw_320i": 2, "vw_vanagon": 3, "truck": 4}
 
 
 class VehicleSettings(EquationSettings):
-    """A road vehicle of CommonRoad's vehicle models, beside the lane that the x-axis is.
+    """A road vehicle of CommonRoad's vehicle models, on a lane along the x-axis.
 
-    Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is that of the lane models; of the
-    library's coordinates V and Y_g have the opposite sign. u is the requested steering angle.
+    Althoff and Würsching, "CommonRoad: Vehicle Models", 2020. x is the state of the lane models: V
+    and Y_g have the opposite sign of the library's coordinates. u is the requested steering angle.
     """
 
     states: ClassVar = (
@@ -57,17 +58,18 @@ class VehicleSettings(EquationSettings):
     kind: Literal["vehicle"]
     """What the plant is."""
     model: Literal["kinematic", "single_track", "drift", "multi_body"] = "single_track"
-    """The library's model: ks (kst of the truck), st, std or mb, in order of their states."""
+    """The library's model: ks (kst for the truck), st, std or mb, in order of their number of
+    states."""
     parameters: Literal["ford_escort", "bmw_320i", "vw_vanagon", "truck"] = "bmw_320i"
-    """The library's parameter set, 1 to 4; the truck is kinematic only."""
+    """The library's parameter set, 1 to 4; the truck has a kinematic model only."""
     speed_m_per_s: Positive = 15.0
     """The initial speed, which the vehicle keeps."""
     speed_gain_per_s: Annotated[FiniteFloat, Field(ge=0, le=100)] = 1.0
-    """Acceleration per deviation from this speed."""
+    """Acceleration per deviation from the initial speed."""
     steering_s: Annotated[FiniteFloat, Field(ge=0.001, le=10)] = 0.05
     """Time constant of the steering servo; the vehicle limits its angle and its rate."""
     friction: Annotated[FiniteFloat, Field(gt=0, le=2)] = 1.0
-    """The road's friction, as a multiple of the tyres' own; for "drift" and "multi_body"."""
+    """Friction of the road, as a multiple of the tyres' own; for "drift" and "multi_body"."""
 
     @property
     def settling_s(self) -> float:
@@ -112,9 +114,9 @@ class VehicleSettings(EquationSettings):
             vehicle_equations.compiled_dynamics(self.library_model)
 
     def equations(self) -> PlantEquations:
-        """Return the equations; z is the state of the library's model, the steering straight.
+        """Return the equations; z is the state of the library's model, initially not steered.
 
-        The servo turns the wheels by (u − δ)/T within the limits of angle and rate, and the vehicle
+        The servo turns the wheels by (u − δ)/T within the limits of angle and rate. The vehicle
         accelerates by k (requested speed − speed), within its limits.
 
         Raises:
@@ -179,7 +181,7 @@ def _output(parameters: Any) -> Callable[[Vector], Vector]:
 
 
 def _start_kinematic(x0: Vector, speed: float, parameters: Any) -> list[float]:
-    # Its reference point is the rear axle; V follows from r, and the steering sets r.
+    # The reference point of this model is the rear axle; V follows from r, and the steering sets r.
     _, rate, yaw, lateral = x0.tolist()
     steering = math.atan(rate * (parameters.a + parameters.b) / speed)
     return [0.0, -lateral - parameters.b * math.sin(yaw), steering, speed, yaw]

@@ -1,4 +1,4 @@
-"""Vectors and matrices as a scenario file gives them, and what may be wrong with them."""
+"""Vectors and matrices as in a scenario file, and checks of their shapes and values."""
 
 import json
 from collections.abc import Iterable
@@ -64,20 +64,20 @@ def require_length(row: tuple[object, ...] | None, key: str, expected: int, why:
 
 
 def require_non_negative(row: tuple[float, ...], key: str, what: str = "half-widths") -> None:
-    """Check half-widths, or what else.
+    """Check that all entries of a vector are at least 0; ``what`` names them in the message.
 
     Raises:
-        ValueError: one is negative.
+        ValueError: an entry is negative.
     """
     if any(entry < 0 for entry in row):
         raise ValueError(f"{key}: {what} cannot be negative")
 
 
 def require_squares(row: tuple[float, ...], key: str, what: str) -> None:
-    """Check what is squared: standard deviations, or bounds of noise.
+    """Check the entries of a vector that will be squared: standard deviations, or noise bounds.
 
     Raises:
-        ValueError: one is negative, or its square is beyond floating point.
+        ValueError: an entry is negative, or its square overflows.
     """
     require_non_negative(row, key, what)
     if any(entry > _LARGEST for entry in row):

@@ -1,4 +1,4 @@
-"""A file that a setting names, relative to the file in which the setting stands."""
+"""A file that a setting names, relative to the file that contains the setting."""
 
 import hashlib
 from pathlib import Path
@@ -8,17 +8,17 @@ from noack.core.errors import CallerError
 from noack.core.regular_file import read_regular
 
 MOST_BYTES = 64 * 2**20
-"""Of a file that is read whole."""
+"""Largest size of a file that is read completely."""
 
 
 class NamedFile:
-    """A file, and where it is named.
+    """A file, and the setting that names it.
 
     Args:
-        name: as the setting has it.
-        folder: where relative names begin.
-        place: the table in which the key ``file`` stands, for messages, e.g.
-            ``run.toml: network.loss``; without it only the file is named.
+        name: as in the setting.
+        folder: relative names are relative to it.
+        place: the table with the key ``file``, for messages, e.g. ``run.toml: network.loss``;
+            without it, messages name the file only.
     """
 
     def __init__(self, name: str, folder: Path, place: str = "") -> None:
@@ -26,7 +26,7 @@ class NamedFile:
         self._named = f'{place}.file = "{name}"' if place else name
 
     def wrong(self, message: str) -> NoReturn:
-        """Refuse what the file says.
+        """Refuse the file's content.
 
         Raises:
             CallerError: always.

@@ -8,11 +8,11 @@ from noack.core.clock import NS_PER_S
 
 RateHz = Annotated[FiniteFloat, Field(gt=0, le=100_000)]
 _LEAST_RATE_HZ = 1e-9
-"""Its period in nanoseconds fits into 64 bits."""
+"""Lowest rate; its period in nanoseconds fits into 64 bits."""
 
 
 def period_ns(rate_hz: float) -> int:
-    """The period of a rate in nanoseconds; rates are validated to have a whole one."""
+    """Return the period of a validated rate, a whole number of nanoseconds."""
     return round(NS_PER_S / rate_hz)
 
 

@@ -1,4 +1,4 @@
-"""Kinds of settings, one file each: a kind is known because its file is in the folder."""
+"""Kinds of settings, one module each: a module in the folder adds its kind."""
 
 from collections.abc import Mapping
 from functools import reduce
@@ -19,7 +19,7 @@ def kinds_in(package: str, base: type[Settings], key: str = "kind") -> Mapping[s
 
     Args:
         package: its dotted name; subpackages are not searched.
-        base: the class from which all of them are derived.
+        base: the base class of all of them.
         key: the field that names the kind, a ``Literal`` of one value.
     """
     found: dict[str, type[Settings]] = {}

@@ -1,4 +1,4 @@
-"""What every table of a settings file is: frozen, and strict about its keys."""
+"""The base of every table in a settings file: frozen, and unknown keys are errors."""
 
 from typing import Annotated
 
@@ -12,7 +12,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**64)]
 
 
 class ScenarioSection(BaseModel):
-    """A frozen table of a settings file that knows all its keys."""
+    """A frozen table of a settings file that refuses unknown keys."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True

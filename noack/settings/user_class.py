@@ -1,7 +1,7 @@
-"""A class of the user's own, named in a scenario: its settings, and how it is loaded.
+"""A user's class that a scenario names: its settings, and how it is loaded.
 
-The class stands in a Python source file or in an installed package. Its code runs in the process
-that needs it. Plants, triggers and controllers share this module.
+The class is in a Python source file or in an installed package. Its code runs in the process that
+needs it. Plants, triggers and controllers share this module.
 """
 
 import sys
@@ -24,7 +24,7 @@ _ROOT = Path(__file__).parents[2]
 
 
 class ClassSettings(FileSettings):
-    """Settings that name a class of the user's own."""
+    """Settings that name a user's class."""
 
     group: ClassVar[str]
     """The group of entry points in which packages name such classes."""
@@ -33,7 +33,7 @@ class ClassSettings(FileSettings):
     """The class: package.module:Class or an entry point of the group noack.plants, noack.triggers
     or noack.controllers; or, with file, the class in it."""
     file: str | None = None
-    """A Python source file that has the class; relative names begin at the scenario file."""
+    """A Python source file with the class; a relative name is relative to the scenario file."""
     parameters: dict[str, bool | int | FiniteFloat | str | Row | Rows] = Field({})
     """Passed to the class as keyword arguments, arrays as lists."""
 
@@ -61,7 +61,7 @@ def new_instance(settings: ClassSettings, place: str) -> tuple[Any, str]:
 
 
 def failure_text(settings: ClassSettings, place: str, error: BaseException) -> str:
-    """Return one line on an error that the user's code raised: the class, the error, the line."""
+    """Return one line about an error in the user's code: the class, the error, the source line."""
     frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one)]
     where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
     return f'{place}.name = "{settings.name}": {type(error).__name__}: {one_line(error)}{where}'
@@ -75,7 +75,7 @@ def read_only(values: Vector) -> Vector:
 
 
 def real_vector(what: str, value: Any, size: int) -> Vector:
-    """Return a copy of what the user's code returned, shape (size,).
+    """Return a copy of a return value of the user's code, shape (size,).
 
     Raises:
         TypeError: its entries are not real numbers.
@@ -116,10 +116,10 @@ def _attribute(module: ModuleType, name: str) -> Any:
 
 
 def _executed(path: Path) -> ModuleType:
-    """Execute a source file as a module; it cannot import the files beside it."""
+    """Execute a source file as a module; it cannot import other files of its folder."""
     module = ModuleType(f"noack_user_{path.stem}")
     module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses look there
+    sys.modules[module.__name__] = module  # dataclasses needs this entry
     exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
     return module
 

@@ -22,10 +22,10 @@ PLACES = ("plant.system", "trigger", "controller")
 
 
 class FileSettings(ScenarioSection):
-    """Settings that may name a file which a run executes."""
+    """Settings that may name a file that a run executes."""
 
     file: str | None = None
-    """The file; relative names begin at the scenario file."""
+    """The file; a relative name is relative to the scenario file."""
     sha256: Sha256 | None = None
     """The file's SHA-256; filled in when the scenario is loaded."""
 
@@ -41,7 +41,7 @@ def file_tables(scenario: BaseModel) -> Iterator[tuple[str, FileSettings]]:
 
 
 def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
-    """Return a scenario or section in which other tables stand at the given places."""
+    """Return a scenario or section with other tables at the given places."""
     update: dict[str, BaseModel] = {}
     for place, table in tables.items():
         part, _, rest = place.partition(".")
@@ -53,12 +53,12 @@ def with_tables(section: Table, tables: Mapping[str, BaseModel]) -> Table:
 def located(settings: Settings, folder: Path, place: str) -> Settings:
     """Return settings with the absolute path of their file, and its SHA-256.
 
-    A SHA-256 that is given already is kept, and the file is then not read: the record of a run can
+    If a SHA-256 is already given, it is kept and the file is not read: so the record of a run can
     be read without the file.
 
     Args:
-        settings: of a table; those that name no file are returned as they are.
-        folder: where relative names begin.
+        settings: of a table; settings that name no file are returned unchanged.
+        folder: relative names are relative to it.
         place: the table, for messages.
 
     Raises:

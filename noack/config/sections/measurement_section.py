@@ -1,4 +1,4 @@
-"""What is measured of the plant."""
+"""The measurement of the plant."""
 
 from typing import Self
 
@@ -11,14 +11,14 @@ from noack.settings.section import ScenarioSection
 
 
 class MeasurementSection(ScenarioSection):
-    """What is measured of the plant: y = C x + v."""
+    """The measurement of the plant: y = C x + v."""
 
     C: Rows | None = None
-    """C by rows, p x n; unless given, every state is measured."""
+    """C by rows, p x n; by default the identity: every state is measured."""
     noise_std: Row | None = None
-    """Standard deviation of a normally distributed part of v, p entries; unless given, zeros."""
+    """Standard deviation of the normally distributed part of v, p entries; by default 0."""
     noise_bound: Row | None = None
-    """Bound of a uniformly distributed part of v, p entries; unless given, zeros."""
+    """Bound of the uniformly distributed part of v, p entries; by default 0."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -52,7 +52,7 @@ class MeasurementSection(ScenarioSection):
         """Require shapes that fit a model of n states.
 
         Raises:
-            ValueError: one does not; the message begins with the key.
+            ValueError: a shape does not fit; the message begins with the key.
         """
         place, p = "plant.measurement", self.outputs(n)
         require_shape(self.C, f"{place}.C", (p, n), f"{why}; one row per output")

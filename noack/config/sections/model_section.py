@@ -1,4 +1,4 @@
-"""What sensor and controller believe about the plant."""
+"""The model of the plant that sensor and controller use."""
 
 from typing import Literal, Self
 
@@ -13,10 +13,10 @@ from noack.settings.section import ScenarioSection
 
 
 class ModelSection(ScenarioSection):
-    """What sensor and controller believe about the plant: Â, B̂, and the gain K of u = K x_c.
+    """The model that sensor and controller use: Â, B̂, and the gain K of u = K x_c.
 
-    Either ``name`` (with optional ``parameters``), or the matrices ``A``, ``B`` and ``gain``, or a
-    ``file`` of them.
+    It is given by ``name`` (with optional ``parameters``), by the matrices ``A``, ``B`` and
+    ``gain``, or by a ``file`` with these matrices.
     """
 
     name: Literal["lane_following", "single_track_lane", "double_integrator"] | None = None
@@ -28,18 +28,19 @@ class ModelSection(ScenarioSection):
     B: Rows | None = None
     """B̂ by rows, n x m."""
     gain: Rows | None = None
-    """K by rows, m x n; a named model brings its own, and a file may."""
+    """K by rows, m x n; a named model has its own gain, and a file may have one."""
     file: str | None = None
-    """An .npz or .mat file of A, B and, unless it stands here, the gain, named gain or K. Relative
-    names begin at the scenario file; what the file says replaces it when it is loaded."""
+    """An .npz or .mat file with A, B and, unless it is given here, the gain, named gain or K. A
+    relative name is relative to the scenario file. Loading the scenario replaces the name by the
+    matrices."""
     names: dict[Literal["A", "B", "gain"], str] | None = None
-    """Names of the arrays in the file, where they are others."""
+    """Names of the arrays in the file, if they differ from A, B and gain."""
     state_names: tuple[str, ...] | None = None
     """Names of the n states, for plots."""
     input_names: tuple[str, ...] | None = None
     """Names of the m inputs, for plots."""
     allow_unstable: bool = False
-    """Accept a gain with which the model's closed loop Â + B̂K is not stable."""
+    """Accept a gain with which the model's closed loop Â + B̂K is unstable."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -112,7 +113,7 @@ class ModelSection(ScenarioSection):
 
 
 def instability(A: Matrix, B: Matrix, K: Matrix) -> str | None:
-    """Why u = K x does not stabilise ẋ = A x + B u, and what would; None if it does.
+    """Return why u = K x does not stabilise ẋ = A x + B u, with a remedy; None if it does.
 
     Args:
         A: (n, n), per second.

@@ -1,4 +1,4 @@
-"""The lossy network between sensor and controller, and the way back of the baseline."""
+"""The lossy network between sensor and controller, and the acknowledgements of the baseline."""
 
 from typing import Annotated, Literal, Self
 
@@ -13,17 +13,18 @@ from noack.settings.section import ScenarioSection
 
 
 class AcknowledgementSection(ScenarioSection):
-    """The way back from controller to sensor, of the acknowledgement baseline."""
+    """The reverse direction from controller to sensor, for the acknowledgement baseline."""
 
     loss: Loss = NoLoss()
-    """What is lost of the acknowledgements."""
+    """Loss of acknowledgements."""
     mansd: Mansd | None = None
-    """At most so many successive acknowledgements are lost; without it, any number."""
+    """Largest number of consecutive lost acknowledgements; unlimited if not given."""
     impairments: tuple[AnyImpairment, ...] = ()
-    """What else happens to them, in this order, after the loss."""
+    """Further impairments of the acknowledgements, applied in this order, after the loss."""
     timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
-    """After a transmission, the sensor waits so long for its acknowledgement before it transmits
-    again. By default five measurement periods, and the longest delay there and back."""
+    """After a transmission, the sensor waits for the acknowledgement for this time before it may
+    transmit again. By default five measurement periods, plus the longest delay in both
+    directions."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -42,24 +43,24 @@ class NetworkSection(ScenarioSection):
     """The lossy network between sensor and controller."""
 
     mansd: Mansd
-    """M − 1, the maximum allowable number of successive dropouts; the paper's M = 5 is 4."""
+    """M − 1, the maximum allowable number of successive dropouts; for the paper's M = 5 it is 4."""
     loss: Loss
-    """What is lost, before the cap."""
+    """Loss of updates, before the cap M − 1 is applied."""
     impairments: tuple[AnyImpairment, ...] = ()
-    """What else happens to the updates, in this order, after the loss."""
+    """Further impairments of the updates, applied in this order, after the loss."""
     limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
-    """At most so many updates are delayed at once; more are dropped."""
+    """Largest number of delayed updates at a time; further updates are dropped."""
     enforce_mansd: bool = True
-    """false: the network ignores the cap, to see what a violated assumption does."""
+    """false: the network ignores the cap, to show the effect of a violated assumption."""
     initial_sync: Literal["first_packet", "known_state"] = "first_packet"
-    """How the paper's delivered t_0 is met. first_packet: the network passes the first packet of a
-    flow. known_state: sensor and controller start from x(0)."""
+    """How the paper's assumption of a delivered t_0 is met. first_packet: the network passes the
+    first packet of a flow. known_state: sensor and controller start from x(0)."""
     protocol: Literal["none", "ack"] = "none"
-    """none: nothing is acknowledged, the paper's loop. ack: the baseline that it is compared with;
-    the controller acknowledges each update, and x_s is reset only by an acknowledgement."""
+    """none: updates are not acknowledged, the paper's loop. ack: the baseline for comparison; the
+    controller acknowledges each update, and x_s is reset only by an acknowledgement."""
     acknowledgements: AcknowledgementSection | None = None
-    """The way back, for protocol = "ack"; by default nothing is lost on it. Of no effect where
-    protocol = "none" is said."""
+    """The reverse direction, for protocol = "ack"; by default without loss. It has no effect if
+    protocol = "none"."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -73,7 +74,7 @@ class NetworkSection(ScenarioSection):
 
     @property
     def reverse(self) -> AcknowledgementSection:
-        """The way back from controller to sensor, as given or by default."""
+        """The reverse direction from controller to sensor, as given or by default."""
         return self.acknowledgements or AcknowledgementSection()
 
     @property

@@ -1,4 +1,4 @@
-"""The true plant, and what it does without a controller."""
+"""The true plant, its initial state, and its behaviour without actuations."""
 
 from typing import Annotated, Literal, Self
 
@@ -16,21 +16,21 @@ from noack.settings.section import ScenarioSection
 
 
 class WatchdogSection(ScenarioSection):
-    """What the plant does when no actuation has come for too long."""
+    """The input of the plant when no actuation has arrived for too long."""
 
     timeout_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] | None = None
     """The newest actuation is too old when its model state is older than this, in simulated time;
     by default 50 periods of the controller."""
     policy: Literal["hold", "zero", "model"] = "hold"
-    """hold: the plant goes on with the newest input; zero: with none; model: with that which the
-    controller's model asks for, propagated from the newest actuation, which then carries x_c."""
+    """hold: the plant keeps the newest input; zero: the input is 0; model: the input of the
+    controller's model, propagated from the newest actuation, which then carries x_c."""
 
 
 class PlantSection(ScenarioSection):
     """The true plant, unknown to sensor and controller, and how it is drawn."""
 
     system: AnyPlant = LinearSettings()
-    """What it is: a table with ``kind``; a linear system unless given."""
+    """The kind of plant: a table with ``kind``; by default a linear system."""
     draw: Literal["nominal", "uniform", "vertex", "given"] = "nominal"
     """nominal: the model itself; uniform: each entry within its half-width; vertex: each entry at
     one end of its half-width; given: the matrices A and B below."""
@@ -43,9 +43,9 @@ class PlantSection(ScenarioSection):
     B: Rows | None = None
     """The true B, n x m, for draw = "given"."""
     file: str | None = None
-    """An .npz or .mat file of the true A and B, as model.file is."""
+    """An .npz or .mat file with the true A and B, as for model.file."""
     names: dict[Literal["A", "B"], str] | None = None
-    """Names of the arrays in the file, where they are others."""
+    """Names of the arrays in the file, if they differ from A and B."""
     initial_state: Row
     """x(0), n entries."""
     initial_state_halfwidth: Row | None = None
@@ -53,10 +53,10 @@ class PlantSection(ScenarioSection):
     rate_hz: RateHz = 500.0
     """Steps per second of simulated time."""
     measure_every: Annotated[int, Field(ge=1, le=1_000_000)] = 1
-    """A measurement is sent every so many steps."""
+    """Number of plant steps per measurement."""
     measurement: MeasurementSection = MeasurementSection()
     disturbances: tuple[AnyDisturbance, ...] = ()
-    """What disturbs it, one added to the other."""
+    """Disturbances of the plant; they add up."""
     watchdog: WatchdogSection = WatchdogSection()
 
     @model_validator(mode="after")

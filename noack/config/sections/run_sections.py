@@ -1,4 +1,4 @@
-"""What a run is besides its loop: certificates, recovery, changes, seeds, ports, real time."""
+"""Settings of a run besides its loop: certificates, recovery, changes, seeds, ports, real time."""
 
 from typing import Annotated, Any, Self
 
@@ -11,30 +11,30 @@ Port = Annotated[int, Field(ge=0, le=65535)]
 
 
 class CertificateSection(ScenarioSection):
-    """What the certificates of a run allow for, beyond the run's own schedule."""
+    """Additional tolerance of the certificates, beyond the run's own schedule."""
 
     late_periods: Annotated[int, Field(ge=0, le=1000)] = 2
-    """Updates and inputs may be late by so many steps of the plant."""
+    """Updates and inputs may be late by this number of plant steps."""
 
 
 class RecoverySection(ScenarioSection):
-    """What becomes of a run when one of its processes dies."""
+    """What happens to a run when one of its processes dies."""
 
     rejoin_within_s: Annotated[FiniteFloat, Field(ge=0, le=86_400)] | None = None
-    """The run goes on without its sensor, controller, network or recorder for so long (wall time),
-    within which another may take its place; the launcher starts one by itself. 0: the run ends.
-    By default 0 for what the launcher has started, and 60 for what people start. Without its plant
-    there is no run."""
+    """Wall time for which the run continues without its sensor, controller, network or recorder.
+    Within this time a new process may replace it; the launcher starts one by itself. 0: the run
+    ends. By default 0 for processes that the launcher started, and 60 for processes started by
+    hand. Without its plant the run ends."""
 
 
 class ScheduledChange(ScenarioSection):
-    """Settings that are others from a time on, while the run goes on."""
+    """Settings that change at a time during the run."""
 
     at_s: Annotated[FiniteFloat, Field(ge=0, le=1e7)]
-    """Simulated time from which on they are in force."""
+    """Simulated time at which the new values take effect."""
     set: Annotated[dict[str, Any], Field(min_length=1)]
-    """The new values by their keys, e.g. "network.loss.probability" = 0.9: those of network.loss,
-    network.mansd, controller.setpoint, and the numbers of the trigger."""
+    """The new values by their keys, e.g. "network.loss.probability" = 0.9: the keys of
+    network.loss, network.mansd, controller.setpoint, and the numbers of the trigger."""
 
     @property
     def at_ns(self) -> int:
@@ -65,9 +65,9 @@ class PortsSection(ScenarioSection):
     sensor: Port = 0
     """Where the sensor receives measurements."""
     netem: Port = 0
-    """Where the network takes the sensor's updates."""
+    """Where the network receives the sensor's updates."""
     controller: Port = 0
-    """Where the controller receives what survives."""
+    """Where the controller receives the delivered updates."""
     control: Port = 0
     """TCP port of the zenoh control plane."""
 
@@ -86,7 +86,7 @@ class PortsSection(ScenarioSection):
 
 
 class RealtimeSection(ScenarioSection):
-    """Real-time settings of the loop's processes; each is taken where the system permits it."""
+    """Real-time settings of the loop's processes; each is applied if the system permits it."""
 
     enabled: bool = True
     """Ask for SCHED_FIFO, locked memory, the shortest timer slack and no deep idle states."""
@@ -95,4 +95,5 @@ class RealtimeSection(ScenarioSection):
     pin_cores: bool = True
     """With SCHED_FIFO: neighbours in the loop run on different cores."""
     spin_us: Annotated[FiniteFloat, Field(ge=0, le=1000)] = 0.0
-    """Busy-wait this long before each deadline; starves the others on a shared core."""
+    """Busy-wait this long before each deadline; this takes time from other processes on the
+    core."""

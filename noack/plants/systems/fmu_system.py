@@ -1,8 +1,8 @@
 """A Functional Mock-up Unit: another tool's model, run by FMPy (FMI 2 and 3, co-simulation).
 
-By the standard it is told its start values and initialised at t = 0; from then on it is given the
-inputs, makes one ``doStep``, and is asked for its variables, at each step of the plant. Its code is
-native and runs in this process. What it prints is not kept; of its log the last complaint is.
+As the standard requires, its start values are set and it is initialised at t = 0. At each step of
+the plant, its inputs are set, one ``doStep`` is made, and its variables are read. The FMU is native
+code and runs in this process. Its printed output is discarded; the last error in its log is kept.
 """
 
 import contextlib
@@ -25,15 +25,15 @@ from noack.plants.systems.plant_system import SystemFailedError
 from noack.settings.user_files import unchanged
 
 _WARNING, _DISCARD, _ERROR, _FATAL = 1, 2, 3, 4
-"""Statuses of FMI."""
+"""Status codes of FMI."""
 _REAL = {"Real", "Float64", "Float32"}
 _TEXT = {"String"}
 _TRUTH = {"Boolean"}
 _READABLE = {"output", "local"}
 _ALIKE = 1e-6
-"""How far x(0) of the scenario and of the FMU may be apart, relative to its size."""
+"""Largest relative difference between x(0) of the scenario and x(0) of the FMU."""
 _LONGEST = 300
-"""Of what is quoted, in characters."""
+"""Largest length of a quoted text, in characters."""
 
 
 class FmuSystem:
@@ -44,7 +44,7 @@ class FmuSystem:
         x0: x(0), shape (n,).
 
     Raises:
-        CallerError: FMPy is missing; the FMU is not what the settings say; it cannot be started.
+        CallerError: FMPy is missing, the FMU does not match the settings, or it cannot be started.
     """
 
     def __init__(self, settings: FmuSettings, x0: Vector) -> None:
@@ -57,7 +57,7 @@ class FmuSystem:
         )
         self._log = _Log()
         end = contextlib.ExitStack()
-        weakref.finalize(self, end.close)  # when it is not needed any more, or the process ends
+        weakref.finalize(self, end.close)  # when the object is deleted, or the process ends
         try:
             description = self._described(path)
             self.about = _about(description)
@@ -66,7 +66,7 @@ class FmuSystem:
         except CallerError:
             end.close()
             raise
-        except Exception as error:  # FMPy has no class of its own for most of what can be wrong
+        except Exception as error:  # FMPy has no exception class of its own for most errors
             end.close()
             self._wrong(f"cannot be started: {self._log.why(error)}")
 
@@ -91,12 +91,12 @@ class FmuSystem:
         raise CallerError(f"{self._place}: {message}")
 
     def _described(self, path: Path) -> Any:
-        """What the FMU says about itself."""
+        """The FMU's model description."""
         fmpy = _fmpy()
         try:
-            with path.open("rb") as file:  # FMPy leaves those open that it cannot read
+            with path.open("rb") as file:  # FMPy does not close a file that it cannot read
                 description = fmpy.read_model_description(file, validate=False)
-        except Exception as error:  # whatever a file that is no FMU leads to
+        except Exception as error:  # a file that is not an FMU can raise any error
             self._wrong(f"is no FMU of FMI 2 or 3, or a damaged one: {_short(error)}")
         if description.fmiVersion.startswith("1."):
             self._wrong(f"is of FMI {description.fmiVersion}; FMI 2 and 3 can be run")
@@ -116,7 +116,7 @@ class FmuSystem:
                     str(folder), description, fmi_type="CoSimulation", logger=self._log.take
                 )
         finally:
-            os.chdir(before)  # FMPy stays where the library is if it cannot be loaded
+            os.chdir(before)  # if loading fails, FMPy does not change back
         instance = _Instance(fmu)
         end.callback(instance.release)
         return instance
@@ -135,7 +135,7 @@ class FmuSystem:
         self._wrong(f"has {has}; this machine needs {platform}/{name}{hint}")
 
     def _start(self, settings: FmuSettings, x0: Vector, description: Any) -> None:
-        """Set the start values, initialise."""
+        """Set the start values and initialise the FMU."""
         fmu, variables = self._instance.fmu, _Variables(description)
         self._states = _Port(fmu, variables.readable("state_variables", settings.state_variables))
         self._inputs = _Port(fmu, variables.inputs("input_variables", settings.input_variables))
@@ -166,7 +166,7 @@ class FmuSystem:
 
 
 class _Instance:
-    """An FMU's instance, and what the standard lets be done with it."""
+    """An instance of an FMU, and its state by the standard."""
 
     def __init__(self, fmu: Any) -> None:
         self.fmu = fmu
@@ -174,7 +174,7 @@ class _Instance:
         self.status = 0
 
     def release(self) -> None:
-        """Terminate and free it, as far as it can be."""
+        """Terminate and free the instance, as far as its status permits."""
         if self.status >= _FATAL:
             return
         with quiet():
@@ -186,33 +186,33 @@ class _Instance:
 
 
 class _Log:
-    """What an FMU said last of all that is worse than a warning."""
+    """The last message of an FMU that is more severe than a warning."""
 
     def __init__(self) -> None:
         self._last = ""
 
     def take(self, *said: Any) -> None:
-        """FMI 2 has (environment, name, status, category, message), FMI 3 no name."""
+        """Keep a message; FMI 2: (environment, name, status, category, message), FMI 3: no name."""
         status, message = said[-3], said[-1]
         if status > _WARNING and message:
             self._last = _short(message.decode(errors="replace"))
 
     def why(self, error: Exception) -> str:
-        """An error, with what the FMU said of it."""
+        """Return an error's text, with the FMU's last message."""
         return f"{_short(error)} ({self._last})" if self._last else _short(error)
 
 
 class _Variables:
-    """The variables of an FMU, checked for what they are to be.
+    """The variables of an FMU, with checks of their properties.
 
-    Every method raises a CallerError, one line, for a variable that is not there or not fit.
+    If a variable is missing or unsuitable, every method raises a CallerError of one line.
     """
 
     def __init__(self, description: Any) -> None:
         self._known: Mapping[str, Any] = {one.name: one for one in description.modelVariables}
 
     def readable(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Real outputs and locals."""
+        """Return real outputs and locals."""
         found = self.real(key, names)
         for one in found:
             if one.causality not in _READABLE:
@@ -220,7 +220,7 @@ class _Variables:
         return found
 
     def inputs(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Real inputs."""
+        """Return real inputs."""
         found = self.real(key, names)
         for one in found:
             if one.causality != "input":
@@ -228,7 +228,7 @@ class _Variables:
         return found
 
     def initial(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Real variables that can be set before the initialisation."""
+        """Return real variables that can be set before the initialisation."""
         found = self.real(key, names)
         for one in found:
             if not _settable(one):
@@ -239,7 +239,7 @@ class _Variables:
         return found
 
     def real(self, key: str, names: Sequence[str]) -> list[Any]:
-        """Real scalars."""
+        """Return real scalars."""
         found = [self._named(key, name) for name in names]
         twice = next((name for name, count in Counter(names).items() if count > 1), None)
         if twice is not None:
@@ -252,7 +252,7 @@ class _Variables:
         return found
 
     def parameter(self, name: str, value: object) -> tuple[Any, Any]:
-        """A variable and the start value that it gets."""
+        """Return a variable and its start value."""
         one = self._named("parameters", name)
         kinds: tuple[type, ...]
         if one.type in _REAL:
@@ -297,14 +297,14 @@ class _Port:
         self._places = [(kind, at, references) for kind, (at, references) in places.items()]
 
     def get(self) -> Vector:
-        """Their values."""
+        """Return the variables' values."""
         values = np.empty(self._size)
         for kind, at, references in self._places:
             values[at] = getattr(self._fmu, f"get{kind}")(references)
         return values
 
     def set(self, values: Vector) -> None:
-        """Set them."""
+        """Set the variables to values."""
         for kind, at, references in self._places:
             _set(self._fmu, kind, references, values[at].tolist())
 
@@ -322,14 +322,14 @@ def _settable(variable: Any) -> bool:
 
 
 def _about(description: Any) -> str:
-    """An FMU in one line."""
+    """Describe an FMU in one line."""
     tool = description.generationTool or "a tool that it does not name"
     needs = "; it needs that tool to run" if description.coSimulation.needsExecutionTool else ""
     return f"FMU {description.modelName}, FMI {description.fmiVersion}, by {tool}{needs}"
 
 
 def _fmpy() -> Any:
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints what its platform lacks
+    with contextlib.redirect_stdout(io.StringIO()):  # the import prints warnings about the platform
         import fmpy
     return fmpy
 

@@ -1,4 +1,4 @@
-"""What running somebody else's native code needs: a folder to unpack it in, and quiet around it."""
+"""Support for native code of third parties: a folder to unpack it in, and suppressed output."""
 
 import ctypes
 import os
@@ -16,9 +16,10 @@ _STREAMS = (1, 2)
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Make a folder of this user alone; remove it at the end, and those of the killed before it.
+    """Create a folder for this user only and remove it at the end; remove abandoned folders first.
 
-    A lock on the folder, which ends with its process however that ends, tells that it is in use.
+    A lock marks a folder that is in use. The lock ends with its process, even if that process is
+    killed; a folder without a lock is abandoned.
     """
     for left in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         _remove_if_left(left)
@@ -27,7 +28,7 @@ def temporary_folder() -> Iterator[Path]:
         lock = _locked(folder)
         if lock is not None and folder.is_dir():
             break
-        if lock is not None:  # another process took it for left before it was locked
+        if lock is not None:  # another process removed it before it was locked
             os.close(lock)
     try:
         yield folder
@@ -61,7 +62,7 @@ def _locked(folder: Path) -> int | None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Let nothing through that native code prints meanwhile: it might do so at every step."""
+    """Discard all output that native code prints in this context; it may print at every step."""
     kept = []
     with suppress(OSError):  # a stream that is closed stays closed
         for stream in _STREAMS:
@@ -73,7 +74,7 @@ def quiet() -> Iterator[None]:
     try:
         yield
     finally:
-        _LIBC.fflush(None)  # or its buffer is printed later
+        _LIBC.fflush(None)  # otherwise its buffer is printed later
         for stream, copy in kept:
             os.dup2(copy, stream)
             os.close(copy)

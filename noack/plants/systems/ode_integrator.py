@@ -1,4 +1,4 @@
-"""Equations that are integrated from step to step with error control."""
+"""A system of differential equations, integrated from step to step with error control."""
 
 import warnings
 from collections.abc import Sequence
@@ -12,21 +12,21 @@ from noack.plants.systems.plant_system import SystemFailedError
 
 _MAX_STEPS = 10_000
 _ESCAPE = 1e4
-"""A state that grows by this factor within a step of the plant escapes to infinity."""
+"""If a state grows by this factor within a step of the plant, it has diverged."""
 _GAVE_UP = {
     -2: f"the integrator needs more than {_MAX_STEPS:,} steps from one sample to the next",
     -3: "the integrator's steps become too small; the equations jump there",
     -4: "they are too stiff for an explicit integrator",
 }
-"""Status of dopri5, in words."""
+"""Status codes of dopri5, as text."""
 
 
 class OdeSystem:
-    """``dz/dt = f(t, z, v)`` under a held input: Dormand & Prince's pair of orders 5 and 4.
+    """``dz/dt = f(t, z, v)`` under a constant input: Dormand & Prince's pair of orders 5 and 4.
 
-    The integrator restarts at every step of the plant, as the input jumps there. So the result
-    depends on z, v and t alone, and a replay repeats it bit for bit. If z escapes to infinity, or f
-    cannot be evaluated, z is NaN from then on, and the run has diverged.
+    The integrator restarts at every step of the plant, because the input changes abruptly there. So
+    the result depends on z, v and t alone, and a replay repeats it bit for bit. If z diverges, or f
+    cannot be evaluated, z is NaN from then on: the run has diverged.
 
     Args:
         equations: f, its output and input, and tolerances.
@@ -58,13 +58,13 @@ class OdeSystem:
 
         Raises:
             SystemFailedError: the tolerance cannot be met, although f is finite.
-            BaseException: f raised it, and it is not an arithmetic error.
+            BaseException: f raised an exception that is not an arithmetic error.
         """
         t_s = t_ns * 1e-9
         self._raised.clear()
         self._integrator.set_f_params(self._equations.physical(u))
         self._integrator.set_initial_value(self._state, t_s)
-        with warnings.catch_warnings(action="ignore"):  # its status says the same
+        with warnings.catch_warnings(action="ignore"):  # the status has the same information
             end = self._integrator.integrate(t_s + dt_ns * 1e-9)
         reached = np.asarray(end, dtype=np.float64)
         for error in self._raised:
@@ -89,7 +89,7 @@ class OdeSystem:
             )
 
     def _guarded(self, t_s: float, z: Vector, v: Vector) -> Sequence[float] | Vector:
-        """Return f, or NaN after an exception: the integrator cannot be stopped by one."""
+        """Return f, or NaN after an exception: an exception cannot stop the integrator."""
         if not self._raised:
             try:
                 return self._equations.derivative(t_s, z, v)

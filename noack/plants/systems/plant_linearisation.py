@@ -1,4 +1,4 @@
-"""What a system is to the loop near its operating point: ẋ ≈ A x + B u."""
+"""Linearisation of a system about its operating point: ẋ ≈ A x + B u."""
 
 import warnings
 from collections.abc import Callable
@@ -12,10 +12,10 @@ from noack.plants.systems.plant_system import PlantSystem
 _STEP_NS = 10_000_000
 _OFF = 1e-4
 _SINGULAR = 1e-9
-"""Where what is left of small deviations spans no more than this of them, x is no state."""
+"""If the smallest singular value of the settled deviations is below this, x is not a state."""
 _AHEAD = 10
 _MISSED = 0.05
-"""Nor where A and B miss more than this share of x so many steps ahead."""
+"""If A and B predict x some steps ahead with a larger relative error, x is not a state."""
 
 
 def linearise(
@@ -26,23 +26,24 @@ def linearise(
     off: float = _OFF,
     settling_s: float = 0.0,
 ) -> tuple[Matrix, Matrix]:
-    """Linearise a system about x = 0, u = 0 from what held inputs make of small deviations.
+    """Linearise a system about x = 0, u = 0 from its response to small deviations.
 
-    A system of more states than x has a Jacobian that says little of what a loop sees that sees x
-    only. So of n + m small deviations of x(0) and u, each on both sides, x is taken after a time in
-    which the rest of the state has settled, and a step of 10 ms later: by central differences
-    x(t + h) = Ad x(t) + Bd u, and the matrix logarithm of [[Ad, Bd], [0, I]] over h gives A and B.
+    If a system has more states than x, its Jacobian does not describe the loop, which uses x only.
+    So n + m small deviations of x(0) and u are applied, each with both signs. x is taken after the
+    rest of the state has settled, and again a step of 10 ms later. Central differences give x(t +
+    h) = Ad x(t) + Bd u. The matrix logarithm of [[Ad, Bd], [0, I]] divided by h gives A and B.
 
     Args:
         system_at: makes the system at an initial state, shape (n,).
         n: number of states.
         m: number of inputs.
-        off: how far from the operating point it is looked at, in each coordinate's units.
-        settling_s: for how long to wait; 0 for a system whose state is x.
+        off: size of a deviation, in each coordinate's units.
+        settling_s: settling time; 0 for a system with the state x.
 
     Returns:
-        A and B, shapes (n, n) and (n, m), per second; NaN where the system has no answer, or x is
-        no state of it: its entries depend on each other, or do not tell what follows.
+        A and B, shapes (n, n) and (n, m), per second. They are NaN if the motion is not finite, or
+            if x is not a state: its entries depend on each other, or do not determine the further
+            motion.
     """
     settling = round(settling_s * 1e9 / _STEP_NS)
     ahead = _AHEAD if settling else 1
@@ -69,7 +70,7 @@ def linearise(
     missed = np.linalg.matrix_power(step, ahead) @ before - later
     if np.linalg.norm(missed) > _MISSED * np.linalg.norm(later[:n]):
         return unknown
-    with warnings.catch_warnings(action="ignore"):  # of what is singular, which is seen next
+    with warnings.catch_warnings(action="ignore"):  # a singular matrix: the result is checked next
         generator = np.real(logm(step)) / (_STEP_NS * 1e-9)
     if not np.isfinite(generator).all():
         return unknown

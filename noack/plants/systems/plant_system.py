@@ -7,14 +7,14 @@ from noack.core.linear_systems import Vector
 
 
 class SystemFailedError(NoackError):
-    """A system cannot continue; the message is one line that names it."""
+    """A system cannot continue; the message is one line that names the system."""
 
 
 class PlantSystem(Protocol):
     """A system that holds its own state.
 
-    Its motion is a function of its start and of the steps since: the same steps give the same bits,
-    so that a run can be replayed.
+    Its motion is a function of its start and of the steps since then: the same steps give the same
+    bits, so a run can be replayed.
     """
 
     @property
@@ -28,7 +28,7 @@ class PlantSystem(Protocol):
         ...
 
     def advance(self, u: Vector, t_ns: int, dt_ns: int) -> None:
-        """Advance from ``t_ns`` by ``dt_ns`` under the held input ``u``.
+        """Advance from ``t_ns`` by ``dt_ns`` under the constant input ``u``.
 
         Args:
             u: deviation from the operating point's input, shape (m,).
@@ -36,6 +36,6 @@ class PlantSystem(Protocol):
             dt_ns: length of the step.
 
         Raises:
-            SystemFailedError: it cannot; it must not be advanced again.
+            SystemFailedError: the system cannot continue; do not advance it again.
         """
         ...

@@ -1,8 +1,8 @@
-"""The equations of CommonRoad's vehicle models; those with tyres are compiled, as they stand.
+"""The equations of CommonRoad's vehicle models, unchanged; those with tyre models are compiled.
 
-Run by Python, the multi-body model takes three times as long, and too long for 500 Hz. Of the
-small models a call of compiled code costs more than it saves: it wants more of the processor's
-caches, which have other contents at each step.
+As Python code, the multi-body model takes three times as long, which is too long for 500 Hz. The
+small models run as Python code. For them a call of compiled code costs more time than it saves,
+because it needs more of the processor's caches, which other code overwrites between two steps.
 """
 
 import inspect
@@ -26,11 +26,11 @@ _LIBRARY = "vehiclemodels"
 _COMPILED = ("std", "mb")
 
 Rates = Callable[[Vector, float, float], Vector]
-"""ż of the library's state (N,), of steering rate (rad/s) and acceleration (m/s²)."""
+"""ż as a function of z (N,), steering rate (rad/s) and acceleration (m/s²)."""
 
 
 def library(module: str, name: str | None = None) -> Any:
-    """What a module of the library has of that name; most have one function, of their own name."""
+    """Return an attribute of a module of the library; by default the function of the same name."""
     return getattr(import_module(f"{_LIBRARY}.{module}"), name or module)
 
 
@@ -38,8 +38,8 @@ def equations(model: str, parameters: Any) -> Rates:
     """Return the equations of a model.
 
     Args:
-        model: as the library calls it, e.g. ``st``.
-        parameters: the library's, of a vehicle.
+        model: the library's name, e.g. ``st``.
+        parameters: the library's parameters of a vehicle.
     """
     if (compiled := compiled_dynamics(model)) is None:
         dynamics = _dynamics(model)
@@ -58,7 +58,7 @@ def equations(model: str, parameters: Any) -> Rates:
 def compiled_dynamics(model: str) -> Any:
     """Return a model's compiled equations; None if they run as Python code.
 
-    The first time on a machine, they are compiled, which takes long.
+    The first call on a machine compiles them, which takes long.
     """
     if model not in _COMPILED:
         return None
@@ -73,7 +73,7 @@ def compiled_dynamics(model: str) -> Any:
     parameters = numba.types.Array(numba.from_dtype(dtype), 1, "C")
     try:
         compiled.compile((vector, numba.float64, numba.float64, parameters, vector))
-    except NumbaError as error:  # another version of the library may do what cannot be compiled
+    except NumbaError as error:  # numba may not support another version of the library
         why = str(error).partition("\n")[0]
         _say(f"warning: the vehicle's equations stay slow, as they cannot be compiled: {why}")
         return None
@@ -90,7 +90,7 @@ def _dynamics(model: str) -> Any:
 
 
 def _say(line: str) -> None:
-    with suppress(OSError, ValueError):  # nobody listens
+    with suppress(OSError, ValueError):  # stderr is closed
         print(f"noack: {line}", file=sys.stderr, flush=True)
 
 
@@ -98,7 +98,7 @@ def _of(dynamics: Callable[..., Any]) -> Callable[..., None]:
     def found(
         z: Vector, steering: float, acceleration: float, parameters: Any, into: Vector
     ) -> None:
-        rates = dynamics(z.copy(), (steering, acceleration), parameters[0])  # it changes its z
+        rates = dynamics(z.copy(), (steering, acceleration), parameters[0])  # it modifies z
         for number in range(len(rates)):
             into[number] = rates[number]
 
@@ -122,7 +122,7 @@ def _folder(model: str) -> Path | None:
 
 
 def _needed(function: FunctionType) -> list[FunctionType]:
-    """A function of the library, and those of it that it calls, directly or not."""
+    """Return a function of the library and all library functions that it calls, also indirectly."""
     found: dict[FunctionType, None] = {}
 
     def visit(one: FunctionType) -> None:
@@ -146,7 +146,7 @@ def _named(function: FunctionType) -> Iterator[FunctionType]:
 
 
 def _record(parameters: Any) -> NDArray[np.void]:
-    """A vehicle's parameters as an array of one record, whose type all vehicles share."""
+    """A vehicle's parameters as an array of one record; its type is the same for all vehicles."""
 
     def told(section: Any) -> tuple[list[Any], tuple[Any, ...]]:
         types: list[Any] = []
