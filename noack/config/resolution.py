@@ -222,7 +222,7 @@ def _explicit_model(model: ModelSection) -> ModelSection:
 
 
 def _perturbation(
-    rng: np.random.Generator,
+    rng: "np.random.Generator",
     draw: Literal["uniform", "vertex"],
     halfwidth: tuple[tuple[float, ...], ...] | None,
     shape: tuple[int, int],

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def stream(seed: int, *name: str) -> np.random.Generator:
+def stream(seed: int, *name: str) -> "np.random.Generator":
     """Return the random stream called ``name`` under ``seed``.
 
     Args:
@@ -123,7 +123,7 @@ def _mixed(one: NDArray[np.uint32], other: NDArray[np.uint32]) -> NDArray[np.uin
     return words
 
 
-def _sequence(seed: int, name: tuple[str, ...]) -> np.random.SeedSequence:
+def _sequence(seed: int, name: tuple[str, ...]) -> "np.random.SeedSequence":
     return np.random.SeedSequence(seed, spawn_key=_words(name))
 
 

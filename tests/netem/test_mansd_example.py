@@ -1,4 +1,4 @@
-"""The example of docs/mansd.md, decided by the link."""
+"""The link decides the example of docs/mansd.md as documented."""
 
 from pathlib import Path
 
