@@ -51,7 +51,7 @@ def test_a_real_run_violates_no_invariant(result: Result) -> None:
     assert ended_badly(result.summary, 0, result.account["rows"], delivered_out_of_order) == []
 
 
-def test_it_writes_figures_and_a_picture(result: Result) -> None:
+def test_a_soak_test_writes_figures_and_a_picture(result: Result) -> None:
     assert result.run_dir is not None
     written = json.loads((result.run_dir / RESULT_FILE).read_text())
     assert set(written["processes"]) == ROLES
