@@ -34,8 +34,8 @@ class Frozen:
     """A machine that does nothing during an interval, and then catches up.
 
     Args:
-        machine: the machine.
-        from_ns, until_ns: when it stands still.
+        machine: the wrapped machine.
+        from_ns, until_ns: the interval in which it stands still.
     """
 
     def __init__(self, machine: Machine[Any], from_ns: int, until_ns: int) -> None:
@@ -64,8 +64,8 @@ class Deaf:
     """A machine that does not receive some messages, as if they were lost in a socket.
 
     Args:
-        machine: the machine.
-        hears: whether a message, by its number among those sent, comes.
+        machine: the wrapped machine.
+        hears: maps the number of a sent message to whether it arrives.
     """
 
     def __init__(self, machine: Machine[Any], hears: Callable[[int], bool]) -> None:
@@ -83,9 +83,9 @@ class Reborn:
     """A machine that is replaced by a restarted one.
 
     Args:
-        machine: the one that dies.
-        successor: the one that follows.
-        at_ns: when.
+        machine: the machine that ends.
+        successor: the restarted machine.
+        at_ns: time of the restart.
     """
 
     def __init__(self, machine: Machine[Any], successor: Machine[Any], at_ns: int) -> None:
@@ -122,7 +122,7 @@ def simulate_with(
 
 
 def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:
-    """Simulate a scenario whose controller stands still from ``from_s`` to ``until_s``."""
+    """Simulate a scenario; its controller stands still from ``from_s`` to ``until_s``."""
     from_ns, until_ns = round(from_s * 1e9), round(until_s * 1e9)
     return simulate_with(resolved, "controller", lambda one: Frozen(one, from_ns, until_ns))
 

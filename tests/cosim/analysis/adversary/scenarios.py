@@ -109,8 +109,8 @@ def simulate(resolved: Scenario, wanted: Pattern) -> ContinuousRun:
 def every_run(resolved: Scenario) -> Iterator[ContinuousRun]:
     """All admissible patterns, each simulated from the start.
 
-    Counts like an odometer: the last update that was lost is delivered in the next pattern, and
-    everything after it that may be lost is lost.
+    Counts like an odometer: the next pattern delivers the last lost update and loses all later
+    updates that may be lost.
     """
     first = int(resolved.network.initial_sync == "first_packet")
     prefix: Pattern = ()

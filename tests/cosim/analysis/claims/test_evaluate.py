@@ -126,9 +126,7 @@ def test_a_controller_that_is_not_the_model_violates_the_identity(run: RunRecord
 
 
 def test_exceeding_a_printed_bound_outside_its_assumptions_is_not_a_violation(make: Make) -> None:
-    """eq:LossEv3 assumes ‖e_s‖ ≤ βe^{−αt} at all times; a trigger with five tests a second does not
-    ensure it.
-    """
+    """eq:LossEv3 assumes ‖e_s‖ ≤ βe^{−αt} at all times; five tests a second do not ensure it."""
     lossy = {"loss": {"model": "worst_case"}}
     seldom = make(plant={"measure_every": 20}, network=lossy, trigger={"beta": 1e-3})
     record = simulate(seldom)

@@ -170,9 +170,7 @@ def test_a_stale_update_is_not_lost_if_the_newer_one_arrived_in_time(make: Make)
 
 
 def test_an_update_that_never_arrives_is_late_from_its_event_on(make: Make) -> None:
-    """The network forwarded it, but no process received it: lost in a socket, or with a dead
-    controller.
-    """
+    """The network forwarded it; it was lost in a socket or with a dead controller."""
     whole = simulate(make(), network_of(lambda n: 0))
     deliveries = whole[CONTROLLER_DELIVERY]
     record = changed(whole, **{CONTROLLER_DELIVERY: deliveries[deliveries["sequence"] < 12]})

@@ -27,7 +27,7 @@ def delta_of(record: RunRecord) -> float | None:
 def by_hand(record: RunRecord, joined: AlignedRun, horizon: int = 10**9) -> float:
     """1 + Σ_k e^{αδ̃_k} sup‖e^{Hτ}‖ over the missing events after each event.
 
-    Here from real intervals, which the theorem's δ̄_j bound from above.
+    Computed from the real intervals; the theorem's δ̄_j bound them from above.
     """
     from scipy.linalg import expm
 

@@ -37,7 +37,7 @@ def make_record(scenario: Scenario, k: int = 500, largest: float = 1.0) -> RunRe
     Args:
         scenario: the resolved scenario.
         k: steps of every process.
-        largest: the last half of the states grows to this.
+        largest: final value of the second half of the states.
     """
     loop = loop_of(scenario)
     types = tables(loop.n, loop.m)

@@ -111,7 +111,7 @@ def test_nothing_is_cut_off_and_no_texts_overlap(drawn: dict[str, Figure]) -> No
                     assert not any(one.overlaps(other) for other in boxes[:i]), name
 
 
-def test_a_figure_without_data_says_so() -> None:
+def test_a_figure_without_data_states_that() -> None:
     for name, figure in drawn_for("empty").items():
         for axes in figure.axes:
             assert "no data" in [text.get_text() for text in axes.texts], name

@@ -140,9 +140,7 @@ def test_the_random_systems_have_events_and_losses() -> None:
 @given(cases())
 @settings(max_examples=30)
 def test_what_holds_between_events(case: Case) -> None:
-    """The threshold is reached at each event and never exceeded; x_c − x_s is the missed jumps
-    (I1).
-    """
+    """The threshold is never exceeded, and reached at each event; (I1) gives x_c − x_s."""
     run, H = case.run(), case.loop.H
     t_s = np.linspace(0, run.reached_s, 301)
     samples = run.at(t_s)
@@ -203,7 +201,7 @@ def test_a_scalar_loop_has_closed_form_events(floored: bool, lost: tuple[bool, .
 def turning(depth: float, omega: float, floored: bool) -> Case:
     """‖e_s‖ over the threshold is sin(ωt/2)/(1 − depth): it exceeds 1 briefly around t = π/ω.
 
-    x turns, x_s does not, and (unless floored) both decay like the threshold.
+    x rotates, x_s does not, and both decay like the threshold unless there is a floor.
     """
     alpha = 0.0 if floored else 0.8
     turn = np.array([[0.0, omega], [-omega, 0.0]])
@@ -240,7 +238,7 @@ def test_a_tangency_within_rounding_is_decided_either_way() -> None:
 def test_the_highest_of_many_near_misses_is_found(depth: float) -> None:
     """e_1 = Σ a_k (1 − cos ω_k t): hundreds of local maxima, one of which exceeds the threshold.
 
-    The weight all but hides the other entries of e_s; the reference is the closed form.
+    The weight of the other entries of e_s is almost 0; the reference is the closed form.
     """
     omegas, weights = np.array([1.0, 11.3, 17.7]), np.array([0.5, 0.3, 0.2])
     horizon_s = 60.0

@@ -220,10 +220,10 @@ def test_send_on_delta_samples_a_first_order_response_at_its_levels(delta: float
 @pytest.mark.parametrize("amplitude", [1.0, 3.7])
 def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -> None:
     """Theorem: at most mean|ẋ|/δ reports a second, where a clock of equal resolution needs
-    max|ẋ|/δ; the ratio is the signal's own, π/2 for a sine, whatever δ.
+    max|ẋ|/δ; the ratio depends on the signal only and is π/2 for a sine, for any δ.
 
-    Miskowicz, Sensors 6(1), 2006. The rule watches the first state of an oscillator; the second
-    one's weight is next to nothing.
+    Miskowicz, Sensors 6(1), 2006. The rule measures the first state of an oscillator; the
+    weight of the second is almost 0.
     """
     system = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.zeros((1, 2))
     delta, periods = 0.05, 4
@@ -239,9 +239,9 @@ def test_send_on_delta_saves_a_sine_the_factor_of_its_slopes(amplitude: float) -
 def test_the_distance_to_the_continuous_loop_is_within_lunze_and_lehmanns_bound() -> None:
     """Theorem: ‖x − x_CT‖ ≤ ē ∫₀^∞ ‖e^{(A+BK)s} BK‖ ds for a generator with ‖e‖ ≤ ē.
 
-    Lunze, Lehmann, Automatica 46(1), 2010. Sensor and controller run the same model. What disturbs
-    it is another plant, here in both loops; without a disturbance there is no event at all, which
-    they remark.
+    Lunze, Lehmann, Automatica 46(1), 2010. Sensor and controller run the same model. The
+    disturbance is a plant mismatch, here in both loops; without a disturbance there is no event,
+    as they remark.
     """
     A, B, K = TABUADA
     closed, level = A + B @ K, 0.2
