@@ -181,10 +181,10 @@ def test_what_takes_time_has_a_place(write: Callable[..., Path]) -> None:
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
-        ({"network.protocol": "ack"}, r'protocol.*with time = "sampled" a campaign runs both'),
+        ({"network.protocol": "ack"}, r'protocol.*time = "sampled" takes both'),
         (
             {"network.impairments": [{"kind": "delay", "delay_s": 0.01}]},
-            r'delay.*or let time = "sampled"',
+            r'delay.*or use time = "sampled"',
         ),
     ],
 )
@@ -200,5 +200,5 @@ def test_continuous_time_refers_to_the_other(
 def test_an_axis_that_plays_no_part_is_refused(write: Callable[..., Path]) -> None:
     axis = {"name": "speed", "key": "speed", "values": [1.0, 2.0]}
     path = write(PLAN | {"axes": [axis]})
-    with pytest.raises(CallerError, match="makes no difference"):
+    with pytest.raises(CallerError, match="has no effect"):
         grid(load(path), path)
