@@ -1,1 +1,1 @@
-"""Runs without processes: in virtual time, in exact continuous time, and compiled in batches."""
+"""Simulation in one process: in virtual time, in exact continuous time, and in compiled batches."""

@@ -1,9 +1,9 @@
-"""The whole loop in virtual time: the four machines, datagrams in between, and no clock at all.
+"""Simulates the whole loop in virtual time: the four machines and their datagrams, without a clock.
 
-The machines, their messages and the rules of the wire are those of a live run; only the shell is
-another one. What is sent arrives at once, except what the network between sensor and controller
-holds back, so a simulated run is the live run of a machine that is never late. It depends on its
-scenario alone and repeats bit for bit on the same machine.
+The machines, their messages and the protocol are those of a live run; only the shell differs. A
+datagram arrives at the time of sending, unless the network between sensor and controller delays
+it. So a simulated run equals a live run in which no deadline is missed. It depends on its scenario
+alone and is bit-exactly repeatable on the same computer.
 """
 
 import heapq
@@ -43,15 +43,15 @@ from plant_server.plant import plant_of
 from sensor_node.sensor import sensor_of
 
 Network = Callable[[bytes, int], int | None]
-"""Takes an update's datagram at a time, in ns; says how long it takes, or None if it is lost."""
+"""Maps an update's datagram and the current time, ns, to its delay, ns, or to None for a loss."""
 
 Progress = Callable[[int], None]
-"""Is told the simulated time now and then, in ns."""
+"""Called from time to time with the simulated time, in ns."""
 
 RUN_ID = 0
-"""Stands in the datagrams of every simulated run, so that its record depends on the scenario alone.
+"""Run number in the datagrams of every simulated run: a record depends on the scenario alone.
 
-There is nobody to keep out, so the key is no secret either."""
+A simulation receives no foreign traffic, so its key need not be secret."""
 _KEY = bytes(KEY_BYTES)
 
 _TIMER_RANKS = {"plant": 0, "netem": 1, "sensor": 3, "controller": 4}
@@ -61,10 +61,10 @@ _HAPPENINGS_PER_WORD = 4096
 
 
 class DecidedLink:
-    """A link whose losses and delays are decided outside: by a pattern, an adversary, another run.
+    """A link with given losses and delays: of a pattern, an adversary or another run.
 
     Args:
-        decide: the network's word on each datagram.
+        decide: the network's decision for each datagram.
     """
 
     def __init__(self, decide: Network) -> None:
@@ -76,11 +76,11 @@ class DecidedLink:
         self._in_flight: list[tuple[int, int, Datagram]] = []
 
     def next_deadline_ns(self) -> int | None:
-        """When the next datagram arrives."""
+        """Return the time of the next arrival."""
         return self._in_flight[0][0] if self._in_flight else None
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Let a datagram out."""
+        """Forward the next delayed datagram."""
         release_ns, packet, datagram = heapq.heappop(self._in_flight)
         stale = packet < self._newest
         self._newest = max(self._newest, packet)
@@ -89,7 +89,7 @@ class DecidedLink:
         return (datagram, Record(NETEM_RELEASE, row))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Take a datagram; return it if it survives and is not delayed."""
+        """Decide on a datagram; return it if it is neither lost nor delayed."""
         delay_ns = self._decide(message.data, now_ns)
         self._drop_run = self._drop_run + 1 if delay_ns is None else 0
         fate = Fate.DROPPED if delay_ns is None else Fate.DELIVERED
@@ -114,13 +114,13 @@ class DecidedLink:
 class Shuttle:
     """Carries datagrams between the four machines, in the order of virtual time.
 
-    At the same time the plant's step comes first, then what the network has held back, then
-    datagrams in the order in which they were sent, then the sensor's and the controller's timers.
+    Order at equal times: the plant's step, delayed datagrams from the network, datagrams in the
+    order of sending, the timers of sensor and controller.
 
     Args:
         machines: the machine of each role.
-        entries: how many numbers a message of a flow carries.
-        take: takes each row and notice, with the role that emitted it.
+        entries: length of a message's vector, by flow.
+        take: called with each row or notice and the role that emitted it.
         protocol: whether updates are acknowledged.
     """
 
@@ -138,7 +138,7 @@ class Shuttle:
         self.decoders = {
             role: Decoder(leg.receives, entries(leg.receives), RUN_ID, _KEY)
             for role, leg in ROUTES.items()
-            if role != "netem"  # which reads no payload
+            if role != "netem"  # netem reads no payload
         }
         self.acknowledgements = Decoder(Flow.ACKNOWLEDGEMENT, 0, RUN_ID, _KEY)
         self._acknowledgement_routes = protocol.acknowledgement_routes
@@ -149,7 +149,7 @@ class Shuttle:
         self._now_ns = 0
 
     def run(self) -> Iterator[int]:
-        """Drive the machines until nothing is due; yield the time after everything that happens."""
+        """Drive the machines until nothing is due; yield the time after each step."""
         while (following := self._next()) is not None:
             self._now_ns, rank, role = following
             if rank != _DATAGRAM_RANK:
@@ -159,7 +159,7 @@ class Shuttle:
             yield self._now_ns
 
     def announce(self, changes: Sequence[ParameterChange]) -> None:
-        """Tell every machine that can be changed of changes to come."""
+        """Announce parameter changes to every reconfigurable machine."""
         for role in CHANGEABLE:
             machine: ReconfigurableMachine[Any] = self.machines[role]  # type: ignore[assignment]
             for change in changes:
@@ -202,7 +202,7 @@ class Shuttle:
 
 
 class _Gathered:
-    """Rows and notices, as they come."""
+    """Rows and notices, in the order in which they are emitted."""
 
     def __init__(self, types: Mapping[str, np.dtype[np.void]]) -> None:
         self._types = types
@@ -216,7 +216,7 @@ class _Gathered:
             return
         rows = self._rows[output.table]
         rows.append(output.row)
-        if len(rows) == _BATCH_ROWS:  # an array takes a fifth of the memory
+        if len(rows) == _BATCH_ROWS:  # an array needs a fifth of the memory of a list
             self._batch(output.table)
 
     def rows(self) -> dict[str, Rows]:
@@ -232,16 +232,16 @@ class _Gathered:
 def simulate(
     resolved: Scenario, network: Network | None = None, progress: Progress | None = None
 ) -> RunRecord:
-    """Run a scenario in virtual time, sampled as a live run samples.
+    """Run a scenario in virtual time, with the sampling of a live run.
 
     Args:
-        resolved: the resolved scenario; its speed, ports and real-time settings play no part.
-        network: decides each update's fate; by default the scenario's own network does what it
-            would in a live run.
-        progress: is told how far the run is.
+        resolved: the resolved scenario; its speed, ports and real-time settings have no effect.
+        network: decides the fate of each update; by default the scenario's own network, as in a
+            live run.
+        progress: called with the simulated time.
 
     Returns:
-        The record of the run; reports hold what applies: no sockets, no real-time settings.
+        The record of the run; its reports have no entries about sockets or real-time settings.
     """
     if network is not None:
         resolved.coverage.require_unchanging()
@@ -259,7 +259,7 @@ def simulate(
     shuttle.announce(changes)
     for change in changes:
         gathered.take(RECORDER, said_of(change))
-    with np.errstate(all="ignore"):  # a loop that diverges has a record, too
+    with np.errstate(all="ignore"):  # a diverging loop overflows and is recorded all the same
         for happened, now_ns in enumerate(shuttle.run()):
             if progress is not None and happened % _HAPPENINGS_PER_WORD == 0:
                 progress(now_ns)

@@ -1,4 +1,4 @@
-"""Hypothesis strategies for settings of a link, derived from the features and their examples."""
+"""Hypothesis strategies for link settings, derived from the features and their examples."""
 
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -19,7 +19,7 @@ _TEXTS = st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size
 
 
 def values(annotation: Any, metadata: list[Any]) -> st.SearchStrategy[Any]:
-    """Values of a field's type, within its limits."""
+    """Return values of a field's type within its limits."""
     limits: dict[str, Any] = {}
     for entry in metadata:
         for part in entry.metadata if isinstance(entry, FieldInfo) else [entry]:
@@ -51,7 +51,7 @@ def values(annotation: Any, metadata: list[Any]) -> st.SearchStrategy[Any]:
 
 @st.composite
 def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
-    """An example of a feature, or one with other values where they make sense."""
+    """Return an example of a feature, possibly with other valid values."""
     example = draw(st.sampled_from(feature.examples()))
     fields = type(example).model_fields
     names = draw(st.sets(st.sampled_from(sorted(fields)), max_size=3))
@@ -63,7 +63,7 @@ def varied(draw: st.DrawFn, feature: type[Feature]) -> Any:
 
 
 def _goes_together(chain: list[Impairment]) -> bool:
-    """Whether each delay that is correlated with loss has a loss before it."""
+    """Whether each delay with a loss correlation comes after a loss."""
     try:
         require_scores(chain)
     except ValueError:
@@ -89,21 +89,21 @@ def _names_no_file(one: Impairment) -> bool:
 
 _ANY = st.one_of([varied(kind) for kind in IMPAIRMENTS])
 settings = _settings(_ANY, most=1_000_000)
-"""Everything that is valid, names of files included."""
+"""All valid settings, including names of files."""
 computable = _settings(_ANY.filter(_names_no_file))
 harsh = _settings(
     st.sampled_from([
         one for kind in IMPAIRMENTS for one in kind.examples() if _names_no_file(one)
     ])
 )  # fmt: skip
-"""Examples of the features, in any order; their times are short."""
+"""Examples of the features in any order, with short times."""
 capped = harsh.filter(lambda one: one.impairments and one.mansd is not None).map(
     lambda one: one.model_copy(update={"first_delivered": True})
 )
 
 
 def words_can_say(settings: LinkSettings) -> bool:
-    """Whether each reorder has a delay before it; words refuse what has no effect."""
+    """Whether each reorder comes after a delay; words refuse a reorder without effect."""
     delayed, reordered = False, False
     for one in settings.impairments:
         if isinstance(one, Reorder) and (reordered or not delayed):

@@ -1,4 +1,4 @@
-"""What netem's tests share: decisions in great number, compiled, and an observer of deliveries."""
+"""Fixtures for netem's tests: many compiled decisions and an observer of deliveries."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ MOST = 1_000_000
 
 
 class Decided(NamedTuple):
-    """What became of k datagrams, (k,) each, and what the link remembers."""
+    """The decisions for k datagrams, arrays of shape (k,), and the link's memory."""
 
     verdicts: NDArray[Any]
     flows: NDArray[np.int64]
@@ -31,7 +31,7 @@ class Decided(NamedTuple):
 
     @property
     def delays_ns(self) -> NDArray[np.int64]:
-        """From arrival to departure; only of what leaves."""
+        """Times from arrival to departure in ns, without lost datagrams."""
         return np.asarray((self.verdicts["release_ns"] - self.arrivals_ns)[self.leaves])
 
     @property
@@ -49,7 +49,7 @@ def compiled_admit_many() -> Any:
 
 @pytest.fixture(scope="session")
 def decide(compiled_admit_many: Any) -> Decide:
-    """Decisions of the compiled rules; scalars stand for all datagrams alike."""
+    """Return decisions of the compiled rules; a scalar argument applies to all datagrams."""
 
     def run(
         settings: LinkSettings | Sequence[AnyImpairment],
@@ -93,7 +93,7 @@ def _longest_undelivered(decided: Decided) -> NDArray[np.int64]:
         intact = [first & (verdicts["bit"] < 0), second & (verdicts["copy_bit"] < 0)]
         times = np.concatenate([verdicts["release_ns"][intact[0]], verdicts["copy_ns"][intact[1]]])
         leaving = np.concatenate([numbers[intact[0]], numbers[intact[1]]])
-        # Who came first leaves first, of those that leave at the same time.
+        # Datagrams with equal release times leave in the order of arrival.
         in_order = leaving[np.lexsort((leaving, times))]
         newest = np.maximum.accumulate(np.concatenate([[-1], in_order]))
         counted = in_order[in_order > newest[:-1]]
@@ -104,21 +104,21 @@ def _longest_undelivered(decided: Decided) -> NDArray[np.int64]:
 
 @pytest.fixture(scope="session")
 def longest_undelivered() -> Callable[[Decided], NDArray[np.int64]]:
-    """Of each flow, the most successive datagrams that a receiver of the newest never got."""
+    """Each flow's longest sequence of datagrams that were lost or delivered out of order."""
     return _longest_undelivered
 
 
 def assert_share(flags: ArrayLike, expected: float, batches: int = 200) -> None:
-    """The mean is as expected, within five of the standard errors that batch means tell.
+    """Check that the mean agrees with ``expected`` to five standard errors of the batch means.
 
-    Successive flags may be correlated, but hardly over the length of a batch. The seeds are fixed;
-    by chance one test in a million would fail.
+    Flags may be correlated, but the correlation over a whole batch is negligible. The seeds are
+    fixed; with random seeds, one test in a million would fail.
     """
     values = np.asarray(flags, float)
     means = values[: len(values) // batches * batches].reshape(batches, -1).mean(axis=1)
     error = means.std(ddof=1) / np.sqrt(batches)
     assert abs(means.mean() - expected) <= 5 * error
-    assert error <= 0.1 * expected  # so that the line above says something
+    assert error <= 0.1 * expected  # else the assertion above is too weak
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""The compiled rules decide as the plain ones do, bit for bit."""
+"""The compiled rules and the plain rules make the same decisions, bit for bit."""
 
 from collections.abc import Sequence
 from dataclasses import astuple
@@ -57,7 +57,7 @@ def rows(records: Sequence[Any]) -> Any:
 
 
 def assert_equal(decided: Any, verdicts: Any, state: LinkMemory) -> None:
-    """Decisions, and all that is remembered."""
+    """Compare the decisions and the link's whole memory."""
     np.testing.assert_array_equal(decided.verdicts, rows(verdicts))
     np.testing.assert_array_equal(decided.state.flows, rows(state.flows))
     np.testing.assert_array_equal(decided.state.recent_ns, state.recent_ns)
@@ -111,8 +111,8 @@ EVERYTHING = LinkSettings(
 )
 
 
-def test_for_long(decide: Any) -> None:
-    """Twenty thousand datagrams of three flows, through everything at once."""
+def test_many_decisions_of_all_impairments_are_the_same(decide: Any) -> None:
+    """Twenty thousand datagrams of three flows, with all impairments together."""
     count = 20_000
     rng = np.random.default_rng(5)
     flows = rng.integers(0, 3, count)
@@ -126,8 +126,8 @@ def test_for_long(decide: Any) -> None:
     assert (np.bincount(decided.fates, minlength=6) > 0).all()
 
 
-def test_a_record_is_repeated_exactly(decide: Any) -> None:
-    """What was decided, taken again at the same times, is decided again; later the rules go on."""
+def test_recorded_decisions_are_replayed_exactly(decide: Any) -> None:
+    """At the same times, a replay repeats the recorded decisions; after them, the rules decide."""
     count, recorded = 20_000, 15_000
     rng = np.random.default_rng(6)
     arrivals = np.cumsum(rng.integers(0, 2_000_000, count))
@@ -158,7 +158,9 @@ def test_a_record_is_repeated_exactly(decide: Any) -> None:
 
 
 @pytest.mark.parametrize("mansd", [0, 2, 9])
-def test_a_million_decisions(decide: Any, longest_undelivered: Any, mansd: int) -> None:
+def test_a_million_decisions_keep_the_guarantee(
+    decide: Any, longest_undelivered: Any, mansd: int
+) -> None:
     count = 1_000_000
     rng = np.random.default_rng(mansd)
     arrivals = np.cumsum(rng.integers(0, 1_000_000, count))

@@ -81,14 +81,14 @@ def fates(link: Link, flow: int, count: int) -> list[Fate]:
 
 
 def drain(link: Link) -> list[tuple[int, Outputs]]:
-    """What is under way, each when it is due."""
+    """Release all datagrams in flight, each at its due time."""
     found = []
     while (due := link.next_deadline_ns()) is not None:
         found.append((due, link.on_timer(due)))
     return found
 
 
-# What a flow's fates depend on.
+# Inputs that determine a flow's fates.
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.model)
@@ -96,7 +96,7 @@ def drain(link: Link) -> list[tuple[int, Outputs]]:
 def test_a_flows_fates_depend_on_nothing_but_its_own_order(
     loss: Loss, arrivals: list[tuple[int, int]]
 ) -> None:
-    """Whatever the other flows do, and whenever anything comes."""
+    """Fates do not depend on other flows or on arrival times."""
     link = new_link(LossOf(loss=loss))
     found: dict[int, list[Fate]] = {flow: [] for flow in range(4)}
     for flow, now_ns in arrivals:
@@ -110,8 +110,8 @@ def test_a_flows_fates_depend_on_nothing_but_its_own_order(
     st.none() | st.integers(0, 4),
 )
 def test_nor_do_bits_copies_and_delays(arrivals: list[tuple[int, int]], mansd: int | None) -> None:
-    """Of everything but rates, blackouts and the limit. Delays are counted from the arrival,
-    before what the guarantee adds."""
+    """Other flows do not change bits, copies and delays either, except with rates, blackouts and
+    the limit. Delays are measured from the arrival, without the time that the guarantee adds."""
     link = new_link(*TIMELESS, mansd=mansd)
     found: dict[int, list[tuple[int, ...]]] = {flow: [] for flow in range(4)}
 
@@ -145,7 +145,7 @@ def test_every_seed_name_and_flow_has_a_stream_of_its_own(loss: Loss) -> None:
 
 
 def test_two_impairments_of_a_kind_are_independent() -> None:
-    """Both lose with probability 1/2 each: together they lose three in four."""
+    """Each impairment has loss probability 1/2; together they lose three packets in four."""
     half = LossOf(loss=BernoulliLoss(probability=0.5))
     lost = np.array(fates(new_link(half, half, mansd=None), 0, 4000)) == Fate.DROPPED
     assert abs(lost.mean() - 0.75) < 5 * np.sqrt(0.75 * 0.25 / 4000)
@@ -177,7 +177,7 @@ CHANGES: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("place", range(len(TIMELESS)), ids=CHANGES.keys())
 def test_another_probability_changes_no_other_randomness(place: int) -> None:
-    """What does not concern it stays, datagram by datagram, as far as it can be seen."""
+    """The unaffected parts of each decision stay the same, as far as they are observable."""
     one = TIMELESS[place]
     new, its_own = CHANGES[one.kind]
     changed = [*TIMELESS[:place], one.model_copy(update=new), *TIMELESS[place + 1 :]]
@@ -189,7 +189,7 @@ def test_another_probability_changes_no_other_randomness(place: int) -> None:
             seen: dict[str, Any] = {"lost": verdict.fate == Fate.DROPPED}
             if not seen["lost"]:
                 seen["copied"] = verdict.copy_ns >= 0
-                if not seen["copied"]:  # else either may leave first
+                if not seen["copied"]:  # with a copy, either can leave first
                     seen |= {"bit": verdict.bit, "delay_ns": verdict.release_ns - k * 10**9}
             found.append(seen)
         return found
@@ -202,7 +202,7 @@ def test_another_probability_changes_no_other_randomness(place: int) -> None:
     assert all(count > 50 for name, count in compared.items() if name != its_own)
 
 
-def test_the_payload_decides_nothing() -> None:
+def test_the_payload_does_not_change_the_decision() -> None:
     zeros, full = new_link(*TIMELESS), new_link(*TIMELESS)
     for k in range(200):
         (one,) = rows_of(zeros.handle(Datagram(0, bytes(k)), 0))
@@ -211,14 +211,14 @@ def test_the_payload_decides_nothing() -> None:
             assert one[name] == other[name]
 
 
-def test_nor_does_its_size_decide_whether_it_is_lost() -> None:
+def test_the_size_of_a_datagram_does_not_change_its_loss() -> None:
     small, great = new_link(mansd=None), new_link(mansd=None)
     for k in range(200):
         one, other = small.decide(0, 0, 0).fate, great.decide(0, 10 * k, 0).fate
         assert one == other
 
 
-# What becomes of a datagram.
+# The fate of a datagram.
 
 
 @given(st.lists(st.binary(max_size=100), min_size=1, max_size=20))
@@ -267,7 +267,7 @@ def test_a_delayed_datagram_leaves_when_it_is_due_and_is_recorded_again() -> Non
 def test_what_is_under_way_leaves_in_the_order_of_time_and_then_of_arrival(
     steps: list[tuple[int, int]],
 ) -> None:
-    """Every verdict is kept: each datagram and copy leaves once, when it was said to leave."""
+    """Each datagram and each copy leaves exactly once, at the decided time."""
     whole_ms = Delay(distribution="empirical", samples_s=(0.001, 0.001, 0.005, 0.005))
     link = new_link(Duplicate(probability=0.5), whole_ms, Reorder(probability=0.3), mansd=3)
     now_ns, expected, found = 0, [], []
@@ -283,7 +283,9 @@ def test_what_is_under_way_leaves_in_the_order_of_time_and_then_of_arrival(
         expected += [(release_ns, data) for release_ns in times_ns if release_ns >= 0]
         found += [(now_ns, datagram.data) for datagram in sent(outputs)]
     found += [(due, sent(outputs)[0].data) for due, outputs in drain(link)]
-    assert found == sorted(expected, key=lambda leaving: leaving[0])  # stable: ties as they came
+    assert found == sorted(
+        expected, key=lambda leaving: leaving[0]
+    )  # stable: ties in order of arrival
     assert link._state.link.in_flight == 0
 
 
@@ -305,7 +307,7 @@ def test_a_stale_datagram_is_recorded_as_such() -> None:
     assert (link.counters.delivered_out_of_order, link.counters.longest_loss_burst) == (1, 1)
 
 
-def test_a_copy_leaves_too_and_says_so() -> None:
+def test_a_copy_leaves_and_is_recorded_as_a_copy() -> None:
     link = new_link(Duplicate(probability=1.0), Delay(delay_s=0.01))
     (row,) = rows_of(link.handle(Datagram(0, b"x"), 0))
     assert (row["release_ns"], row["copy_ns"]) == (10 * MS, 10 * MS)
@@ -325,11 +327,11 @@ def test_a_corrupted_datagram_has_one_bit_flipped_and_the_record_says_which(data
     assert row["fate"] == Fate.CORRUPTED
     difference = int.from_bytes(changed.data, "little") ^ int.from_bytes(data, "little")
     assert difference == 1 << int(row["bit"])
-    assert row["head"].tobytes()[: len(data)] == data[:PACKET_HEAD_BYTES]  # as it came
+    assert row["head"].tobytes()[: len(data)] == data[:PACKET_HEAD_BYTES]  # as received
 
 
 @pytest.mark.parametrize("copies", [False, True])
-def test_no_more_are_delayed_than_the_limit_lets(copies: bool) -> None:
+def test_the_limit_bounds_the_datagrams_in_flight(copies: bool) -> None:
     impairments = (Duplicate(probability=1.0),) if copies else ()
     link = new_link(*impairments, Delay(delay_s=0.01), mansd=None, limit=5)
     found = fates(link, 0, 20)
@@ -339,7 +341,7 @@ def test_no_more_are_delayed_than_the_limit_lets(copies: bool) -> None:
     assert fate_of(link, 0, 20 * MS) is Fate.DELIVERED
 
 
-def test_copies_of_what_leaves_at_once_keep_to_the_limit_too() -> None:
+def test_the_limit_also_bounds_copies_of_undelayed_datagrams() -> None:
     link = new_link(Duplicate(probability=1.0), Delay(delay_s=0.01), Reorder(), limit=5)
     for k in range(20):
         link.handle(Datagram(0, b"x"), k)
@@ -364,7 +366,7 @@ def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> 
     assert of.forwarded == of.delivered + of.forced + of.corrupted + of.duplicated
 
 
-# Of a scenario.
+# The link of a scenario.
 
 
 @pytest.mark.parametrize(
@@ -377,7 +379,7 @@ def test_every_datagram_is_counted_once(order: list[int], mansd: int | None) -> 
         ({"enforce_mansd": False}, "Fdddddd"),
     ],
 )
-def test_the_link_of_a_scenario_keeps_its_promise(
+def test_the_link_of_a_scenario_keeps_its_mansd(
     content: dict[str, Any], network: dict[str, Any], expected: str
 ) -> None:
     content["network"] |= {"loss": {"model": "worst_case"}, **network}
@@ -386,7 +388,7 @@ def test_the_link_of_a_scenario_keeps_its_promise(
     assert found == expected
 
 
-def test_the_seed_of_the_losses_is_the_scenarios_own(content: dict[str, Any]) -> None:
+def test_losses_depend_on_the_scenarios_loss_seed_only(content: dict[str, Any]) -> None:
     def found(**seeds: int) -> list[Fate]:
         content["seeds"] = seeds
         return fates(update_link_of(resolve(validate(content, "here"))), 0, 100)

@@ -1,7 +1,7 @@
-"""The guarantee, seen by an observer at the receiver who knows nothing of the link's decisions.
+"""The guarantee, checked by an observer at the receiver without access to the link's decisions.
 
-A datagram carries its number three times, so that the observer knows a flipped bit when there is
-one. Intact ones count that are newer than all intact ones before.
+A datagram carries its number three times, so the observer detects a flipped bit. A datagram counts
+as delivered if it is intact and newer than all intact datagrams before it.
 """
 
 import itertools
@@ -92,7 +92,7 @@ gaps_ns = st.sampled_from([0, 0, 1, 1000, MS // 3, MS, 5 * MS, 100 * MS])
 
 
 def steps_of(seed: int, count: int) -> list[tuple[int, int]]:
-    """Flows and gaps, from a seed: lists that hypothesis draws itself are mostly short."""
+    """Flows and gaps, from a seed: most lists that Hypothesis draws itself are short."""
     rng = np.random.default_rng(seed)
     gaps = rng.choice([0, 1, 1000, MS // 3, MS, 5 * MS, 100 * MS], count)
     return list(zip(rng.integers(0, 3, count).tolist(), gaps.tolist(), strict=True))
@@ -106,7 +106,7 @@ def payload(flow: int, number: int) -> bytes:
 
 
 class Observer:
-    """Of each flow, which numbers count."""
+    """Records the numbers of the delivered datagrams of each flow."""
 
     def __init__(self) -> None:
         self.counted: dict[int, list[int]] = {}
@@ -125,7 +125,7 @@ class Observer:
                 counted.append(number)
 
     def longest_loss_burst(self, flow: int, sent: int, since: int = 0) -> int:
-        """Of the datagrams from number ``since`` on, with what was sent and never came."""
+        """Return the longest loss burst of a flow from number ``since`` on, lost ends included."""
         counted = [number for number in self.counted.get(flow, ()) if number >= since]
         borders = [since - 1, *counted, sent]
         return max(b - a - 1 for a, b in itertools.pairwise(borders))
@@ -137,7 +137,7 @@ def send_all(
     late: Callable[[], bool] = lambda: False,
     before_each: Callable[[], None] = lambda: None,
 ) -> tuple[Observer, dict[int, int]]:
-    """Send datagrams at their times, and serve the timers before each unless ``late()``."""
+    """Send datagrams at their times; before each, serve the due timers unless ``late()``."""
     observer, sent = Observer(), dict[int, int]()
     now_ns = 0
     for flow, gap_ns in steps:
@@ -183,7 +183,7 @@ def test_never_more_than_mansd_in_a_row_are_not_delivered(
 def test_nor_when_the_shell_is_late(
     settings: LinkSettings, steps: list[tuple[int, int]], seed: int, share: float
 ) -> None:
-    """Datagrams are handed in while timers are overdue, which are served whenever."""
+    """The guarantee holds if datagrams arrive before overdue timers are served."""
     link = Link(settings, 1, "a")
     rng = np.random.default_rng(seed)
     observer, sent = send_all(link, steps, lambda: rng.random() < share)
@@ -193,7 +193,7 @@ def test_nor_when_the_shell_is_late(
 @settings(max_examples=100)
 @given(links, st.integers(0, 2**32), st.integers(1, 80))
 def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count: int) -> None:
-    """Times of arrival in any order, timers served too early: the guarantee needs no clock."""
+    """The guarantee needs no clock: arrival times in any order, timers served too early."""
     link = Link(settings, 1, "a")
     rng = np.random.default_rng(seed)
     observer, sent = Observer(), [0, 0]
@@ -215,7 +215,7 @@ def test_nor_when_its_clock_goes_astray(settings: LinkSettings, seed: int, count
 def test_nor_when_the_impairments_change(
     stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int
 ) -> None:
-    """Under the same cap, whatever is under way."""
+    """The guarantee holds across changes of the impairments that keep the cap."""
     first, rng = stages[0], np.random.default_rng(seed)
     same = {"mansd": first.mansd, "first_delivered": first.first_delivered}
     link = Link(first, 1, "a")
@@ -233,7 +233,7 @@ def test_nor_when_the_impairments_change(
 def test_another_cap_holds_from_when_it_is_in_force(
     stages: list[LinkSettings], steps: list[tuple[int, int]], seed: int
 ) -> None:
-    """For what comes from then on, whatever is under way or was lost before."""
+    """It holds for all later arrivals, whatever is in flight or was lost before."""
     rng = np.random.default_rng(seed)
     link = Link(stages[0], 1, "a")
     in_force = [stages[0]]
@@ -275,7 +275,7 @@ decisions = st.builds(
 def test_nor_when_anything_is_repeated(
     recorded: list[RecordedDecision], gaps: list[int], mansd: int, first: bool
 ) -> None:
-    """A record may hold decisions that no link would take, and times may differ."""
+    """The guarantee holds in any replay, also of decisions that no link makes, at other times."""
     settings = LinkSettings(
         impairments=(LossOf(loss=WorstCaseLoss()),), mansd=mansd, first_delivered=first
     )
@@ -296,12 +296,12 @@ def test_without_a_cap_the_first_is_still_delivered(
         assert observer.counted[flow][0] == 0
 
 
-# What the cap may not do: be more severe than need be.
+# The cap forces and holds back no more datagrams than necessary.
 
 
 @pytest.mark.parametrize("mansd", range(6))
 @pytest.mark.parametrize("first", [False, True])
-def test_all_is_lost_that_may_be_lost(decide: Any, mansd: int, first: bool) -> None:
+def test_the_cap_forces_only_the_necessary_packets(decide: Any, mansd: int, first: bool) -> None:
     for impairment in (
         LossOf(loss=WorstCaseLoss()),
         Corrupt(probability=1.0),
@@ -313,7 +313,7 @@ def test_all_is_lost_that_may_be_lost(decide: Any, mansd: int, first: bool) -> N
 
 
 def longest_run_of(releases: Sequence[int | None]) -> int:
-    """Of datagrams in their order, with the times at which they leave, by brute force."""
+    """Return the longest loss burst for the given release times, by brute force."""
     fresh = [
         time is not None
         and not any(later is not None and later < time for later in releases[number + 1 :])
@@ -328,7 +328,7 @@ def longest_run_of(releases: Sequence[int | None]) -> int:
 def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
     wishes: list[int | None], mansd: int
 ) -> None:
-    """Against all alternatives: the least time, not before the wish, that keeps the guarantee."""
+    """Compare all times: the earliest at or after the wish that keeps the guarantee is chosen."""
     settings = LinkSettings(impairments=(Delay(delay_s=1.0),), mansd=mansd)
     program = program_of(settings, 0, "a")
     flow, width = new_flow(0, False), recent_width(program)
@@ -355,7 +355,7 @@ def test_a_datagram_is_held_back_exactly_as_long_as_need_be(
 
 @given(st.lists(st.integers(0, 3), max_size=60), st.integers(0, 4), links)
 def test_flows_never_share_a_counter(order: list[int], mansd: int, settings: LinkSettings) -> None:
-    """Each flow's runs are as if it were alone, as long as nothing is shared on purpose."""
+    """Without shared impairments, each flow has the same consecutive losses as alone."""
     own = tuple(one for one in settings.impairments if not isinstance(one, Rate))
     settings = settings.model_copy(update={"impairments": own, "limit": 10_000, "mansd": mansd})
     together = Link(settings, 3, "a")
@@ -371,7 +371,7 @@ def test_flows_never_share_a_counter(order: list[int], mansd: int, settings: Lin
 
 
 def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
-    """Copies change neither which datagrams are forced nor the runs."""
+    """Copies change neither the forced datagrams nor the consecutive losses."""
     worst = LossOf(loss=WorstCaseLoss())
     alone = decide(LinkSettings(impairments=(worst,), mansd=3), 1000)
     doubled = decide(LinkSettings(impairments=(worst, Duplicate(probability=1.0)), mansd=3), 1000)
@@ -381,7 +381,7 @@ def test_a_duplicate_is_not_a_second_delivery(decide: Any) -> None:
     assert (doubled.verdicts["copy_ns"] >= 0).sum() == 250
 
 
-# In great number, compiled, with an observer in NumPy.
+# Many compiled decisions, with an observer in NumPy.
 
 HARSH: dict[str, tuple[AnyImpairment, ...]] = {
     "losses and jitter": (
@@ -406,7 +406,7 @@ HARSH: dict[str, tuple[AnyImpairment, ...]] = {
 @pytest.mark.parametrize("harsh", HARSH.values(), ids=HARSH.keys())
 @pytest.mark.parametrize("mansd", [0, 1, 4, 30])
 @pytest.mark.parametrize("first", [False, True])
-def test_not_once_in_hundreds_of_thousands(
+def test_the_guarantee_holds_for_hundreds_of_thousands_of_datagrams(
     decide: Any, longest_undelivered: Any, harsh: Any, mansd: int, first: bool
 ) -> None:
     count = 400_000
@@ -417,7 +417,7 @@ def test_not_once_in_hundreds_of_thousands(
     decided = decide(settings, count, flows=flows, arrivals_ns=np.cumsum(gaps_ns))
     longest = longest_undelivered(decided)
     assert longest.max() <= mansd
-    assert longest.max() == mansd  # so harsh are they
+    assert longest.max() == mansd  # the impairments reach the bound
 
 
 @given(st.integers(0, 3), st.integers(0, 40))

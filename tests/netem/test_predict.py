@@ -1,4 +1,4 @@
-"""Predicted loss rates, against closed forms and a million decisions of the compiled link."""
+"""Compare predicted loss rates with closed forms and a million decisions of the compiled link."""
 
 import re
 
@@ -19,13 +19,13 @@ from noack.protocol.record_tables import Fate
 DECISIONS = 1_000_000
 BATCHES = 200
 ERRORS = 5
-"""Standard errors allowed; by chance one test in a million would fail, and the seeds are fixed."""
+"""Allowed standard errors: with random seeds, one test in a million would fail; seeds are fixed."""
 
 BERNOULLI = [(p, m) for p in (0.05, 0.5, 0.97) for m in (0, 1, 4, 17)]
 
 
 def not_delivered(settings: LinkSettings, seed: int) -> NDArray[np.bool_]:
-    """Which of a million datagrams of a flow are not effectively delivered."""
+    """Return flags: which of a million datagrams of a flow are not effectively delivered."""
     program = program_of(settings, seed, "test")
     state = compiled_state(program, empty_state(program), 1, recent_width(program))
     verdicts = np.zeros(DECISIONS, dtype_of(PacketDecision))
@@ -54,14 +54,17 @@ def test_losses_without_chance_are_exact() -> None:
         ("loss periodic 2/100", 0.02),
         ("loss periodic 100/100 mansd 3", 3 / 4),
         ("loss periodic 7/100 from 3 mansd 2", 5 / 100),  # lost, lost, not, lost, lost, not, lost
-        ("loss script 0,1,2,7,8,9 every 10 mansd 4", 5 / 10),  # six in a row, across the end
+        (
+            "loss script 0,1,2,7,8,9 every 10 mansd 4",
+            5 / 10,
+        ),  # six consecutive losses, across the end
         ("loss script none every 10", 0.0),
         ("loss periodic 1/2 loss periodic 1/3", 4 / 6),
     ):
         assert predicted_loss(settings_of(words)) == pytest.approx(rate, rel=1e-12), words
 
 
-def test_chains_that_do_not_mix_go_where_they_start() -> None:
+def test_the_prediction_of_a_reducible_chain_depends_on_its_start() -> None:
     for words, rate in (
         ("loss gemodel 0% 0% 100% 10%", 0.1),  # stays good
         ("loss gemodel 10% 0% 60% 10%", 0.6),  # ends up bad
@@ -104,8 +107,8 @@ def test_chains_that_do_not_mix_go_where_they_start() -> None:
         "delay 1ms 1ms loss 30% reorder 20% mansd 2 limit 1000000",
     ],
 )
-def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
-    """The standard error is that of batch means: losses hardly correlate over 5,000 datagrams."""
+def test_a_million_decisions_have_the_predicted_loss(words: str) -> None:
+    """Standard error of batch means: correlation over 5,000 datagrams is negligible."""
     settings = settings_of(words)
     predicted = predicted_loss(settings)
     assert predicted is not None
@@ -113,7 +116,7 @@ def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
     means = lost.reshape(BATCHES, -1).mean(axis=1)
     error = means.std(ddof=1) / np.sqrt(BATCHES)
     assert abs(lost.mean() - predicted) <= ERRORS * error
-    assert error < 0.02 * predicted  # so that the line above says something
+    assert error < 0.02 * predicted  # else the assertion above is too weak
 
 
 @pytest.mark.parametrize(
@@ -132,7 +135,7 @@ def test_a_million_decisions_lose_what_is_predicted(words: str) -> None:
         ),
     ],
 )
-def test_what_cannot_be_told_says_why(words: str, why: str) -> None:
+def test_a_missing_prediction_states_its_reason(words: str, why: str) -> None:
     prediction = predict(settings_of(words))
     assert prediction.rate is None
     assert re.search(why, prediction.note)
@@ -162,13 +165,13 @@ QUEUE, OUT_OF_ORDER = (
         ("rate 1mbit delay 10ms 2ms", f"{QUEUE}; {OUT_OF_ORDER}"),
     ],
 )
-def test_what_is_not_counted_is_said(words: str, note: str) -> None:
+def test_the_note_states_what_the_prediction_excludes(words: str, note: str) -> None:
     assert predict(settings_of(words)).note == note
     assert makes_stale(settings_of(words)) == (OUT_OF_ORDER in note)
 
 
 def makes_stale(settings: LinkSettings) -> bool:
-    """Whether one of some datagrams, 10 µs apart, leaves before one that came before it."""
+    """Whether one of 2000 datagrams, 10 µs apart, leaves before an earlier one."""
     link = Link(settings, 1, "test")
     leaves_ns = []
     for packet in range(2000):

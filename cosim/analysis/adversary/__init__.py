@@ -1,4 +1,4 @@
-"""The pattern of dropouts that does most harm, and how much of a certificate it uses up."""
+"""Search for the worst loss pattern, and the share of a certificate's bound that it reaches."""
 
 from cosim.analysis.adversary.objective import Objective
 from cosim.analysis.adversary.tightness import Worst

@@ -16,7 +16,7 @@ from noack.theory.scenario_certificates import ScenarioCertificate
 def document(
     found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
 ) -> dict[str, Any]:
-    """The results as JSON."""
+    """Return the results as JSON."""
     return {
         "scenario": resolved.name,
         "mode": resolved.mode,
@@ -30,7 +30,7 @@ def document(
 def print_worst(
     console: Console, found: Sequence[Worst], resolved: Scenario, certificate: ScenarioCertificate
 ) -> None:
-    """Print the results, and the patterns that led to them."""
+    """Print the results and their loss patterns."""
     table = Table(
         title=f"{resolved.name}: worst losses found, at most M − 1 = {resolved.network.mansd} "
         f"consecutive, {resolved.horizon_s:g} s"

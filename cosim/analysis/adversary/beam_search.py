@@ -1,10 +1,10 @@
-"""Beam search: where there are too many patterns, the most promising of each kind go on.
+"""Beam search: if there are too many patterns, only the most promising of each kind are continued.
 
-All runs pass through the same windows of time. At the end of each the runs are thinned out: of runs
-that nearly coincide one is kept, and then, of every number of successive dropouts and every part of
-the window, first the best, then the second best, and so on; one half by what a run is worth so far,
-the other by its promise. The promise is what the loop would do by itself, without events: the
-integral of the output's square over the window to come.
+All runs pass through the same time windows. At the end of each window the runs are thinned out. Of
+runs that nearly coincide, one is kept. The others are grouped by their number of consecutive losses
+and their part of the window; from each group first the best run is selected, then the second best,
+and so on. One half of the selection ranks runs by their value so far, the other half by their
+promise: the integral of the output's square over the next window, for the loop without events.
 """
 
 import numpy as np
@@ -38,14 +38,14 @@ def search_beam(
     known: float = -np.inf,
     report: Report = lambda nodes, value: None,
 ) -> WorstPatternFound:
-    """Look for a large value among patterns with at most ``mansd`` consecutive losses.
+    """Search for a large value among patterns with at most ``mansd`` consecutive losses.
 
     Args:
         flow: the loop with its objective.
         mansd: M − 1.
-        width: how many runs go on from one window to the next.
-        window_s: about the time between two events.
-        known: a value that is reached for sure.
+        width: number of runs that continue from one window to the next.
+        window_s: length of a window, about one inter-event time.
+        known: a value that some pattern reaches.
         report: receives the progress.
 
     Raises:
@@ -71,14 +71,14 @@ def search_beam(
 
 
 class _Choice:
-    """Who goes on."""
+    """The selection of the runs that continue."""
 
     def __init__(self, flow: SegmentFlow, width: int, window_s: float) -> None:
         self._measure, self._window_s = flow.measure, window_s
         self._gramian = _gramian(flow, window_s)
 
     def thin(self, nodes: Nodes, width: int) -> Nodes:
-        """At most ``width`` of them."""
+        """Return at most ``width`` of the runs."""
         if len(nodes.t_s) <= width:
             return nodes
         nodes = nodes.take(self._distinct(nodes))
@@ -103,7 +103,7 @@ class _Choice:
         return np.asarray(nodes.dropouts * (_PARTS + 1) + part)
 
     def _distinct(self, nodes: Nodes) -> Indices:
-        """The most valuable of those that nearly coincide."""
+        """Return, for each group of nearly equal runs, the one with the largest value."""
         z = self._scaled(nodes)
         size = np.abs(z).max() or 1.0
         features = np.column_stack([nodes.t_s / self._window_s, z / size, nodes.dropouts])
@@ -113,7 +113,7 @@ class _Choice:
 
 
 def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
-    """Indices in the order of choice: the best of each kind, the second best of each, and so on."""
+    """Return indices in selection order: first the best of each kind, then the second best, etc."""
     then = score if then is None else then
     order = np.lexsort((-then, -score, kind))
     starts = np.flatnonzero(np.diff(kind[order], prepend=-1))
@@ -123,10 +123,10 @@ def _turns(score: Vector, kind: Indices, then: Vector | None = None) -> Indices:
 
 
 def _gramian(flow: SegmentFlow, window_s: float) -> Matrix:
-    """∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
+    """Return ∫₀^window e^{Gᵀs} Cᵀ C e^{Gs} ds, scaled like the objective; CᵀC for event times."""
     system, measure = flow.system, flow.measure
     n = system.loop.n
-    if measure.output is None:  # how fast e_s sets out
+    if measure.output is None:  # the initial speed of e_s
         speed = system.generator[n : 2 * n]
         speed = speed if system.trigger.weight is None else system.trigger.weight @ speed
         return np.asarray(speed.T @ speed)

@@ -1,13 +1,14 @@
-"""What the rest of a run can still add to ∫‖x‖² at most.
+"""Upper bound on the contribution of the rest of a run to ∫‖x‖².
 
 From x' = (A+BK) x + B p, p = K e_c, and the triangle inequality in L₂[t, ∞),
 
     ‖x‖_{L₂} ≤ √(x(t)ᵀ P x(t)) + ∫₀^∞‖e^{(A+BK)s}B U‖ds · ‖p‖_{L₂},  (A+BK)ᵀP + P(A+BK) = −I
 
-(Young's inequality for the convolution; K = U R), where by identity (I1) no pattern makes ‖R e_c‖
-larger than D level(t): D sums the gains of the present e_s and of M − 1 missed ones, however close.
-It is cheap, and it leaves out what comes late in a run. For suprema there is nothing as good: they
-may come at any time, and a bound by rates of growth reaches only the last fraction of a second.
+by Young's inequality for the convolution, with K = U R. By identity (I1) every pattern has
+‖R e_c‖ ≤ D level(t): D sums the gains of the present e_s and of M − 1 missed ones, at any distance.
+The bound is cheap and prunes the late part of the search tree. There is no comparable bound for
+suprema: they may occur at any time, and a bound from growth rates prunes only the last fraction of
+a second.
 """
 
 import numpy as np
@@ -21,7 +22,7 @@ from noack.theory.gains import ErrorGains, Output
 
 
 def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceiling | None:
-    """The bound for a loop; None if A + BK is not stable."""
+    """Return the bound for a loop; None if A + BK is not stable."""
     from scipy.linalg import solve_continuous_lyapunov
 
     loop, trigger = system.loop, system.decaying
@@ -47,7 +48,7 @@ def cost_ceiling(system: ContinuousLoop, mansd: int, horizon_s: float) -> Ceilin
 
 
 def _models(system: ContinuousLoop) -> ErrorGains:
-    """The gains at the threshold's own rate if the models decay faster, otherwise at rate 0."""
+    """Return the gains at the threshold's rate if the models decay faster, otherwise at rate 0."""
     loop, trigger = system.loop, system.decaying
     weight = np.eye(loop.n) if trigger.weight is None else trigger.weight
     gains = ErrorGains(loop.H, loop.K, weight, trigger.alpha_per_s)

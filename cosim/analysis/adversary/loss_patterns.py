@@ -16,7 +16,7 @@ from cosim.simulation.continuous.continuous_run import MAX_EVENTS, TooManyEvents
 from noack.core.linear_systems import Vector
 
 Pattern = tuple[bool, ...]
-"""Whether the update of each event is delivered; of events beyond its end it is."""
+"""Whether the update of each event is delivered; events after its end are delivered."""
 
 _RANDOM = 64
 
@@ -27,11 +27,11 @@ class Outcomes(NamedTuple):
     value: Vector
     """(N,)"""
     patterns: list[Pattern]
-    """The decisions that were made, up to the horizon."""
+    """The applied decisions, up to the horizon."""
 
 
 def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
-    """Run patterns to the horizon; where one asks for too many dropouts, an update is delivered.
+    """Run patterns to the horizon; an update is delivered if its loss would exceed ``mansd``.
 
     Raises:
         TooManyEventsError: a run has more than 100,000 events, or two at the same time.
@@ -57,12 +57,12 @@ def follow(flow: SegmentFlow, mansd: int, patterns: list[Pattern]) -> Outcomes:
 
 
 def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Pattern]:
-    """Patterns to begin with: none lost, all that may be, regular ones, random ones.
+    """Return initial patterns: no losses, as many as admissible, regular ones, random ones.
 
     Args:
         mansd: M − 1.
-        events: how many decisions to make.
-        rng: for the random ones.
+        events: number of decisions.
+        rng: generator for the random patterns.
     """
     if mansd == 0:
         return [()]
@@ -79,16 +79,16 @@ def candidates(mansd: int, events: int, rng: np.random.Generator) -> list[Patter
 def improve(
     flow: SegmentFlow, mansd: int, pattern: Pattern, value: float, most_nodes: int
 ) -> WorstPatternFound:
-    """Change single decisions as long as that makes a pattern worse for the loop.
+    """Change single decisions of a pattern as long as this increases the objective.
 
     Args:
         flow: the loop with its objective.
         mansd: M − 1.
-        pattern: to begin with.
-        value: of it.
-        most_nodes: the search stops beyond.
+        pattern: the initial pattern.
+        value: its value.
+        most_nodes: largest number of nodes; the search stops there.
     """
-    # One that was only decided up to its worst moment is completed.
+    # A pattern may end at the time of its largest value; complete it up to the horizon.
     pattern, visited = follow(flow, mansd, [pattern]).patterns[0], len(pattern)
     while visited + len(pattern) ** 2 <= most_nodes:
         changed = [_changed(pattern, i) for i in range(len(pattern))]

@@ -1,15 +1,15 @@
-"""What the adversary maximises along a run.
+"""The objectives that the adversary maximises along a run.
 
-With z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous.continuous_loop`, a level that falls
-like the threshold, and the run's events t_0 < t_1 < …, over a horizon T:
+z = (x, e_s, e_c) as in :mod:`cosim.simulation.continuous.continuous_loop`. The level decays like
+the threshold, t_0 < t_1 < … are the run's events, and T is the horizon:
 
 * error: sup_{t ≤ T} ‖W e_c(t)‖ / level(t), the observed Δ;
 * state: sup_{t ≤ T} ‖x(t)‖ β / level(t), the observed X;
 * cost: ∫₀^T ‖x(t)‖² dt;
 * inter-event: −min_i (t_{i+1} − t_i).
 
-level(t) = βe^{−rt}, r = α unless a certificate decays at another rate; where the threshold has a
-floor ε and r = α, it is the threshold max(βe^{−αt}, ε).
+level(t) = βe^{−rt} with r = α, unless a certificate has another decay rate. If the threshold has a
+floor ε and r = α, the level is the threshold max(βe^{−αt}, ε).
 """
 
 from dataclasses import dataclass
@@ -32,35 +32,35 @@ class Objective(StrEnum):
 
 @dataclass(frozen=True)
 class Measure:
-    """An objective of a given loop: how its segments between events are valued and put together."""
+    """An objective of a given loop: values of segments between events, and their combination."""
 
     objective: Objective
     output: Matrix | None
-    """C of the output y = C z whose norm counts, (q, 3n); None if only event times count."""
+    """C of the evaluated output y = C z, (q, 3n); None if the objective uses event times only."""
     beta: float
     """The level at t = 0."""
     rate_per_s: float
-    """r, at which the level falls; 0 for the cost."""
+    """r, the level's decay rate; 0 for the cost."""
     floor: float
-    """Below which the level does not fall."""
+    """The smallest value of the level."""
 
     @property
     def additive(self) -> bool:
-        """Whether the values of segments add up; otherwise the largest counts."""
+        """Whether the values of segments are added; otherwise the largest one is the result."""
         return self.objective is Objective.COST
 
     @property
     def nothing(self) -> float:
-        """The value of no segment at all."""
+        """The value of a run without segments."""
         return 0.0 if self.additive else -np.inf
 
     def level(self, t_s: Matrix) -> Matrix:
-        """The level at times (k,), over its value at 0."""
+        """Return the level at times (k,), divided by its value at 0."""
         level = np.exp(-self.rate_per_s * t_s)
         return np.asarray(np.maximum(level, self.floor / self.beta) if self.floor else level)
 
     def joined(self, first: Matrix, second: Matrix) -> Matrix:
-        """The value of two stretches one after the other."""
+        """Return the value of two successive parts of a run."""
         return np.asarray(first + second if self.additive else np.maximum(first, second))
 
 
@@ -71,7 +71,7 @@ def measure_of(
 
     Args:
         system: the loop.
-        objective: what counts.
+        objective: the objective.
         rate_per_s: r of the level; α unless given.
     """
     n, trigger = system.loop.n, system.decaying

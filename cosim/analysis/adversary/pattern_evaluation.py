@@ -1,8 +1,8 @@
-"""What a run of the reference simulator is worth, with suprema enclosed rather than sampled.
+"""Evaluates the objective on a run of the reference simulator; suprema are enclosed, not sampled.
 
-Within a cell |y|² is a polynomial of degree 36. In the Bernstein basis its largest coefficient
-bounds it from above, its first and last are values of it; intervals are halved until nothing can
-exceed the largest value known by more than 1e-12 of it.
+Within a cell |y|² is a polynomial of degree 36. In the Bernstein basis its largest coefficient is
+an upper bound, and its first and last coefficients are values of the polynomial. Intervals are
+halved until the upper bounds exceed the largest value found by at most a share of 1e-12.
 """
 
 import math
@@ -31,9 +31,9 @@ class Valued(NamedTuple):
 
 
 def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
-    """The objective along a run; infinite if it diverged.
+    """Return the objective along a run; infinite if the run diverged.
 
-    The inter-event time comes with the sign of the objective: negative, −∞ without two events.
+    The inter-event time has the sign of the objective: negative, or −∞ with fewer than two events.
     """
     if measure.output is None:
         between_s = np.diff(run.event_s)
@@ -52,17 +52,17 @@ def evaluate(run: ContinuousRun, measure: Measure) -> Valued:
 
 
 class _Part(NamedTuple):
-    """A part of a cell in which the level falls exponentially."""
+    """A part of a cell in which the level decays exponentially."""
 
     begin_s: float
     width_s: float
-    """Of the part."""
+    """Width of the part."""
     taylor: Matrix
-    """Coefficients of the scaled output over it, brought to [0, 1], (p + 1, q)."""
+    """Coefficients of the scaled output over the part, rescaled to [0, 1], (p + 1, q)."""
 
 
 def _cells(run: ContinuousRun, cuts_s: Vector) -> Iterator[tuple[float, float, Vector]]:
-    """Begin, width and (x, e_s, e_c) of all parts of cells between events and cuts."""
+    """Yield start, width and (x, e_s, e_c) of all parts of cells between events and cuts."""
     flow = run.system.flow
     ends_s = [*run.event_s.tolist(), run.horizon_s]
     # With a first packet the run starts at event 0.
@@ -94,7 +94,7 @@ def _parts(run: ContinuousRun, measure: Measure) -> Iterator[_Part]:
 
 
 def _highest(part: _Part, best: Valued) -> Valued:
-    """The larger of the best and the supremum of |y| over a part, to 1e-12 of it."""
+    """Return the larger of ``best`` and sup |y| over a part, to a relative accuracy of 1e-12."""
     basis = curve_stack(DEGREE)
     pending = [(0.0, 1.0, basis.squares(part.taylor[None])[0])]
     while pending:

@@ -1,4 +1,4 @@
-"""All admissible patterns: depth first over the decision at every event, many runs at a time."""
+"""Depth-first search through all admissible loss patterns, many runs at a time."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ from cosim.analysis.adversary.segments import SegmentFlow
 from noack.core.linear_systems import Vector
 
 Ceiling = Callable[[Nodes], Vector]
-"""An upper bound of what the rest of each run can add to its value, (N,)."""
+"""Returns an upper bound on the value that the rest of each run can add, (N,)."""
 
 _BLOCK = 4096
 
@@ -32,14 +32,14 @@ def search_tree(
     ceiling: Ceiling | None = None,
     report: Report = lambda nodes, value: None,
 ) -> WorstPatternFound:
-    """Look for the largest value over all patterns with at most ``mansd`` consecutive losses.
+    """Search for the largest value over all patterns with at most ``mansd`` consecutive losses.
 
     Args:
         flow: the loop with its objective.
         mansd: M − 1.
-        most_nodes: the search stops beyond.
-        known: a value that is reached for sure: what cannot exceed it is left out.
-        ceiling: lets branches be left out that cannot exceed the best.
+        most_nodes: largest number of nodes; the search stops there.
+        known: a value that some pattern reaches; branches that cannot exceed it are pruned.
+        ceiling: bound for pruning branches that cannot exceed the largest value so far.
         report: receives the progress.
 
     Raises:
@@ -66,7 +66,7 @@ def search_tree(
 
 
 def _top(pile: list[Nodes]) -> Nodes:
-    """Take a block of nodes off the pile, the deepest first."""
+    """Pop a block of nodes from the stack, the deepest first."""
     parts, room = [], _BLOCK
     while pile and room > 0:
         nodes = pile.pop()

@@ -1,8 +1,7 @@
-"""First exits from the unit ball, and highest points, of many polynomial curves at once.
+"""First exits from the unit ball, and maxima, of many polynomial curves at once.
 
-The isolation of crossings is that of :mod:`cosim.simulation.continuous.bernstein`, in array
-operations for all curves. Nearly all curves cross once or not at all; the others are isolated one
-by one.
+Crossings are isolated as in :mod:`cosim.simulation.continuous.bernstein`, in array operations over
+all curves. Nearly all curves cross at most once; the others are isolated one by one.
 """
 
 from functools import lru_cache
@@ -26,7 +25,7 @@ class CurveStack(CurveBasis):
     """Vector-valued polynomials of one degree on [0, 1], many at a time."""
 
     def first_exits(self, taylor: Stack) -> Vector:
-        """The first u in [0, 1] after which |y(u)| > 1 for a while, of each curve; NaN for none.
+        """Return each curve's first u in [0, 1] after which |y(u)| becomes > 1; NaN for none.
 
         Args:
             taylor: coefficients of y(u) = Σ_k ``taylor``[·, k] u^k, shape (N, p + 1, n).
@@ -47,38 +46,38 @@ class CurveStack(CurveBasis):
         return found
 
     def squares(self, taylor: Stack) -> Stack:
-        """Bernstein coefficients of |y(u)|² of each curve, (N, 2p + 1).
+        """Return the Bernstein coefficients of |y(u)|² of each curve, (N, 2p + 1).
 
-        The largest bounds |y|² on [0, 1]; the first and last are its values at 0 and 1.
+        The largest coefficient bounds |y|² on [0, 1]; the first and the last are |y|² at 0 and 1.
         """
         control = self.from_taylor @ taylor
         products = (control @ control.transpose(0, 2, 1)).reshape(len(taylor), -1)
         return np.asarray(products @ self.square.T)
 
     def halves(self, squares: Vector) -> tuple[Vector, Vector]:
-        """The coefficients on [0, ½] and on [½, 1], each brought to [0, 1]."""
+        """Return the coefficients on [0, ½] and on [½, 1], each rescaled to [0, 1]."""
         left, right = np.split(self._halves @ squares, 2)
         return left, right
 
 
 @lru_cache
 def curve_stack(degree: int) -> CurveStack:
-    """The basis of a degree, made once."""
+    """Return the cached basis of a degree."""
     return CurveStack(degree)
 
 
 def powers(u: Vector, degree: int) -> Stack:
-    """u^k for k = 0 … ``degree``, shape (N, p + 1)."""
+    """Return u^k for k = 0 … ``degree``, shape (N, p + 1)."""
     return np.vander(u, degree + 1, increasing=True)
 
 
 def peak_squares(taylor: Stack, at: Vector, reach: float) -> Vector:
-    """The highest |y|² within ``reach`` of u = ``at``, by Newton's method on its slope, (N,).
+    """Return the maximum of |y|² within ``reach`` of u = ``at``, by Newton's method, (N,).
 
     Args:
         taylor: coefficients of the curves, (N, p + 1, n).
-        at: where |y|² is known to be about highest, (N,).
-        reach: so small that |y|² has one maximum there.
+        at: approximate positions of the maxima, (N,).
+        reach: half width of an interval so short that |y|² has one maximum in it.
     """
     degree = taylor.shape[1] - 1
     first = np.arange(1.0, degree + 1)[:, None] * taylor[:, 1:]
@@ -91,7 +90,7 @@ def peak_squares(taylor: Stack, at: Vector, reach: float) -> Vector:
         slope, bend = _values(u_k[:, :-1], first), _values(u_k[:, :-2], second)
         rise = np.einsum("ai,ai->a", y, slope)
         curvature = np.einsum("ai,ai->a", slope, slope) + np.einsum("ai,ai->a", y, bend)
-        # Where |y|² bends upward, its maximum is at an end of the interval.
+        # If |y|² is convex, its maximum is at an end of the interval.
         to_the_end = np.where(rise > 0, high, low) - u
         step = np.divide(-rise, curvature, out=to_the_end, where=curvature < 0)
         u = np.clip(u + step, low, high)
@@ -104,7 +103,7 @@ def _values(u_k: Stack, taylor: Stack) -> Stack:
 
 
 def _crossings(taylor: Stack) -> Vector:
-    """Newton's method on |y(u)| = 1 for curves that cross once, bisecting when it leaves [0, 1]."""
+    """Solve |y(u)| = 1 for curves that cross once: Newton's method, bisection outside [0, 1]."""
     degree = taylor.shape[1] - 1
     first = np.arange(1.0, degree + 1)[:, None] * taylor[:, 1:]
     inside, outside = np.zeros(len(taylor)), np.ones(len(taylor))
@@ -118,7 +117,7 @@ def _crossings(taylor: Stack) -> Vector:
         following = u - np.divide(excess, growth, out=np.full_like(u, np.inf), where=growth != 0)
         newton = (inside <= following) & (following <= outside)
         following = np.where(newton, following, (inside + outside) / 2)
-        # What is left after a step of Newton's method is about the square of the step.
+        # The error after a step of Newton's method is about the square of the step.
         settled = newton & (np.abs(following - u) <= _SMALL_STEP * outside)
         settled |= outside - inside <= _FINEST * outside
         u = following

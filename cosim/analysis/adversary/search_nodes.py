@@ -1,4 +1,4 @@
-"""Runs of the loop that advance together, with the decisions of each."""
+"""Runs of the loop that are computed together, with the loss decisions of each."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ Report = Callable[[int, float], None]
 """Receives the nodes visited and the best value so far."""
 
 START = -1
-"""The entry of runs in which nothing has been decided."""
+"""The entry of a run without any decision."""
 
 
 class Nodes(NamedTuple):
@@ -28,14 +28,14 @@ class Nodes(NamedTuple):
     z: Matrix
     """(x, e_s, e_c), (N, 3n)."""
     dropouts: Indices
-    """Successive ones up to now, (N,)."""
+    """Current number of consecutive losses, (N,)."""
     value: Vector
-    """What the run is worth so far, (N,)."""
+    """The objective's value of the run up to ``t_s``, (N,)."""
     entry: Indices
-    """The last decision's number in the log, (N,)."""
+    """Index of the last decision in the log, (N,)."""
 
     def take(self, which: Indices | Flags | slice) -> "Nodes":
-        """Some of them."""
+        """Return a selection of the runs."""
         return Nodes(
             self.t_s[which],
             self.z[which],
@@ -46,7 +46,7 @@ class Nodes(NamedTuple):
 
 
 def root(flow: SegmentFlow) -> Nodes:
-    """The start: sensor and controller have x(0), from the first packet or from the scenario."""
+    """Return the start: sensor and controller have x(0), by the first packet or the scenario."""
     x0 = flow.system.loop.x0
     z = np.concatenate([x0, np.zeros(2 * len(x0))])[None]
     return Nodes(
@@ -55,12 +55,12 @@ def root(flow: SegmentFlow) -> Nodes:
 
 
 def together(parts: Sequence[Nodes]) -> Nodes:
-    """All of several groups."""
+    """Return several groups as one."""
     return Nodes(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 class DecisionLog:
-    """Decisions, each with the one before it."""
+    """A log of decisions; each entry refers to the decision before it."""
 
     def __init__(self) -> None:
         self._parents: list[Indices] = []
@@ -68,14 +68,14 @@ class DecisionLog:
         self._length = 0
 
     def add(self, parents: Indices, delivered: Flags) -> Indices:
-        """Enter decisions; returns their numbers."""
+        """Append decisions; return their indices."""
         self._parents.append(parents)
         self._delivered.append(delivered)
         self._length += len(parents)
         return np.arange(self._length - len(parents), self._length)
 
     def decisions(self, entry: int) -> tuple[bool, ...]:
-        """Whether each event up to this entry was delivered."""
+        """Return whether the update of each event up to this entry was delivered."""
         starts = np.cumsum([0, *map(len, self._parents)])
         found: list[bool] = []
         while entry != START:
@@ -90,29 +90,29 @@ class WorstPatternFound(NamedTuple):
     """The result of a search."""
 
     value: float
-    """The largest value seen, or what the search started with."""
+    """The largest value found, or the search's initial value if none was larger."""
     decisions: tuple[bool, ...] | None
-    """Whether the update of each event arrives, up to where the value was reached; None if nothing
-    exceeded what the search started with."""
+    """Whether the update of each event arrives, up to the time of the value; None if no pattern
+    exceeded the initial value."""
     nodes: int
     """Segments between events that were computed."""
     complete: bool
-    """Whether every pattern was covered."""
+    """Whether the search covered every pattern."""
 
 
 class Best:
-    """The worst run seen: for the adversary, the best."""
+    """The run with the largest objective so far."""
 
     def __init__(self, flow: SegmentFlow, value: float = -np.inf) -> None:
         self._measure = flow.measure
         self.value = value
         self.entry: int | None = None
-        """Its last decision; None while nothing has exceeded the value to start with."""
+        """Last decision of that run; None until a run exceeds the initial value."""
 
     def see(self, nodes: Nodes, segments: Segments) -> Vector:
-        """Look at the segments that follow nodes; returns what the runs are worth now, (N,)."""
+        """Evaluate the segments that follow nodes; return the values of the runs, (N,)."""
         value = self._measure.joined(nodes.value, segments.value)
-        # A sum counts once it is complete.
+        # A sum is compared only when the run is complete.
         pending = segments.is_event & self._measure.additive
         candidates = np.where(pending, -np.inf, value)
         top = int(candidates.argmax())
@@ -121,7 +121,7 @@ class Best:
         return value
 
     def found(self, log: DecisionLog, nodes: int, *, complete: bool) -> WorstPatternFound:
-        """What was found in the end."""
+        """Return the result of the search."""
         decisions = None if self.entry is None else log.decisions(self.entry)
         return WorstPatternFound(self.value, decisions, nodes, complete)
 
@@ -134,15 +134,15 @@ def after_events(
     delivered: Flags,
     log: DecisionLog,
 ) -> Nodes:
-    """The runs ``these`` after the events that ended their segments.
+    """Return the runs ``these`` just after the events at the end of their segments.
 
     Args:
-        nodes: before the segments.
-        segments: that ended in events.
-        value: of the runs up to there, (N,).
-        these: which runs, (k,).
-        delivered: whether the update of each arrives, (k,).
-        log: takes the decisions.
+        nodes: the runs before the segments.
+        segments: the segments; those of ``these`` end in events.
+        value: values of the runs at the end of the segments, (N,).
+        these: indices of the runs, (k,).
+        delivered: whether the update of each run arrives, (k,).
+        log: receives the decisions.
 
     Raises:
         TooManyEventsError: two events at the same time.
@@ -166,7 +166,7 @@ def after_events(
 def branches(
     nodes: Nodes, segments: Segments, value: Vector, mansd: int, log: DecisionLog
 ) -> Nodes:
-    """All runs that can follow: each update lost, if ``mansd`` allows, and delivered."""
+    """Return all successors: each update lost (if ``mansd`` allows it) and delivered."""
     events = np.flatnonzero(segments.is_event)
     losable = events[nodes.dropouts[events] < mansd]
     fates = np.repeat([False, True], [len(losable), len(events)])

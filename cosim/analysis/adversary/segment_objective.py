@@ -1,10 +1,11 @@
-"""What a stretch of a run is worth: the supremum of a norm, or the integral of its square.
+"""The objective's value on a part of a run: the supremum of a norm, or the integral of its square.
 
-Within a cell an output y of the loop is a polynomial of degree 18 to rounding. The integral of |y|²
-is a Gauss–Legendre rule that is exact for it. The supremum is looked for at 17 points and, from
-every one of them that is higher than its neighbours and nearly the highest, by Newton's method to
-rounding. It can be missed only where |y|² has two maxima within 1/16 of a cell: its slope then has
-three zeros there, so that it varies by at most 1e-6 of its fourth derivative, per cell.
+Within a cell an output y of the loop is a polynomial of degree 18, up to rounding. The integral of
+|y|² is computed by a Gauss–Legendre rule that is exact for this degree. The supremum is searched at
+17 points. From every point that is higher than its neighbours and close to the maximum, Newton's
+method refines it to rounding. The supremum can be missed only if |y|² has two maxima within 1/16 of
+a cell. Then the slope has three zeros there, and |y|² varies by at most 1e-6 of its fourth
+derivative, per cell.
 """
 
 from typing import Protocol
@@ -17,16 +18,16 @@ from noack.core.linear_systems import Matrix, Vector
 
 _POINTS = np.linspace(0.0, 1.0, 17)
 _CLOSE = 0.95
-"""A sampled |y|² is within 5 % of its maximum."""
+"""A sampled |y|² next to a maximum is at least this share of it; lower points are not refined."""
 
 
 class SegmentObjective(Protocol):
-    """How a stretch is valued.
+    """Returns the values of parts of cells.
 
     Args:
         z: scaled states at the start of cells, (N, 3n).
-        u: how much of each cell counts, in (0, 1], (N,).
-        known: values below need not be precise, (N,).
+        u: the share of each cell that is evaluated, from its start, in (0, 1], (N,).
+        known: results below these values may be inaccurate, (N,).
     """
 
     def __call__(self, z: Matrix, u: Vector, known: Vector) -> Vector:
@@ -35,7 +36,7 @@ class SegmentObjective(Protocol):
 
 
 class Supremum:
-    """Of |y| over parts of cells.
+    """The supremum of |y| over parts of cells.
 
     Args:
         taylor: Taylor coefficients of y over a cell, (p + 1, q, 3n).
@@ -59,11 +60,11 @@ class Supremum:
 
 
 class SquareIntegral:
-    """Of |y|² over parts of cells.
+    """The integral of |y|² over parts of cells.
 
     Args:
         taylor: Taylor coefficients of y over a cell, (p + 1, q, 3n).
-        width_s: of a cell.
+        width_s: width of a cell.
     """
 
     def __init__(self, taylor: Stack, width_s: float) -> None:
@@ -86,12 +87,12 @@ class _OutputCurve:
         self._whole = columns(np.tensordot(self._at_points, taylor, 1))
 
     def taylor(self, z: Matrix, u: Vector) -> Stack:
-        """Coefficients of y over [0, u] of the cell, brought to [0, 1]; (N, p + 1, q)."""
+        """Return y's coefficients over [0, u] of the cell, rescaled to [0, 1]; (N, p + 1, q)."""
         whole = (z @ self._taylor).reshape(len(z), DEGREE + 1, self._q)
         return np.asarray(whole * powers(u, DEGREE)[:, :, None])
 
     def squares(self, z: Matrix, u: Vector) -> Stack:
-        """|y|² at the points, (N, points)."""
+        """Return |y|² at the points, (N, points)."""
         y = np.empty((len(z), self._points, self._q))
         whole = u == 1.0
         y[whole] = (z[whole] @ self._whole).reshape(-1, self._points, self._q)
@@ -100,5 +101,5 @@ class _OutputCurve:
 
 
 def columns(terms: Stack) -> Matrix:
-    """(p, q, N) as a matrix (N, p q) that states, as rows, are multiplied by."""
+    """Return terms (p, q, N) as a matrix (N, p q), the right factor for states in rows."""
     return np.ascontiguousarray(terms.reshape(-1, terms.shape[2]).T)

@@ -1,7 +1,7 @@
-"""From each of many states to its next event, and what the way there is worth.
+"""Computes segments: from each of many states to its next event, with the objective's value.
 
 Cells, polynomials and crossings are those of :mod:`cosim.simulation.continuous.continuous_loop`;
-here all states take each step together.
+here they are computed for all states at once.
 """
 
 import math
@@ -27,26 +27,26 @@ _SLACK = 1e-13
 
 
 class Segments(NamedTuple):
-    """Where N states got to: the next event, or the horizon."""
+    """The ends of N segments: the next event, or the horizon."""
 
     end_s: Vector
     """(N,)"""
     z: Matrix
-    """(x, e_s, e_c) there, before any reset, (N, 3n)."""
+    """(x, e_s, e_c) at the end, before any reset, (N, 3n)."""
     is_event: NDArray[np.bool_]
-    """Whether an event ended it; otherwise the horizon did, or the loop diverged, (N,)."""
+    """Whether the segment ends in an event, not at the horizon or by divergence, (N,)."""
     value: Vector
-    """What the segment is worth, (N,); infinite if the loop diverged."""
+    """The segment's value, (N,); infinite if the loop diverged."""
 
 
 class SegmentFlow:
-    """Takes states to their next events.
+    """Follows states to their next events.
 
     Args:
         system: the loop.
-        measure: what a segment is worth.
-        horizon_s: where everything ends.
-        known_start: sensor and controller know x(0), so that no event happens at t = 0.
+        measure: the objective that evaluates a segment.
+        horizon_s: end of the runs.
+        known_start: sensor and controller start from x(0), so there is no event at t = 0.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class SegmentFlow:
         Args:
             t_s: their times, at most the horizon, (N,).
             z: (x, e_s, e_c), (N, 3n).
-            known: values below need not be precise.
+            known: results below this value may be inaccurate.
         """
         count, measure = len(t_s), self.measure
         found = Segments(
@@ -98,7 +98,7 @@ class SegmentFlow:
 
 
 class _Phase:
-    """A time over which threshold and level fall exponentially, at ``alpha`` and ``rate``."""
+    """An interval with exponential decay of threshold and level, at ``alpha`` and ``rate``."""
 
     def __init__(
         self, system: ContinuousLoop, measure: Measure, alpha_per_s: float, rate_per_s: float
@@ -162,7 +162,7 @@ class _Phase:
         return found
 
     def _exits(self, scaled: Matrix) -> Vector:
-        """Where in the cell W e_s / threshold leaves the unit ball, NaN for nowhere, (N,)."""
+        """Return where W e_s / threshold leaves the unit ball in the cell, (N,); NaN if nowhere."""
         shape = (-1, DEGREE + 1, self._system.loop.n)
         control = (scaled @ self._control).reshape(shape)
         reach = np.einsum("aki,aki->ak", control, control).max(axis=1)
@@ -173,6 +173,6 @@ class _Phase:
         return exits
 
     def _within(self, z: Matrix, u: Vector) -> Matrix:
-        """State at the part u of the cell."""
+        """Return the state at position u ∈ [0, 1] of the cell."""
         terms = (z @ self._state).reshape(len(z), DEGREE + 1, z.shape[1])
         return np.asarray(np.einsum("ak,aki->ai", powers(u, DEGREE), terms))

@@ -25,9 +25,9 @@ class Worst:
     objective: Objective
     horizon_s: float
     value: float | None
-    """Infinite if the loop diverges; None if there are no two events between which time passes."""
+    """Infinite if the loop diverges; None if there is no inter-event time above 0."""
     at_s: float | None
-    """Where a supremum is reached, or the later of the two closest events."""
+    """Time of the supremum, or of the later of the two closest events."""
     pattern: Pattern
     """Whether the update of each event is delivered."""
     event_s: tuple[float, ...]
@@ -37,17 +37,17 @@ class Worst:
     nodes: int
     """Segments between events that were computed."""
     lossless: float | None
-    """The same when nothing is lost."""
+    """The value without losses."""
     own: float | None
-    """The same under the losses of the scenario's own network."""
+    """The value with the losses of the scenario's own network."""
     certified: float | None
-    """The certificate's bound, for the paper's conditions; None without a certificate."""
+    """The certificate's bound under the paper's conditions; None without a certificate."""
     elapsed_s: float = field(compare=False)
     """Wall time of the search."""
 
     @property
     def tightness(self) -> float | None:
-        """Found over certified, or for inter-event times certified over found: at most 1."""
+        """Found / certified value, or certified / found for inter-event times: at most 1."""
         if self.value is None or self.certified is None or not self.certified or not self.value:
             return None
         if self.objective is Objective.INTER_EVENT:
@@ -61,7 +61,7 @@ class Worst:
 
     @property
     def diverges(self) -> bool:
-        """Whether the pattern takes the state to infinity."""
+        """Whether the loop diverges under the pattern."""
         return self.value == math.inf
 
     @property
@@ -70,7 +70,7 @@ class Worst:
         return "".join("D" if delivered else "·" for delivered in self.pattern)
 
     def to_json(self) -> dict[str, Any]:
-        """All fields for JSON; an infinite value becomes null."""
+        """Return all fields for JSON; an infinite value becomes null."""
         found = asdict(self) | {
             "objective": self.objective.value,
             "pattern": self.text,
@@ -83,7 +83,7 @@ class Worst:
 
 
 def shown(value: float, objective: Objective) -> float | None:
-    """In the objective's own sign."""
+    """Return a value with the sign of the reported quantity."""
     if objective is not Objective.INTER_EVENT:
         return value
     return None if value == -math.inf else -value
@@ -92,7 +92,7 @@ def shown(value: float, objective: Objective) -> float | None:
 def certified(
     certificate: ScenarioCertificate, measure: Measure, horizon_s: float, valued: Valued
 ) -> float | None:
-    """The certificate's bound of the same quantity, at the same time."""
+    """Return the certificate's bound on the same quantity at the same time."""
     first, late = certificate.constants, certificate.floor_constants
     if first is None:
         return None
@@ -110,6 +110,6 @@ def certified(
 
 
 def _square_integral(constants: Constants, until_s: float) -> float:
-    """∫(X e^{−rt})² dt up to ``until_s``."""
+    """Return ∫(X e^{−rt})² dt up to ``until_s``."""
     rate = 2 * constants.rate_per_s
     return constants.state**2 * (-math.expm1(-rate * until_s) / rate if rate else until_s)

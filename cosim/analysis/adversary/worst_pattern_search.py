@@ -1,9 +1,10 @@
-"""The worst admissible pattern of dropouts for a scenario, and how near a certificate comes to it.
+"""The worst admissible loss pattern of a scenario, compared with the certificate.
 
-First the patterns that anybody would try, each with single decisions changed as long as that helps,
-and a beam search; then all patterns, depth first, up to a number of nodes. If that is enough, and
-the reference simulator confirms the value, the result is exact: no admissible pattern is worse, to
-the resolution of :mod:`cosim.analysis.adversary.segment_objective`.
+The search first evaluates regular and random patterns, improves each by changes of single
+decisions, and runs a beam search. Then it searches all patterns, depth first, up to a number of
+nodes. If this covers all patterns and the reference simulator confirms the value, the result is
+exact: no admissible pattern is worse, within the resolution of
+:mod:`cosim.analysis.adversary.segment_objective`.
 """
 
 import math
@@ -39,11 +40,11 @@ _LONGEST = 1000
 _CONFIRMED = 1e-5
 
 SearchReport = Callable[[str, int, float], None]
-"""Receives the current step, the nodes it visited, and the worst value so far."""
+"""Receives the current search step, its number of visited nodes, and the largest value so far."""
 
 
 class _Known(NamedTuple):
-    """A pattern and what it is worth by the fast computation."""
+    """A pattern and its value by the fast computation."""
 
     value: float
     pattern: Pattern
@@ -60,24 +61,24 @@ def find_worst(
     certificate: ScenarioCertificate | None = None,
     report: SearchReport = lambda what, nodes, value: None,
 ) -> Worst:
-    """Find the pattern, with at most M − 1 consecutive updates lost, that is worst for the loop.
+    """Find the pattern with at most M − 1 consecutive losses that maximises the objective.
 
-    The loop is the paper's, in exact continuous time on an instant network, from a delivered start.
-    The same arguments give the same result.
+    The loop is the paper's, in exact continuous time without network delay; the first update is
+    delivered. The same arguments give the same result.
 
     Args:
-        resolved: the scenario; its loss model does not matter here, its ``network.mansd`` does.
+        resolved: the scenario; its ``network.mansd`` is used, its loss model only for comparison.
         objective: the value to maximise.
-        horizon_s: the scenario's unless given.
-        most_nodes: of the search through all patterns; 0 for none.
-        beam: runs that the beam search carries along; 0 for none.
-        seed: of the random patterns.
-        certificate: to compare with; the scenario's own plant's, for continuous triggering and an
-            instant network, unless given.
+        horizon_s: end of the run; by default the scenario's.
+        most_nodes: largest number of nodes of the search through all patterns; 0 for no search.
+        beam: width of the beam search; 0 for no search.
+        seed: seed of the random patterns.
+        certificate: the certificate to compare with; by default that of the scenario's own plant,
+            for continuous triggering without network delay.
         report: receives the progress.
 
     Raises:
-        CallerError: the events accumulate, or the threshold decays to nothing before the horizon.
+        CallerError: the events accumulate, or the threshold becomes too small before the horizon.
     """
     began_s = time.monotonic()
     certificate = certificate or certify(resolved, ideal_conditions(resolved))
@@ -133,17 +134,17 @@ class _Trial:
         )
 
     def whole(self, pattern: Pattern) -> Pattern:
-        """With the first packet, which no search decides on."""
+        """Add the first packet, which is always delivered and not part of a search."""
         return pattern if self.flow.known_start else (True, *pattern)
 
     def decided(self, run: ContinuousRun) -> Pattern:
-        """Without the first packet."""
+        """Return a run's decisions without the first packet."""
         pattern = tuple(run.delivered.tolist())
         return pattern if self.flow.known_start else pattern[1:]
 
 
 class _Search:
-    """Carries the worst pattern from one search to the next."""
+    """The search steps; each one starts from the worst pattern found before."""
 
     def __init__(self, trial: _Trial, mansd: int, report: SearchReport) -> None:
         self._flow, self._mansd, self._report = trial.flow, mansd, report
@@ -164,7 +165,7 @@ class _Search:
             self.improve(_Known(float(tried.value[i]), tried.patterns[i]), _NODES_FOR_A_GUESS)
 
     def beam(self, width: int) -> None:
-        """Carry along ``width`` runs."""
+        """Run a beam search of ``width`` runs."""
         self._take(
             search_beam(
                 self._flow, self._mansd, width, self._window_s, known=self.known.value,
@@ -173,7 +174,7 @@ class _Search:
         )  # fmt: skip
 
     def tree(self, most_nodes: int) -> None:
-        """Try everything."""
+        """Search all patterns."""
         flow, mansd = self._flow, self._mansd
         additive = flow.measure.additive
         found = search_tree(

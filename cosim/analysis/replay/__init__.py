@@ -1,14 +1,14 @@
 """Bit-exact replay of a recorded run.
 
-Every machine is fed its recorded inputs, in the order of the ``input`` column over all its tables
-and at their recorded ``now_ns``. Compared are
+Every machine receives its recorded inputs, in the order of the ``input`` column over all its tables
+and at their recorded ``now_ns``. The replay compares
 
-* every row that it emits with the recorded row, byte for byte (``machine_replay.py``), and
-* every message that it emits with what the next process recorded as received
+* every emitted row with the recorded row, byte for byte (``machine_replay.py``), and
+* every emitted message with the message that the next process recorded as received
   (``message_comparison.py``).
 
-What no output depends on cannot be compared: ``now_ns`` is checked only against the deadlines and
-against running backward.
+No output depends on the exact value of ``now_ns``. So it is only checked that ``now_ns`` is not
+before the deadlines and does not decrease.
 """
 
 import numpy as np
@@ -23,8 +23,8 @@ __all__ = ["Replay", "replay"]
 
 
 def replay(record: RunRecord) -> Replay:
-    """Replay a run and compare it with its record; a process with gaps is replayed up to there."""
-    with np.errstate(all="ignore"):  # a run that diverged is replayed, too
+    """Replay a run and compare it with its record; a process is replayed up to its first gap."""
+    with np.errstate(all="ignore"):  # a diverging run overflows and is replayed all the same
         replayed = {role: replay_machine(role, record) for role in LOOP_ROLES}
         messages = check_messages(record, replayed)
     accounts = tuple(account for one in replayed.values() for account in one.accounts)

@@ -1,4 +1,4 @@
-"""Replays one machine from its own rows and compares the rows that it emits."""
+"""Replays one machine from its recorded rows and compares the rows that it emits."""
 
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -44,24 +44,24 @@ _MACHINES: Mapping[str, Callable[[Scenario, Start], Machine[Any]]] = {
 }
 _TIMERS = (PLANT_STEP, CONTROLLER_STEP, NETEM_RELEASE)
 _MOST_BYTES = 65_535
-"""No datagram is longer, whatever a damaged record says."""
+"""Largest size of a datagram; a damaged record may contain larger numbers."""
 
 
 @dataclass(frozen=True)
 class MachineReplay:
-    """The replay of a role's machines: the account of each, and the messages that they emitted."""
+    """The replay of a role's machines: the result of each, and the messages that they emitted."""
 
     accounts: tuple[ProcessReplay, ...]
     sent: Sequence[Any]
 
     @property
     def whole(self) -> bool:
-        """Whether all that was done was replayed."""
+        """Whether every input was replayed."""
         return all(account.whole for account in self.accounts)
 
 
 def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
-    """Names of the columns that make up the vector of a received message."""
+    """Return the names of the columns that contain the vector of a received message."""
     if table == SENSOR_ACKNOWLEDGEMENT:
         return ()
     names = rows.dtype.names or ()
@@ -73,7 +73,7 @@ def vector_columns(table: str, rows: Rows) -> tuple[str, ...]:
 def replay_machine(role: str, record: RunRecord) -> MachineReplay:
     """Feed a process's machine its recorded inputs, up to the first gap, and compare its rows.
 
-    If others took the place of the process, so do theirs.
+    If the process was restarted, the machine of each restarted process is replayed too.
     """
     sent: list[Any] = []
     accounts = [_replay_life(role, record.scenario, life, sent) for life in record.lives(role)]
@@ -102,9 +102,9 @@ def _replay_life(role: str, scenario: Scenario, life: Life, sent: list[Any]) -> 
 
 
 def _start(life: Life) -> Start:
-    """Where a process began its work: for the controller, at its first tick.
+    """Return the start of a process: for the controller, its first tick.
 
-    If it died before that, its first message shows it.
+    If the controller died before its first tick, its first message determines the start.
     """
     if not life.generation or CONTROLLER_STEP not in life.rows:
         return Start(life.generation)
@@ -135,7 +135,7 @@ def _inputs(owned: Mapping[str, Rows], report: Mapping[str, Any] | None, first: 
         doubtful = whole
         if numbers[whole] > whole:
             missing_from = whole
-            if written == count:  # no row is missing, so one of them must have a wrong number
+            if written == count:  # no row is missing, so an ``input`` number is wrong
                 repeated = np.append(np.diff(numbers) == 0, False)
                 doubtful = int(np.flatnonzero(repeated | (numbers >= count))[0])
         if numbers[whole] < whole or written == count:
@@ -186,7 +186,7 @@ class _Run:
             LookupError,
             ValueError,
             CallerError,
-        ) as error:  # from numbers that no run has
+        ) as error:  # a damaged record has values that no run can have
             self._differs(table, row, f"the machine cannot take this input: {error}")
             return False
         return True
@@ -211,7 +211,7 @@ class _Run:
 
 
 def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | ParameterChange | None]:
-    """Yield what the machine took at each row; None for its timer."""
+    """Yield the machine's input of each row; None for its timer."""
     if table in _TIMERS:
         yield from itertools.repeat(None, len(rows))
     elif table in SETTINGS:
@@ -237,12 +237,12 @@ def _messages(table: str, rows: Rows) -> Iterator[Message | Datagram | Parameter
         for sequence, t_ns, vector in zip(
             rows["sequence"].tolist(), rows["t_ns"].tolist(), vectors, strict=True
         ):
-            # A copy lies in memory as the decoder's vector does, which arithmetic may depend on.
+            # The copy has the memory layout of the decoder's vector: rounding may depend on it.
             yield Message(flow, sequence, t_ns, vector.copy())
 
 
 def _settings(data: bytes) -> dict[str, Any]:
-    """The changes of settings; invalid ones of a damaged record are left out."""
+    """Return the changes of settings without the invalid ones of a damaged record."""
     try:
         return settings_of(data)
     except ValueError:

@@ -1,7 +1,7 @@
-"""Compares what each process sends in its replay with what the next one received in the run.
+"""Compares the messages that a process sends in its replay with those that the next one received.
 
-What was lost under way was received by nobody and is not compared; what was received must have
-been sent, and bit for bit so.
+Every received message must be bit-identical to a sent one. Messages that were lost in the network
+are not compared.
 """
 
 from collections import Counter
@@ -31,7 +31,7 @@ from noack.protocol.wire_format import KEY_BYTES, Encoder, Flow, Header, Message
 def check_messages(
     record: RunRecord, replayed: Mapping[str, MachineReplay]
 ) -> tuple[MessagesReplay, ...]:
-    """Compare the messages of every leg of the loop."""
+    """Compare the messages of every hop of the loop."""
     plant, sensor, controller = (replayed[role] for role in ("plant", "sensor", "controller"))
     measurements = _Received("plant → sensor", SENSOR_MEASUREMENT, record, plant, Flow.MEASUREMENT)
     entering = _Received("sensor → netem", NETEM_PACKET, record, sensor, Flow.UPDATE)
@@ -78,7 +78,7 @@ def _compare_changes(record: RunRecord) -> MessagesReplay | None:
 
 
 class _Received:
-    """The messages of one leg, as they were received and as they are sent in the replay."""
+    """The messages of one hop, as received in the run and as sent in the replay."""
 
     def __init__(
         self, leg: str, table: str, record: RunRecord, sender: MachineReplay, flow: Flow
@@ -107,7 +107,7 @@ class _Received:
         return MessagesReplay(self._leg, len(self._rows), self._compared, found)
 
     def compare_vectors(self) -> None:
-        """Compare sequence number, time and vector of what a machine received."""
+        """Compare sequence number, time and vector of the received messages."""
         rows, columns, newest = self._rows, vector_columns(self._table, self._rows), -1
         entries = [
             entry for column in columns for entry in entry_names(column, rows[column].shape[1])
@@ -132,10 +132,10 @@ class _Received:
                     self._differs(row, "was not sent so", entries[place], *values)
 
     def compare_heads(self) -> None:
-        """Compare what netem keeps of a datagram: its first bytes and its size."""
+        """Compare the part of a datagram that netem records: its first bytes and its size."""
         heads, sizes = self._rows["head"].tolist(), self._rows["size_bytes"].tolist()
         headers = [read_header(head) for head in heads]
-        # The run's number is drawn for each run and recorded here only.
+        # The run number is random and recorded only here.
         ids = Counter(header.run_id for header in headers if header is not None)
         encoder = Encoder(ids.most_common(1)[0][0] if ids else 0, bytes(KEY_BYTES))
         for row, (head, size, header) in enumerate(zip(heads, sizes, headers, strict=True)):
@@ -150,13 +150,13 @@ class _Received:
                 self._differs(row, "was not sent so", "size_bytes", size, len(data))
 
     def compare_flows(self) -> None:
-        """Look whether anybody but the sensor was served."""
+        """Check that only the sensor's flow was forwarded."""
         for row, flow in enumerate(self._rows["flow"].tolist()):
             if flow != 0:
                 self._differs(row, "netem serves the sensor alone", "flow", flow, 0)
 
     def compare_with_survivors(self, network: MachineReplay) -> None:
-        """Look whether the network let through what was received."""
+        """Check that the network forwarded every received message."""
         if not network.whole:
             return
         survivors = {
@@ -169,7 +169,7 @@ class _Received:
                 self._differs(row, "netem does not let it through", "sequence", sequence)
 
     def _find(self, row: int, sequence: int, column: str, value: object) -> Message | None:
-        """Return the message of a number, if it was sent and its sender was replayed that far."""
+        """Return the message of a number if its sender was replayed that far and sent it."""
         if (message := self._sent.get(sequence)) is not None:
             self._compared += 1
             return message

@@ -1,4 +1,4 @@
-"""What a replay found: per process, per flow of messages, and the first difference of all."""
+"""The result of a replay: by process, by flow of messages, and the first difference of all."""
 
 import math
 import struct
@@ -14,23 +14,23 @@ Value = float | int | str | None
 
 @dataclass(frozen=True)
 class ReplayDifference:
-    """A place where the record and the replay part.
+    """A value that differs between record and replay.
 
-    Floating-point values come with ``float.hex()``, which shows every bit; one that is not finite
-    has no other form.
+    Floating-point values also have their ``float.hex()``, which shows every bit; a value that is
+    not finite has this form only.
     """
 
     table: str
     row: int
     """Index in the table, from 0."""
     column: str
-    """As in the Parquet file: ``x_2`` is an entry of a vector. Empty if no single one is."""
+    """Name as in the Parquet file, such as ``x_2``; empty if no single column differs."""
     recorded: Value
     recorded_hex: str | None
     replayed: Value
     replayed_hex: str | None
     what: str
-    """In words."""
+    """The difference in words."""
     now_ns: int
     """The row's recorded time."""
 
@@ -52,7 +52,7 @@ def difference(
     recorded: object = None,
     replayed: object = None,
 ) -> ReplayDifference:
-    """Return a difference with its values made presentable."""
+    """Return a difference with its values formatted."""
     (first, first_hex), (second, second_hex) = _shown(recorded), _shown(replayed)
     return ReplayDifference(table, row, column, first, first_hex, second, second_hex, what, now_ns)
 
@@ -80,7 +80,7 @@ def first_entry(recorded: Any, replayed: Any) -> tuple[int, object, object] | No
 
 def _shown(value: object) -> tuple[Value, str | None]:
     if isinstance(value, float):
-        if math.isnan(value):  # they are not all alike
+        if math.isnan(value):  # NaNs may differ in their bits
             return None, f"nan, bits {struct.pack('>d', value).hex()}"
         return value if math.isfinite(value) else None, value.hex()
     if isinstance(value, bytes):
@@ -96,27 +96,27 @@ def _text(value: Value, as_hex: str | None) -> str:
 
 @dataclass(frozen=True)
 class ProcessReplay:
-    """How one process's replay went."""
+    """The result of one process's replay."""
 
     process: str
     inputs: int
     """Inputs in the record."""
     compared: int
-    """Inputs that were replayed; each leaves one row, which was compared."""
+    """Replayed inputs; the row of each was compared."""
     missing_from: int | None
-    """Number of the first input whose row the record lacks: the replay went up to there."""
+    """Number of the first input without a row in the record; the replay stops before it."""
     end_known: bool
-    """Whether the process left a report of how many rows there are."""
+    """Whether the process wrote a report with its number of rows."""
     difference: ReplayDifference | None
 
     @property
     def whole(self) -> bool:
-        """Whether all that the process did was replayed."""
+        """Whether every input of the process was replayed."""
         return self.end_known and self.compared == self.inputs and self.missing_from is None
 
     @property
     def gap(self) -> str | None:
-        """What the replay of this process does not cover, in words."""
+        """The part of the record that the replay of this process does not cover, in words."""
         if self.missing_from is not None:
             return f"{self.process}: rows are missing from input {self.missing_from} on"
         if self.compared < self.inputs:
@@ -128,31 +128,31 @@ class ProcessReplay:
 
 @dataclass(frozen=True)
 class MessagesReplay:
-    """How the messages of one leg compare: what was sent in the replay, what arrived in the run."""
+    """The comparison of one hop: messages sent in the replay, messages received in the run."""
 
     leg: str
     received: int
     """Messages in the receiver's record."""
     compared: int
-    """Those whose sender was replayed that far."""
+    """Compared messages; the replay of their sender covers them."""
     difference: ReplayDifference | None
 
 
 @dataclass(frozen=True)
 class Replay:
-    """The verdict."""
+    """The result of a replay."""
 
     processes: tuple[ProcessReplay, ...]
     messages: tuple[MessagesReplay, ...]
 
     @property
     def inputs(self) -> int:
-        """Inputs that were replayed."""
+        """Number of replayed inputs."""
         return sum(process.compared for process in self.processes)
 
     @property
     def first_difference(self) -> ReplayDifference | None:
-        """The earliest difference by the recorded time; of a message before that of a row."""
+        """The earliest difference by recorded time; at equal times messages come before rows."""
         found = [messages.difference for messages in self.messages]
         found += [process.difference for process in self.processes]
         differences = [one for one in found if one is not None]
@@ -160,16 +160,16 @@ class Replay:
 
     @property
     def bit_exact(self) -> bool | None:
-        """Whether nothing that was compared differs; None if there was nothing to compare."""
+        """Whether there is no difference; None if nothing was compared."""
         return self.first_difference is None if self.inputs else None
 
     @property
     def gaps(self) -> list[str]:
-        """What is not covered, in words: the record's gaps."""
+        """The gaps of the record that the replay does not cover, in words."""
         return [gap for process in self.processes if (gap := process.gap)]
 
     def verdict(self) -> dict[str, Any]:
-        """The verdict for the run's summary."""
+        """The result for the run's summary."""
         found = self.first_difference
         return {
             "bit_exact": self.bit_exact,
@@ -179,7 +179,7 @@ class Replay:
         }
 
     def document(self) -> dict[str, Any]:
-        """Everything, for JSON."""
+        """The complete result for JSON."""
         return self.verdict() | {
             "gaps": self.gaps,
             "processes": [asdict(process) for process in self.processes],

@@ -1,4 +1,4 @@
-"""The table that a person sees after a replay."""
+"""Prints the result of a replay as a table."""
 
 from collections.abc import Sequence
 
@@ -10,12 +10,12 @@ from cosim.analysis.replay.replay_result import Replay, ReplayDifference
 
 
 def print_replay(console: Console, found: Replay, changed: Sequence[str]) -> None:
-    """Print what a replay found.
+    """Print the result of a replay.
 
     Args:
-        console: where to.
-        found: the replay.
-        changed: what differs between the machine of the run and this one, in words.
+        console: the console.
+        found: the result.
+        changed: differences between the computer of the run and this one, in words.
     """
     table = Table(title="replay, bit for bit")
     table.add_column("process, leg")

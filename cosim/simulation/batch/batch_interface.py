@@ -27,7 +27,7 @@ from noack.trigger import self_triggered_interval
 from noack.trigger.trigger_policy import Policy
 
 _SMALLEST_THRESHOLD = 1e-140
-"""Its square, and the square's share that counts, must be numbers."""
+"""Below it, the threshold's square or its significant bits would underflow."""
 
 ROW = np.dtype(
     [
@@ -45,22 +45,22 @@ ROW = np.dtype(
 )
 """The row of a run; NaN where a number is not defined.
 
-transmissions, deliveries: events, and those whose update arrived, until the end or the failure.
-inter_event_min_s, inter_event_mean_s: of the times between successive events; NaN below two events.
-settling_s: the last time at which ‖x‖ > settle ‖x(0)‖; NaN if it is so at the horizon.
+transmissions, deliveries: numbers of events and of delivered updates, until the end or the failure.
+inter_event_min_s, inter_event_mean_s: minimum and mean inter-event time; NaN below two events.
+settling_s: the last time at which ‖x‖ > settle ‖x(0)‖; NaN if this holds at the horizon.
 cost: ∫ xᵀQx + uᵀRu dt over the horizon, u = K x_c.
-sup_e_c_scaled: the supremum over the horizon of ‖W e_c‖ e^{αt}, the left limits at events included,
-to within 1e-10 of it (certified: no sample). Without a known start, e_c counts from event 0 on. α
-is that of a threshold that decays from the run's start on; of other policies it is 0.
+sup_e_c_scaled: the supremum over the horizon of ‖W e_c‖ e^{αt}, with the left limits at events. Its
+relative error is at most 1e-10 (certified, not sampled). Without a known start, it begins at
+event 0. α is the threshold's decay rate if the threshold decays from the start of the run, else 0.
 final_norm: ‖x‖ at the horizon.
-diverged_at_s: where a diverged run ends, as in :mod:`cosim.simulation.continuous.continuous_loop`.
-status: of :mod:`cosim.simulation.batch.batch_status`; if it is not OK, the measures of the whole
-run are NaN.
+diverged_at_s: end of a diverged run, as in :mod:`cosim.simulation.continuous.continuous_loop`.
+status: a value of :mod:`cosim.simulation.batch.batch_status`; unless it is OK, the measures of the
+whole run are NaN.
 """
 
 
 class Population(NamedTuple):
-    """What differs between the runs."""
+    """The data that differ between the runs."""
 
     A: NDArray[np.float64]
     """True plants, (k, n, n), per second."""
@@ -74,18 +74,18 @@ class Population(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """What all runs of a batch share."""
+    """The settings that all runs of a batch share."""
 
     H: Matrix
-    """What both models integrate between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
+    """Matrix of both models between updates: Â + B̂K, or 0 in zero-order-hold mode, (n, n)."""
     K: Matrix
     """Gain, (m, n)."""
     trigger: Policy
     link: LinkSettings
-    """Losses, corruption, and the cap; ``network_fates`` has the same."""
+    """Losses, corruption and the cap, as in ``network_fates``."""
     horizon_s: float
     known_start: bool
-    """Sensor and controller know x(0). Otherwise x_c = 0, and event 0 happens at t = 0."""
+    """Sensor and controller start from x(0). Otherwise x_c = 0 and event 0 happens at t = 0."""
     Q: Matrix | None = None
     """Symmetric, (n, n); None: the identity."""
     R: Matrix | None = None
@@ -105,10 +105,10 @@ class Events(NamedTuple):
 
 
 def setting_of(resolved: Scenario) -> Setting:
-    """Return what the runs of a resolved scenario share; its plant, x(0) and seeds play no part.
+    """Return the shared settings of a resolved scenario, without its plant, x(0) and seeds.
 
     Raises:
-        CallerError: the scenario is one that exact simulation cannot take.
+        CallerError: exact simulation does not support the scenario.
     """
     resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()
@@ -125,26 +125,26 @@ def setting_of(resolved: Scenario) -> Setting:
 
 
 def run_batch(setting: Setting, population: Population) -> NDArray[np.void]:
-    """Run every draw; a run's row depends on the setting and its own draw only, bit for bit.
+    """Run every draw; a run's row depends bit-exactly on the setting and its own draw only.
 
     Returns:
         Rows of :data:`ROW`, (k,).
 
     Raises:
-        CallerError: the threshold decays to nothing before the horizon, or the link does more than
-            to lose.
-        ValueError: matrices whose shapes do not fit.
+        CallerError: the threshold becomes too small before the horizon, or the link has impairments
+            other than losses.
+        ValueError: the shapes of the matrices do not match.
     """
     rows, _ = _run(setting, population, 0)
     return rows
 
 
 def run_events(setting: Setting, population: Population) -> Events:
-    """Run one draw, and return its events; raises as :func:`run_batch`.
+    """Run one draw and return its events; raises the errors of :func:`run_batch`.
 
     Args:
-        setting: what runs share.
-        population: of one run.
+        setting: the shared settings.
+        population: a population of one run.
     """
     if len(population.A) != 1:
         raise ValueError(f"one run is wanted, not {len(population.A)}")
@@ -248,7 +248,7 @@ def _flat(array: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _columns(matrices: NDArray[Any] | None) -> NDArray[np.float64]:
-    """Matrices by columns, one after the other; nothing for None."""
+    """Return all matrices in column-major order in one array; an empty array for None."""
     return np.empty(0) if matrices is None else _flat(np.swapaxes(matrices, -1, -2))
 
 

@@ -1,6 +1,6 @@
-"""When the comparison of a trigger rule counts, and its threshold then.
+"""Computes the times at which a trigger rule's comparison is active, and its threshold.
 
-The numbers are those of :class:`noack.trigger.trigger_rule.TriggerRule`, and so are the meanings.
+The numbers are those of :class:`noack.trigger.trigger_rule.TriggerRule`, with the same meaning.
 """
 
 import math
@@ -10,7 +10,7 @@ from noack.trigger.self_triggered_interval import Forecast, interval_ns
 from noack.trigger.trigger_rule import TriggerRule
 
 _GRID_SLACK = 1e-9
-"""Of a period: rounding of an event's time on the grid, as in ``continuous_loop``."""
+"""Tolerance for an event's time on the grid, as a share of the period (see ``continuous_loop``)."""
 _NS = 1e-9
 _PER_S = 1e9
 
@@ -59,23 +59,23 @@ class Span(NamedTuple):
     level: float
     """c."""
     floor_from_s: float
-    """From when on the floor is the threshold."""
+    """From this time on, the floor is the threshold."""
     begin_s: float
-    """The comparison counts from here on."""
+    """The comparison is active from this time on."""
     due_s: float
-    """The next event is due."""
+    """Time of the next event that the rule forces."""
     point: int
-    """The next of the grid."""
+    """Number of the next grid point."""
 
 
 def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
-    """The rule after an event, or from the start on.
+    """Return the rule's span after an event or after the start.
 
     Args:
         rule: the rule.
         t_s: time of the event.
-        left: ‖P z‖ just after it, if the rule is ``from_event``.
-        size: ‖x‖_W, if it has a forecast.
+        left: ‖P z‖ just after the event; used if the rule is ``from_event``.
+        size: ‖x‖_W; used if the rule has a forecast.
     """
     level, since_s, due_ns, point = rule.level, 0.0, rule.longest_ns, 0
     if rule.from_event:
@@ -87,7 +87,7 @@ def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
         floor_from_s = math.inf
         if rule.floor > 0.0 and rule.rate_per_s > 0.0:
             floor_from_s = since_s + math.log(level / rule.floor) / rule.rate_per_s
-    # In nanoseconds, as the rule is: what falls on the horizon does so in every engine.
+    # In integer nanoseconds like the rule, so that an event at the horizon is the same everywhere.
     due_s = (t_s * _PER_S + due_ns) * _NS
     begin_s = min((t_s * _PER_S + rule.idle_ns) * _NS, due_s)
     if rule.grid_s > 0.0:
@@ -98,20 +98,20 @@ def span_after(rule: Rule, t_s: float, left: float, size: float) -> Span:
 
 
 class Phase(NamedTuple):
-    """A time in which the comparison and its threshold keep their form."""
+    """An interval in which the form of the comparison and of its threshold does not change."""
 
     until_s: float
     """Its end."""
     compares: bool
-    """The comparison counts."""
+    """Whether the comparison is active."""
     threshold: float
-    """It is this at the phase's beginning; 0: there is none."""
+    """Threshold at the start of the phase; 0 if there is none."""
     rate_per_s: float
-    """At which it decays."""
+    """Decay rate of the threshold."""
 
 
 def phase_at(rule: Rule, span: Span, t_s: float) -> Phase:
-    """What holds from ``t_s`` on: the comparison counts or not, its threshold decays or not."""
+    """Return the phase that starts at ``t_s``."""
     if t_s < span.begin_s:
         return Phase(span.begin_s, False, 0.0, 0.0)
     if not rule.compares:
@@ -123,5 +123,5 @@ def phase_at(rule: Rule, span: Span, t_s: float) -> Phase:
 
 
 def last_point(rule: Rule, t_s: float) -> int:
-    """The last point of the grid up to a time."""
+    """Return the last grid point up to a time."""
     return math.floor(t_s / rule.grid_s + _GRID_SLACK)

@@ -1,4 +1,4 @@
-"""One run after the other, from event to event; a run's row depends on its own draw only."""
+"""Computes runs one by one, from event to event; a run's row depends on its own draw only."""
 
 import math
 from typing import Any, NamedTuple
@@ -32,15 +32,16 @@ from netem.rules.link_rules import admit
 from noack.impairments.link_records import DELIVERED, FORCED, NEVER_NS, LinkMemory, LinkProgram
 
 _LARGEST = 1e100
-"""Beyond, a state is said to have diverged, as in ``continuous_loop``."""
+"""A state above this norm counts as diverged, as in ``continuous_loop``."""
 _MOST_PIECES = 1_000_000
-"""Of a run: some 2 s."""
+"""Largest number of pieces of a run; computing them takes about 2 s."""
 _AHEAD = 1.25
-"""A first look goes so many times as far as the error at its first speed needs."""
+"""Length of the first search after an event, in units of the time that the error would need at its
+initial speed."""
 
 
 class BatchSystem(NamedTuple):
-    """What all runs share; matrices by columns, one number after the other."""
+    """The data that all runs share; matrices in column-major order."""
 
     H: Array
     K: Array
@@ -51,7 +52,7 @@ class BatchSystem(NamedTuple):
     R: Array
     """Empty: the identity."""
     inverse: Array
-    """1/k at place k."""
+    """1/k at index k."""
     H_k: Array
     """Table of H^k/k!."""
     rule: Rule
@@ -65,7 +66,7 @@ class BatchSystem(NamedTuple):
 
 
 class Draws(NamedTuple):
-    """What differs between the runs; matrices by columns, one run after the other."""
+    """The data that differ between the runs; matrices in column-major order, run by run."""
 
     A: Array
     B: Array
@@ -81,11 +82,11 @@ class BatchMemory(NamedTuple):
     A_k: Array
     X_k: Array
     reach_s: Array
-    """How far polynomials carry, by degree."""
+    """Time over which a polynomial is accurate, by degree."""
     measured_s: Array
-    """The same for what is measured."""
+    """The same, at the accuracy of the measures."""
     x_c: Array
-    """Coefficients, as all that follow."""
+    """Coefficients, as in all arrays below."""
     e_c: Array
     d: Array
     x: Array
@@ -107,23 +108,23 @@ class LossTable(NamedTuple):
     program: LinkProgram
     state: LinkMemory
     verdicts: Any
-    """One, of :class:`noack.impairments.link_records.PacketDecision`."""
+    """One :class:`noack.impairments.link_records.PacketDecision`."""
 
 
 class EventLog(NamedTuple):
-    """The events of a run, as many as there is room for."""
+    """The events of a run, up to the length of the arrays."""
 
     event_s: Array
     delivered: Any
 
 
 class Batch(NamedTuple):
-    """All that the runs of a batch use."""
+    """All data of a batch."""
 
     n: Width
-    """As many entries as there are states."""
+    """Tuple of n entries, n the number of states."""
     m: Width
-    """As many entries as there are inputs."""
+    """Tuple of m entries, m the number of inputs."""
     system: BatchSystem
     draws: Draws
     network: LossTable
@@ -140,13 +141,13 @@ class Models(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A piece of a run: a time on which one polynomial holds."""
+    """A piece of a run: an interval on which one polynomial is accurate."""
 
     t_s: float
     """Its start."""
     length_s: float
     settled: float
-    """‖x‖ at or below which the run has settled."""
+    """The run has settled when ‖x‖ is at or below this level."""
     ceiling: float
     """A bound on ‖W e_c‖ e^{αt}, or infinity."""
 
@@ -154,9 +155,9 @@ class Piece(NamedTuple):
 def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
     """Run k draws; each fills a row.
 
-    Without ``squares`` the rule compares ‖W e_s‖ with its threshold, or nothing. The two cases are
-    compiled separately, each when first used; a compiler leaves out a branch only for an argument
-    that is None, so ``squares`` is no part of the batch.
+    Without ``squares`` the rule compares ‖W e_s‖ with its threshold, or has no comparison. The two
+    cases are compiled separately, each at its first use. The compiler omits a branch only for an
+    argument that is None, so ``squares`` is an argument and not a part of the batch.
     """
     powers(batch.system.H, 0, batch.system.H_k, batch.n)
     for run in range(len(rows)):
@@ -166,7 +167,7 @@ def run_many(batch: Batch, squares: QuadraticCurves | None, rows: Any) -> None:
 
 
 def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> None:
-    """Let the link be that of a run: before its first update, with the run's random streams."""
+    """Reset the link to its state before a run's first update, with the run's random streams."""
     flow = network.state.flows[0]
     flow.packets = 0
     flow.consecutive_losses = 0
@@ -184,7 +185,7 @@ def renew(network: LossTable, keys: Any, run: int, first_delivered: bool) -> Non
 
 
 def arrives(network: LossTable) -> bool:
-    """Whether the next update does."""
+    """Return whether the next update arrives."""
     admit(network.program, network.state, 0, 1, 0, network.verdicts[0])
     fate = network.verdicts[0].fate
     return fate in (DELIVERED, FORCED)
@@ -210,7 +211,7 @@ def expand(
     batch: Batch, squares: QuadraticCurves | None, state: Models, factor: float, begin: int,
     end: int,
 ) -> None:  # fmt: skip
-    """Write the coefficients of degree ``begin`` to ``end``; ``squares``' times a factor."""
+    """Write the coefficients of degree ``begin`` to ``end``; scale those of ``squares``."""
     n, m, system, space = batch.n, batch.m, batch.system, batch.space
     size, inputs = len(n), len(m)
     for k in range(begin, end + 1):
@@ -231,7 +232,7 @@ def expand(
 
 
 def weighted(batch: Batch, v: Lanes) -> Lanes:
-    """W v."""
+    """Return W v."""
     if len(batch.system.weight) == 0:
         return v
     return times(batch.system.weight, 0, v, batch.n)
@@ -333,7 +334,7 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
                 space.x_c, space.e_c, space.d, p, spent_s, _LARGEST, threshold, rate, n
             )
             break
-        # While both models agree, e_c is e_s, which is below a threshold that meets it at an event.
+        # While both models agree, e_c = e_s, and ‖W e_s‖ is at most the threshold between events.
         ceiling = math.inf
         if agree and phase.compares and squares is None and not rule.integrates:
             until = t_s + (spent_s if rate == 0.0 else 0.0)
@@ -351,7 +352,7 @@ def follow(batch: Batch, squares: QuadraticCurves | None, run: int, row: Any) ->
 
 
 def begin_row(row: Any) -> None:
-    """Set a row to what holds before the first event."""
+    """Initialise a row to the values before the first event."""
     row.transmissions = 0
     row.deliveries = 0
     row.inter_event_min_s = math.inf
@@ -364,10 +365,10 @@ def finish_row(row: Any, status: int, t_s: float, span_s: float, above: bool, no
     """Complete a row.
 
     Args:
-        row: with sums and extremes so far.
+        row: the row, with its sums and extremes up to ``t_s``.
         status: how the run ended.
-        t_s: its end.
-        span_s: time from its first event to its last.
+        t_s: end of the run.
+        span_s: time from the first event to the last.
         above: whether ‖x‖ is above the settling level at the end.
         norm: ‖x‖ at the end.
     """
@@ -397,7 +398,7 @@ def count_event(batch: Batch, row: Any, t_s: float, last_s: float) -> bool:
 
 
 def updated(state: Models, delivered: bool, nothing: Lanes) -> Models:
-    """The models after an event: x_s = x, and x_c = x if the update arrives."""
+    """Return the models after an event: x_s = x, and x_c = x if the update arrives."""
     if delivered:
         return Models(state.x_c - state.e_c, nothing, nothing)
     return Models(state.x_c, state.e_c, nothing - state.e_c)
@@ -406,7 +407,7 @@ def updated(state: Models, delivered: bool, nothing: Lanes) -> Models:
 def next_span(
     batch: Batch, squares: QuadraticCurves | None, state: Models, t_s: float
 ) -> Span:  # fmt: skip
-    """The rule after an event, or from the start on."""
+    """Return the rule's span after an event or after the start."""
     x, left, length = state.x_c - state.e_c, 0.0, 0.0
     if squares is not None:
         left = left_side(squares, x)
@@ -416,7 +417,7 @@ def next_span(
 
 
 def first_window(batch: Batch, threshold: float, auxiliary: float) -> float:
-    """The length of the first search after an event, if the error keeps its first speed."""
+    """Return the length of the first search after an event, from the error's initial speed."""
     speed = size_of(load(batch.space.error, len(batch.n), batch.n))
     if speed == 0.0:
         return math.inf
@@ -426,12 +427,12 @@ def first_window(batch: Batch, threshold: float, auxiliary: float) -> float:
 
 
 def measure_piece(batch: Batch, row: Any, end: Models, piece: Piece) -> float:
-    """Add what a piece contributes to a row.
+    """Add a piece's contribution to a row.
 
     Args:
-        batch: with the coefficients of the piece.
-        row: with sums and extremes so far.
-        end: the state at its end.
+        batch: the batch; its memory contains the coefficients of the piece.
+        row: the row, with its sums and extremes up to the piece.
+        end: the state at the end of the piece.
         piece: the piece.
 
     Returns:
@@ -460,11 +461,11 @@ def measure_piece(batch: Batch, row: Any, end: Models, piece: Piece) -> float:
 
 
 def size_of(v: Lanes) -> float:
-    """‖v‖."""
+    """Return ‖v‖."""
     return math.sqrt(dot(v, v))
 
 
 def size_of_state(state: Models) -> float:
-    """The norm of (x_c, e_c, d)."""
+    """Return the norm of (x_c, e_c, d)."""
     x_c, e_c, d = state.x_c, state.e_c, state.d
     return math.sqrt(dot(x_c, x_c) + dot(e_c, e_c) + dot(d, d))

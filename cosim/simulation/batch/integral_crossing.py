@@ -1,10 +1,10 @@
-"""When the integral of a norm, ∫‖y‖dτ, first exceeds a threshold that decays, on a piece of a run.
+"""Finds the first time at which ∫‖y‖dτ exceeds a decaying threshold, on a piece of a run.
 
-The integral does not decrease and the threshold does not grow: they meet once, and no crossing can
-be missed. On a piece y is a Taylor polynomial (:mod:`cosim.simulation.batch.taylor`). ∫‖y‖ is
-computed by Gauss-Legendre quadrature of 8 nodes, on intervals that are halved until the halves
-agree with the whole to TOLERANCE of the integral so far. The crossing is found by bisection, to the
-last bits of the time on the piece.
+The integral never decreases and the threshold never increases, so they cross at most once and no
+crossing can be missed. On a piece y is a Taylor polynomial (:mod:`cosim.simulation.batch.taylor`).
+∫‖y‖ is computed by Gauss-Legendre quadrature with 8 nodes, on intervals that are halved until the
+halves agree with the whole to TOLERANCE of the integral so far. The crossing is found by bisection,
+to the last bits of the time on the piece.
 """
 
 import math
@@ -18,13 +18,13 @@ _NODES = (0.18343464249564978, 0.525532409916329, 0.7966664774136267, 0.96028985
 """The positive nodes on [−1, 1]."""
 _WEIGHTS = (0.36268378337836166, 0.3137066458778869, 0.22238103445337443, 0.10122853629037706)
 _SHORTEST = 1e-9
-"""Share of the piece that is not halved any more."""
+"""Shortest interval that is halved, as a share of the piece."""
 _MOST_INTERVALS = 100_000
 _BISECTIONS = 60
 
 
 def gauss(curve: Array, p: int, begin_s: float, end_s: float, n: Width) -> float:
-    """The quadrature of ‖y‖ over [``begin_s``, ``end_s``]."""
+    """Return the quadrature of ‖y‖ over [``begin_s``, ``end_s``]."""
     middle, half, total = 0.5 * (begin_s + end_s), 0.5 * (end_s - begin_s), 0.0
     for i in range(len(_NODES)):
         y = value(curve, p, middle - half * _NODES[i], n)
@@ -37,19 +37,20 @@ def gauss(curve: Array, p: int, begin_s: float, end_s: float, n: Width) -> float
 def first_excess(
     curve: Array, p: int, integral: float, level: float, rate: float, end_s: float, n: Width
 ) -> tuple[float, float]:
-    """When the integral first exceeds ``level`` e^{−``rate`` s}, as seconds from the piece's start.
+    """Return the first time at which the integral exceeds ``level`` e^{−``rate`` s}.
 
     Args:
         curve: coefficients of y.
         p: the degree.
         integral: its value at the start of the piece.
-        level: threshold at the start; infinite: only the integral is wanted.
-        rate: at which the threshold decays, per second.
+        level: threshold at the start; infinity to compute only the integral.
+        rate: decay rate of the threshold, per second.
         end_s: length of the piece.
         n: number of entries of y.
 
     Returns:
-        The time, NONE or UNRESOLVED; and the integral there, or at the end.
+        The time in seconds from the start of the piece, NONE or UNRESOLVED; and the integral at
+        that time, or at the end.
     """
     if integral > level:
         return 0.0, integral
@@ -75,7 +76,7 @@ def crossing(
     curve: Array, p: int, integral: float, level: float, rate: float, begin_s: float, end_s: float,
     n: Width,
 ) -> tuple[float, float]:  # fmt: skip
-    """The crossing in an interval on which one quadrature is exact; as :func:`first_excess`."""
+    """Return the crossing, as :func:`first_excess`, where one quadrature is exact."""
     low_s, high_s = begin_s, end_s
     for _ in range(_BISECTIONS):
         middle_s = 0.5 * (low_s + high_s)

@@ -1,24 +1,26 @@
-"""Where a polynomial first meets a level that decays, by steps that cannot pass it.
+"""Finds where a scalar polynomial first reaches a decaying level, by steps that skip no crossing.
 
-h(s) = g(s) − c e^{−rs} is followed from where it is negative, as in
-:mod:`cosim.simulation.batch.norm_crossing`, but g is a number. With |g̈| ≤ b on [s, a] and c ≥ 0,
+The method is that of :mod:`cosim.simulation.batch.norm_crossing` for a scalar g:
+h(s) = g(s) − c e^{−rs} is followed from a point where it is negative. If |g̈| ≤ b on [s, a] and
+c ≥ 0, then
 
-    h(s + δ) ≤ φ(δ) = h(s) + ḣ(s) δ + ½ b δ²,    as ḧ = g̈ − r² c e^{−rs} ≤ b,
+    h(s + δ) ≤ φ(δ) = h(s) + ḣ(s) δ + ½ b δ²,    as ḧ = g̈ − r² c e^{−rs} ≤ b.
 
-and a step of length δ up to φ's positive root passes no crossing, however short: φ is convex, and
-negative in between. As ḧ ≥ −(b + r² c e^{−rs}) =: −L, h ascends on all of [s, a] if
-ḣ(s) > L (a − s): it has one root there, or none, and Newton's method may take any steps that stay
-within a bracket.
+φ is convex and negative between 0 and its positive root, so a step up to that root skips no
+crossing, however short. Since ḧ ≥ −(b + r² c e^{−rs}) =: −L, h increases on all of [s, a] if
+ḣ(s) > L (a − s). Then it has at most one root there, and Newton's method may take any steps that
+stay within a bracket.
 
-b = Σ k(k−1) |g_k| a^{k−2} belongs to [0, a], and is made anew where a nearer a makes it much
-smaller. Nothing is sampled. What remains is rounding: where h is below 0 by no more than that, a
-tangency is passed or met.
+b = Σ k(k−1) |g_k| a^{k−2} is valid on [0, a]. It is recomputed if a smaller a makes it much
+smaller. Nothing is sampled. Only rounding remains: a tangency is detected or missed if h differs
+from 0 by less than the rounding error.
 
-h may begin at 0, as an envelope does that begins at the event, and go down from there: then the
-step is −2ḣ/b. It is an event at once if it begins above 0, or at 0 and goes up.
+If h starts at 0 and decreases, as for an envelope that starts at the event, the first step is
+−2ḣ/b. If h starts above 0, or at 0 and increases, the event is at the start.
 
-How it ends. Each step leads on, or is too short to be one in floating point, which ends it; so does
-MOST_STEPS. Newton's method may take NEWTON_STEPS; then its bracket is halved, to the last bit.
+Termination: a step either advances or is too short to change s in floating point, which ends the
+search; MOST_STEPS also ends it. Newton's method takes at most NEWTON_STEPS; then its bracket is
+bisected to the last bit.
 """
 
 import math
@@ -41,15 +43,15 @@ _NEARER = 0.6
 def first_root(
     g: Array, degree: int, level: float, rate: float, grain: float, end_s: float
 ) -> float:
-    """The first s in [0, ``end_s``) from which g(s) ≥ ``level`` e^{−``rate`` s}.
+    """Return the first s in [0, ``end_s``) from which g(s) ≥ ``level`` e^{−``rate`` s}.
 
     Args:
         g: coefficients g_k.
         degree: the highest k.
         level: c ≥ 0.
         rate: r ≥ 0, per second.
-        grain: h(0) is known to within so much, by rounding.
-        end_s: where to stop.
+        grain: bound on the rounding error of h(0).
+        end_s: end of the search.
 
     Returns:
         The time; NONE; or UNRESOLVED after MOST_STEPS.
@@ -91,7 +93,7 @@ def first_root(
 
 
 def safe_step(value: float, slope: float, most: float, span: float) -> float:
-    """φ's positive root, where φ(0) ≤ 0; or ``span`` if that is nearer.
+    """Return φ's positive root, given φ(0) ≤ 0, or ``span`` if that is smaller.
 
     Args:
         value: φ(0) = h(s).
@@ -111,14 +113,14 @@ def ascending_root(
     g: Array, degree: int, level: float, rate: float, s: float, value: float, slope: float,
     ahead_s: float,
 ) -> float:  # fmt: skip
-    """The root of h in (``s``, ``ahead_s``), where h ascends; or NONE.
+    """Return the root of an increasing h in (``s``, ``ahead_s``), or NONE.
 
     Args:
-        g: as of :func:`first_root`, and so are degree, level and rate.
-        degree: degree.
+        g: as in :func:`first_root`.
+        degree: the highest k.
         level: c.
         rate: r.
-        s: where h is negative.
+        s: a point where h is negative.
         value: h(s).
         slope: ḣ(s).
         ahead_s: a.
@@ -145,7 +147,7 @@ def ascending_root(
 
 
 def estimate(g: Array, level: float, rate: float) -> float:
-    """Where h meets 0 if it is what its first three coefficients say; infinite if nowhere."""
+    """Return the root of h's approximation by three coefficients; infinity if there is none."""
     value, slope = g[0] - level, g[1] + rate * level
     half = g[2] - 0.5 * rate * rate * level
     square = slope * slope - 4.0 * half * min(value, 0.0)
@@ -157,7 +159,7 @@ def estimate(g: Array, level: float, rate: float) -> float:
 
 
 def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
-    """The polynomial and its derivative."""
+    """Return the polynomial and its derivative."""
     total, slope = g[degree], 0.0
     for k in range(degree - 1, -1, -1):
         slope = slope * s + total
@@ -166,7 +168,7 @@ def number_and_slope(g: Array, degree: int, s: float) -> tuple[float, float]:
 
 
 def bend_of(g: Array, degree: int, s: float) -> float:
-    """A bound on |g̈| in [0, s]: the second derivative of Σ |g_k| s^k."""
+    """Return a bound on |g̈| in [0, s]: the second derivative of Σ |g_k| s^k."""
     total = 0.0
     for k in range(degree, 1, -1):
         total = total * s + k * (k - 1.0) * abs(g[k])

@@ -1,30 +1,29 @@
-"""Where a polynomial curve first meets a threshold, by steps that cannot pass it.
+"""Finds where a polynomial curve first reaches a threshold, by steps that skip no crossing.
 
-h(s) = |y(s)| − c e^{−rs} is followed from where it is negative. With |ÿ| ≤ b on the way ahead, up
-to a,
+h(s) = |y(s)| − c e^{−rs} is followed from a point where it is negative. If |ÿ| ≤ b on [s, a], then
 
-    h(s + δ) ≤ φ(δ) = |y(s) + ẏ(s) δ| + ½ b δ² − c_s (1 − r δ),    c_s = c e^{−rs},
+    h(s + δ) ≤ φ(δ) = |y(s) + ẏ(s) δ| + ½ b δ² − c_s (1 − r δ),    c_s = c e^{−rs}.
 
-and φ is convex: where φ(0) < 0 and φ(δ) ≤ 0, φ and h are negative in between, and a step of length
-δ passes no crossing, however short. Newton's method from the right stays right of φ's root, and
-the chord from there to (0, φ(0)) meets 0 left of it: that is the step.
+φ is convex. If φ(0) < 0 and φ(δ) ≤ 0, then φ and h are negative in between, so a step of length δ
+skips no crossing, however short. Newton's method from the right stays right of φ's root. The chord
+from its last point to (0, φ(0)) is zero at a point left of the root: this point is the step.
 
-Where y ≠ 0, ḧ = (|ẏ|² − (y·ẏ/|y|)² + y·ÿ)/|y| − r² c e^{−rs} ≥ −(b + r² c_s) =: −L, and where
-y = 0, |y| has an edge that bends h upward only. So if ḣ(s) > L (a − s), h ascends on all of
-[s, a]: it has one root there, or none, and Newton's method may take any steps that stay within the
-interval.
+If y ≠ 0, ḧ = (|ẏ|² − (y·ẏ/|y|)² + y·ÿ)/|y| − r² c e^{−rs} ≥ −(b + r² c_s) =: −L. If y = 0, the
+kink of |y| only increases ḣ. So if ḣ(s) > L (a − s), h increases on all of [s, a]. Then it has at
+most one root there, and Newton's method may take any steps that stay within the interval.
 
-b is :func:`cosim.simulation.batch.taylor.bend`; it belongs to [0, a], and is made anew where a
-nearer a makes it much smaller. Nothing is sampled. What remains is rounding: where h is below 0 by
-no more than that, steps have about 1e-8 of the curve's own time, and a tangency in floating point
-is passed or met. Backwards from the end the same holds for s ↦ y(end − s).
+b is :func:`cosim.simulation.batch.taylor.bend` and valid on [0, a]. It is recomputed if a smaller a
+makes it much smaller. Nothing is sampled. Only rounding remains: if h is below 0 by less than the
+rounding error, steps have about 1e-8 of the curve's time scale, and a tangency in floating point is
+detected or missed. The backward search is the same search on s ↦ y(end − s).
 
-How it ends. Each step leads on, or is too short to be one in floating point, which ends it. A curve
-that stays just below its threshold may still take very many; after MOST_STEPS it is UNRESOLVED. A
-chord of φ is above φ, so that Newton's method may be left at any time, for a step that is shorter
-and as safe. Where h ascends it may take NEWTON_STEPS; then its bracket is halved, to the last bit.
+Termination: a step either advances or is too short to change s in floating point, which ends the
+search. A curve that stays just below its threshold may need very many steps; after MOST_STEPS the
+result is UNRESOLVED. A chord of φ lies above φ, so Newton's method may stop at any iteration: the
+step is then shorter and equally safe. Where h increases, Newton's method takes at most
+NEWTON_STEPS; then its bracket is bisected to the last bit.
 
-Only |y| is known here. Other quadratic event functions are
+This module compares |y| only. Other quadratic event functions are in
 :mod:`cosim.simulation.batch.quadratic_crossing`.
 """
 
@@ -36,31 +35,31 @@ from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, load
 NONE = -1.0
 UNRESOLVED = -2.0
 MOST_STEPS = 1_000_000
-"""Some 50 ms."""
+"""They take about 50 ms."""
 CLOSE = 1e-8
-"""Newton's last step, as a share of the way; its square is below rounding."""
+"""Relative size of Newton's last step; its square is below rounding."""
 _AHEAD = 3.0
 _NEARER = 0.6
 NEWTON_STEPS = 60
 TURNS = NEWTON_STEPS + 1100
-"""More halvings than there are between any two numbers."""
+"""More bisections than any two floating-point numbers need."""
 
 
 def first_exit(
     curve: Array, p: int, level: float, rate: float, end_s: float, backward: bool, most_steps: int,
     n: Width,
 ) -> float:  # fmt: skip
-    """The first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
+    """Return the first s in [0, ``end_s``) from which |y(s)| ≥ ``level`` e^{−``rate`` s}.
 
     Args:
         curve: coefficients of y.
         p: the degree.
         level: c > 0.
         rate: r ≥ 0, per second; 0 if ``backward``.
-        end_s: where to stop.
-        backward: look at y(``end_s`` − s) instead.
-        most_steps: give up after so many.
-        n: how many numbers y has.
+        end_s: end of the search.
+        backward: search y(``end_s`` − s) instead.
+        most_steps: largest number of steps.
+        n: number of entries of y.
 
     Returns:
         The time; NONE; or UNRESOLVED.
@@ -105,7 +104,7 @@ def first_exit(
 def safe(
     square: float, mixed: float, speed: float, limit: float, rate: float, most: float, span: float
 ) -> float:
-    """The length of a step that passes no crossing; ``span`` if there is none so far.
+    """Return the length of a step that skips no crossing; ``span`` if there is none within it.
 
     Args:
         square: |y|².
@@ -139,20 +138,20 @@ def ascent(
     curve: Array, p: int, level: float, rate: float, s: float, excess: float, slope: float,
     ahead_s: float, end_s: float, backward: bool, n: Width,
 ) -> float:  # fmt: skip
-    """The root of h in (``s``, ``ahead_s``), where h ascends; or NONE.
+    """Return the root of an increasing h in (``s``, ``ahead_s``), or NONE.
 
     Args:
-        curve: as of :func:`first_exit`, and so are p, level, rate, end_s, backward and n.
-        p: degree.
+        curve: as in :func:`first_exit`.
+        p: the degree.
         level: c.
         rate: r.
-        s: where h is negative.
+        s: a point where h is negative.
         excess: h(s).
         slope: ḣ(s).
         ahead_s: a.
-        end_s: the end.
-        backward: the sense.
-        n: how many numbers.
+        end_s: as in :func:`first_exit`.
+        backward: as in :func:`first_exit`.
+        n: number of entries of y.
     """
     low_s, high_s, beyond = s, ahead_s, False
     for turn in range(TURNS):
@@ -178,14 +177,14 @@ def ascent(
 
 
 def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: bool) -> float:
-    """Newton's next point if it is within the bracket, and not too many came before; or a safe one.
+    """Return Newton's next point if it is in the bracket and within NEWTON_STEPS, else a safe one.
 
     Args:
-        following: Newton's.
-        turn: how many came before.
-        low_s: below the root, if there is one.
-        high_s: above it, if ``beyond``; else the end.
-        beyond: there is one.
+        following: Newton's next point.
+        turn: number of earlier points.
+        low_s: a point below the root, if there is a root.
+        high_s: a point above the root if ``beyond``, else the end of the interval.
+        beyond: whether there is a root below ``high_s``.
     """
     if turn < NEWTON_STEPS and low_s < following < high_s:
         return following
@@ -197,7 +196,7 @@ def bracketed(following: float, turn: int, low_s: float, high_s: float, beyond: 
 def look(
     curve: Array, p: int, s: float, end_s: float, backward: bool, n: Width
 ) -> tuple[Lanes, Lanes]:
-    """Y and ẏ, forward or backward."""
+    """Return y and ẏ, forward or backward."""
     if backward:
         y, dy = value_and_slope(curve, p, end_s - s, n)
         return y, filled(0.0, n) - dy
@@ -205,6 +204,6 @@ def look(
 
 
 def last_entry(curve: Array, p: int, level: float, end_s: float, n: Width) -> float:
-    """The last s in [0, ``end_s``] up to which |y(s)| ≥ ``level``; or NONE, or UNRESOLVED."""
+    """Return the last s in [0, ``end_s``] with |y(s)| ≥ ``level``, NONE or UNRESOLVED."""
     back_s = first_exit(curve, p, level, 0.0, end_s, True, MOST_STEPS, n)
     return back_s if back_s < 0.0 else end_s - back_s

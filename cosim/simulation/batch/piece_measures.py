@@ -1,8 +1,7 @@
-"""What is measured of a piece of a run in which nothing is reset, from its Taylor polynomials.
+"""Measures of a piece of a run (an interval without resets), from its Taylor polynomials.
 
-The cost integrates the polynomials' products exactly. The supremum and the settling time look for
-crossings with a level (:mod:`cosim.simulation.batch.norm_crossing`), so that nothing between two
-times is missed.
+The cost integrates the polynomials' products exactly. The supremum and the settling time are found
+from crossings with a level (:mod:`cosim.simulation.batch.norm_crossing`), without sampling.
 """
 
 import math
@@ -13,7 +12,7 @@ from cosim.simulation.batch.taylor import Array, largest, squared, value, value_
 from cosim.simulation.batch.vector_lanes import Lanes, Width, dot, filled, fma, load, store, times
 
 CERTAINTY = 1e-10
-"""The true supremum is at most by this share above the one that is returned."""
+"""The true supremum exceeds the returned one by at most this share."""
 _SMALL_SHARE = 1e-27
 _LEAST = 1e-150
 _LARGEST = 1e150
@@ -21,36 +20,37 @@ _CLIMBS = 12
 _HALVINGS = 60
 _FEW_STEPS = 50
 _RISES = 10_000
-"""Each passes a maximum, of which a polynomial of degree 24 has few, or rises by CERTAINTY."""
+"""Largest number of rises. Each passes a maximum (a polynomial of degree 24 has few) or rises by
+CERTAINTY."""
 
 
 def square_integrals(
     x: Array, u: Array, p: int, s: float, Q: Array, R: Array, inverse: Array,
     x_scaled: Array, u_scaled: Array, n: Width, m: Width,
 ) -> float:  # fmt: skip
-    """∫₀ˢ xᵀQx + uᵀRu of polynomials, exactly but for rounding.
+    """Return ∫₀ˢ xᵀQx + uᵀRu of polynomials, exact up to rounding.
 
-    With v_k = c_k s^k the part of x is s Σ_{i,j} v_iᵀ Q v_j/(i + j + 1).
+    With v_k = c_k s^k the integral of xᵀQx is s Σ_{i,j} v_iᵀ Q v_j/(i + j + 1).
 
     Args:
         x: coefficients c_k.
-        u: likewise.
+        u: coefficients of u.
         p: the degree.
-        s: where to stop.
-        Q: symmetric, n² numbers; or none, for the identity.
-        R: likewise, m².
-        inverse: 1/k at place k, up to 2p + 1.
+        s: upper limit of the integral.
+        Q: symmetric, n² numbers; empty for the identity.
+        R: symmetric, m² numbers; empty for the identity.
+        inverse: 1/k at index k, up to 2p + 1.
         x_scaled: scratch, (p + 1) n numbers.
         u_scaled: scratch, (p + 1) m numbers.
-        n: how many states.
-        m: how many inputs.
+        n: number of states.
+        m: number of inputs.
     """
     size, inputs, power = len(n), len(m), 1.0
     for k in range(p + 1):
         store(x_scaled, k * size, load(x, k * size, n) * power)
         store(u_scaled, k * inputs, load(u, k * inputs, m) * power)
         power *= s
-    # What the last coefficients add is known, and often nothing.
+    # The last coefficients often contribute nothing to the sum.
     v, w = load(x_scaled, 0, n), load(u_scaled, 0, m)
     negligible = _SMALL_SHARE * (dot(v, v) + dot(w, w))
     while p > 1:
@@ -60,7 +60,7 @@ def square_integrals(
         p -= 1
     x_total, u_total = filled(0.0, n), filled(0.0, m)
     for i in range(p + 1):
-        # Two sums at a time: one alone would wait for its own last addition.
+        # Two independent sums: a single one would stall on the latency of each addition.
         v, w = load(x_scaled, i * size, n), load(u_scaled, i * inputs, m)
         x_sum, u_sum = v * (0.5 * inverse[2 * i + 1]), w * (0.5 * inverse[2 * i + 1])
         x_more, u_more = filled(0.0, n), filled(0.0, m)
@@ -82,23 +82,23 @@ def raised(
     best: float, curve: Array, p: int, end_s: float, rate: float, growth: float, squares: Array,
     n: Width,
 ) -> float:  # fmt: skip
-    """The larger of ``best`` and the supremum of |y(s)| e^{rate s} ``growth`` in [0, ``end_s``].
+    """Return the larger of ``best`` and sup |y(s)| e^{rate s} ``growth`` over [0, ``end_s``].
 
-    It is a value that is taken, and the true supremum is larger by a share of CERTAINTY at most
-    (or below 1e-150, or infinite beyond 1e150). A curve that stays close to one level, as an
-    oscillation does, is looked at once more as |y|², a number, where terms that cancel are gone.
-    UNRESOLVED if that does not help (:mod:`cosim.simulation.batch.level_crossing`), or the curve
-    rises again and again.
+    The returned value is attained, and the true supremum exceeds it by at most the share CERTAINTY
+    (values below 1e-150 are ignored; values above 1e150 are infinite). A curve that stays close to
+    one level, such as an oscillation, is searched again as the scalar |y|², in which cancelling
+    terms vanish (:mod:`cosim.simulation.batch.level_crossing`). The result is UNRESOLVED if this
+    search fails too, or if there are too many rises.
 
     Args:
-        best: a value.
+        best: the largest value so far.
         curve: coefficients of y.
         p: the degree.
-        end_s: where to stop.
+        end_s: end of the interval.
         rate: per second.
         growth: a factor.
         squares: scratch, 2p + 1 numbers.
-        n: how many numbers y has.
+        n: number of entries of y.
     """
     for _ in range(_RISES):
         if best >= _LARGEST:
@@ -118,14 +118,14 @@ def raised(
 
 
 def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: Width) -> float:
-    """|y(s)| e^{rate s} at, or near, a maximum to the right of ``low_s``."""
+    """Return |y(s)| e^{rate s} at or near a maximum to the right of ``low_s``."""
     y, dy = value_and_slope(curve, p, low_s, n)
     low = dot(y, dy) + rate * dot(y, y)
     best = math.sqrt(dot(y, y)) * math.exp(rate * low_s)
     y, dy = value_and_slope(curve, p, high_s, n)
     high = dot(y, dy) + rate * dot(y, y)
     for _ in range(_CLIMBS):
-        # Regula falsi where the slope falls through 0, and halves elsewhere.
+        # Regula falsi if the slope decreases through 0, otherwise bisection.
         s = 0.5 * (low_s + high_s)
         if low > 0.0 > high:
             s = low_s + (high_s - low_s) * (low / (low - high))
@@ -142,15 +142,15 @@ def _climbed(curve: Array, p: int, low_s: float, high_s: float, rate: float, n: 
 
 
 def last_above(curve: Array, p: int, end_s: float, level: float, ended: Lanes, n: Width) -> float:
-    """The last s in [0, ``end_s``] at which |y(s)| > ``level``; or NONE, or UNRESOLVED.
+    """Return the last s in [0, ``end_s``] at which |y(s)| > ``level``, NONE or UNRESOLVED.
 
     Args:
         curve: coefficients of y.
         p: the degree.
-        end_s: where to stop.
+        end_s: end of the interval.
         level: the level.
         ended: y(``end_s``).
-        n: how many numbers y has.
+        n: number of entries of y.
     """
     square = level * level
     if dot(ended, ended) > square:
@@ -164,18 +164,18 @@ def passed_at(
     x_c: Array, e_c: Array, d: Array, p: int, end_s: float, limit: float, level: float,
     rate: float, n: Width,
 ) -> float:  # fmt: skip
-    """When the size of the loop passes a limit, for it is below it at 0 and beyond at ``end_s``.
+    """Return the time at which the loop's norm exceeds a limit: below at 0, above at ``end_s``.
 
     Args:
         x_c: coefficients.
         e_c: coefficients.
         d: coefficients.
         p: the degree.
-        end_s: a time.
-        limit: of the size.
-        level: and so many times ``limit``, e^{−rate s} of it; 0: this does not count.
+        end_s: a time at which the limit is exceeded.
+        limit: limit of the norm.
+        level: the second limit is ``level`` ``limit`` e^{−rate s}; 0 if there is no second limit.
         rate: per second.
-        n: how many states.
+        n: number of states.
     """
     low_s, high_s = 0.0, end_s
     for _ in range(_HALVINGS):
@@ -189,7 +189,7 @@ def passed_at(
 
 
 def is_within(x_c: Lanes, e_c: Lanes, d: Lanes, limit: float, level: float) -> bool:
-    """Whether ‖(x, e_s, e_c)‖ is below a limit, and below so many times a threshold if it has one.
+    """Return whether ‖(x, e_s, e_c)‖ is below ``limit``, and below ``limit`` ``level`` if given.
 
     Args:
         x_c: the controller's model.

@@ -2,19 +2,19 @@
 
 With z = (x, e_s), a policy compares ‖P z‖² − ‖N z‖² − η with a squared threshold
 (:mod:`noack.trigger.trigger_condition`). On a piece of a run z is a Taylor polynomial of degree p
-(:mod:`cosim.simulation.batch.taylor`), hence the squares are one of degree 2p: the coefficients of
-y_i² add up to Σ_{i+j=k} y_i · S y_j, y = [P; N] z, S the signs. η̇ = −λη + ψ has the Taylor
-coefficients
+(:mod:`cosim.simulation.batch.taylor`), so the squares are a polynomial of degree 2p. Its
+coefficients are Σ_{i+j=k} y_i · S y_j with y = [P; N] z and the diagonal sign matrix S.
+η̇ = −λη + ψ has the Taylor coefficients
 
-    η_{k+1} = (ψ_k − λ η_k)/(k + 1),
+    η_{k+1} = (ψ_k − λ η_k)/(k + 1).
 
-and from degree D = 2p + 1 on η_{k+1} = −λ η_k/(k + 1), as ψ is a polynomial of degree 2p. What is
-left out after degree q ≥ D is at most |η_q| s^q (λs/(q+1))/(1 − λs/(q+2)). Pieces are so short that
-λs ≤ 2; then each further coefficient counts for 2/(q + 1) of the last one or less, and _MORE of
-them, D ≥ 9, bring this below 2⁻⁵³ of |η_D| s^D: 2²⁰ 9!/29! < 1e-19.
+From degree D = 2p + 1 on, η_{k+1} = −λ η_k/(k + 1), as ψ is a polynomial of degree 2p. The
+truncation error after degree q ≥ D is at most |η_q| s^q (λs/(q+1))/(1 − λs/(q+2)). Pieces are so
+short that λs ≤ 2. Then each further term is at most 2/(q + 1) times the one before, and for D ≥ 9
+_MORE terms reduce the error below 2⁻⁵³ |η_D| s^D: 2²⁰ 9!/29! < 1e-19.
 
-All is divided by the square of a number of the size of the state, so that what has decayed to
-1e-150 keeps its relative accuracy.
+All terms are divided by the square of a number of the state's magnitude, so that values that have
+decayed to 1e-150 keep their relative accuracy.
 """
 
 import math
@@ -32,23 +32,23 @@ from noack.trigger.trigger_policy import Policy
 
 _MORE = 20
 MOST_TERMS = 2 * HIGHEST + 2 + _MORE
-"""Coefficients of the comparison."""
+"""Largest number of coefficients of the comparison."""
 _LEAST_SCALE = 1e-150
 _GRAIN = 16 * 2.0**-52
 SLOWEST = 2.0
-"""λs on a piece."""
+"""Largest λs on a piece."""
 
 
 class QuadraticCurves(NamedTuple):
-    """The forms of the comparison and of η; matrices by columns."""
+    """The quadratic forms of the comparison and of η; matrices in column-major order."""
 
     rows: Width
-    """How many P and N have; rows of zeros fill them up."""
+    """A tuple; its length is the number of rows of [P; N] including zero rows for padding."""
     form: Array
-    """[P; N], for x above, then for e_s."""
+    """[P; N]: the block for x, then the block for e_s."""
     form_signs: Array
     gain: Array
-    """[P_η; N_η]; empty: there is no η."""
+    """[P_η; N_η]; empty if there is no η."""
     gain_signs: Array
     decay_per_s: float
     """λ."""
@@ -56,19 +56,19 @@ class QuadraticCurves(NamedTuple):
     y: Array
     """Scratch: coefficients of [P; N] z."""
     w: Array
-    """Scratch: likewise of η's."""
+    """Scratch: coefficients of [P_η; N_η] z."""
     g: Array
-    """Scratch: of the comparison."""
+    """Scratch: coefficients of the comparison."""
     eta: Array
-    """Scratch: of η."""
+    """Scratch: coefficients of η."""
 
 
 def squares_of(policy: Policy, n: int) -> QuadraticCurves | None:
-    """Return a policy's comparison; None if it has none, or that of ‖W e_s‖ with a threshold.
+    """Return a policy's comparison; None if it has none or compares ‖W e_s‖ with a threshold.
 
     Args:
         policy: the policy.
-        n: how many states.
+        n: number of states.
     """
     rule = policy.trigger_rule(n)
     form, dynamic_variable = rule.form, rule.dynamic_variable
@@ -101,7 +101,7 @@ def squares_of(policy: Policy, n: int) -> QuadraticCurves | None:
 
 
 def _stacked(form: QuadraticForm, rows: int) -> tuple[Array, Array]:
-    """[P; N] by columns, filled up with zeros, and the signs of its rows."""
+    """Return [P; N] in column-major order, padded with zeros, and the signs of its rows."""
     signs = np.zeros(rows)
     signs[: len(form.up)], signs[len(form.up) :] = 1.0, -1.0
     both = np.vstack([form.up, form.down])
@@ -111,12 +111,12 @@ def _stacked(form: QuadraticForm, rows: int) -> tuple[Array, Array]:
 
 
 def scale_of(largest: float, threshold: float, dynamic_variable: float) -> float:
-    """A number of the size of what is compared."""
+    """Return a number of the magnitude of the compared values."""
     return max(largest, threshold, math.sqrt(abs(dynamic_variable)), _LEAST_SCALE)
 
 
 def put(squares: QuadraticCurves, k: int, x: Lanes, e_s: Lanes, factor: float) -> None:
-    """Take a coefficient of the state, times a factor."""
+    """Store a coefficient of the state, times a factor."""
     size, area = len(squares.rows), len(squares.form) // 2
     y = times(squares.form, 0, x, squares.rows) + times(squares.form, area, e_s, squares.rows)
     store(squares.y, k * size, y * factor)
@@ -126,15 +126,15 @@ def put(squares: QuadraticCurves, k: int, x: Lanes, e_s: Lanes, factor: float) -
 
 
 def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
-    """Make the comparison's coefficients of those of the state, up to degree p.
+    """Compute the comparison's coefficients from those of the state.
 
     Args:
         squares: the forms.
-        p: the degree.
-        dynamic_variable: η at the start, over the square of the scale.
+        p: degree of the state's polynomial.
+        dynamic_variable: η at the start, divided by the square of the scale.
 
     Returns:
-        Their degree.
+        The degree of the comparison.
     """
     degree = 2 * p
     signs = load(squares.form_signs, 0, squares.rows)
@@ -143,7 +143,7 @@ def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
         return degree
     signs = load(squares.gain_signs, 0, squares.rows)
     squared(squares.w, p, signs, squares.eta, squares.rows)
-    # From the gain's coefficients to those of η, in the same place.
+    # Compute the coefficients of η from those of its gain, in place.
     last = dynamic_variable
     for k in range(degree + 1 + _MORE):
         gain = squares.eta[k] if k <= degree else 0.0
@@ -158,7 +158,7 @@ def compare(squares: QuadraticCurves, p: int, dynamic_variable: float) -> int:
 
 
 def left_side(squares: QuadraticCurves, x: Lanes) -> float:
-    """‖P z‖ where e_s = 0."""
+    """Return ‖P z‖ for e_s = 0."""
     y = times(squares.form, 0, x, squares.rows)
     return math.sqrt(max(dot(y * load(squares.form_signs, 0, squares.rows), y), 0.0))
 
@@ -166,13 +166,13 @@ def left_side(squares: QuadraticCurves, x: Lanes) -> float:
 def first_look(
     squares: QuadraticCurves, level: float, rate: float, dynamic_variable: float
 ) -> float:
-    """About when the comparison may hold, from the first three coefficients of the state.
+    """Estimate the time of the next event from the first three coefficients of the state.
 
     Args:
         squares: the forms.
-        level: squared threshold, over the square of the scale.
-        rate: at which it decays, per second.
-        dynamic_variable: η, over the square of the scale.
+        level: squared threshold, divided by the square of the scale.
+        rate: decay rate of ``level``, per second.
+        dynamic_variable: η, divided by the square of the scale.
     """
     compare(squares, 2, dynamic_variable)
     return estimate(squares.g, level, rate)
@@ -182,20 +182,20 @@ def first_event(
     squares: QuadraticCurves, rule: Rule, degree: int, level: float, rate: float, point: int,
     t_s: float, end_s: float,
 ) -> tuple[float, int]:  # fmt: skip
-    """When the comparison first holds on a piece, as seconds from its start; or NONE.
+    """Return the first time at which the comparison holds on a piece.
 
     Args:
         squares: the forms.
         rule: the rule.
-        degree: of the comparison.
-        level: squared threshold at the start, over the square of the scale.
-        rate: at which it decays, per second.
-        point: the next point of the grid, if there is one.
-        t_s: when the piece starts.
-        end_s: its length.
+        degree: degree of the comparison.
+        level: squared threshold at the start, divided by the square of the scale.
+        rate: decay rate of ``level``, per second.
+        point: the next point of the grid, if there is a grid.
+        t_s: start of the piece.
+        end_s: length of the piece.
 
     Returns:
-        This; and the next point of the grid.
+        The time in seconds from the piece's start, or NONE; and the next point of the grid.
     """
     if rule.grid_s == 0.0:
         start = load(squares.y, 0, squares.rows)
@@ -214,7 +214,7 @@ def first_event(
 
 
 def dynamic_variable_at(squares: QuadraticCurves, p: int, s: float) -> float:
-    """η, over the square of the scale."""
+    """Return η, divided by the square of the scale."""
     if len(squares.gain) == 0:
         return 0.0
     number, _ = number_and_slope(squares.eta, 2 * p + 1 + _MORE, s)

@@ -1,26 +1,26 @@
-"""The loop between events as Taylor polynomials with a bound on what they leave out.
+"""The loop between events as Taylor polynomials with a bound on the truncation error.
 
-In the coordinates (x_c, e_c, d), e_c = x_c − x and d = x_s − x_c = e_s − e_c,
+In the coordinates (x_c, e_c, d) with e_c = x_c − x and d = x_s − x_c = e_s − e_c,
 
     ẋ_c = H x_c        ḋ = H d        ė_c = A e_c − E x_c        E = A + BK − H,
 
-since A e_c − E x_c = H x_c − A x − BK x_c. What depends on the plant is one chain of n states
-driven by x_c; x_c and d follow the models, which all plants share. x = x_c − e_c, and
-e_s = e_c + d, which is 0 to the last bit after an event, where d = −e_c or both are 0. Nothing
-small is the difference of what is large: a small mismatch E, and errors that it drives, keep their
-relative accuracy.
+since A e_c − E x_c = H x_c − A x − BK x_c. Only e_c depends on the plant; x_c drives it. x_c and d
+follow the models, which all plants share. x = x_c − e_c and e_s = e_c + d. After an event e_s is
+exactly 0, since d = −e_c or both are 0. No small quantity is the difference of large ones: a small
+mismatch E and the errors that it drives keep their relative accuracy.
 
-The Taylor coefficients of degree k are H_k x_c, H_k d and A_k e_c + X_k x_c with tables made once
-for a plant:
+The Taylor coefficients of degree k are H_k x_c, H_k d and A_k e_c + X_k x_c. Their tables are
+computed once per plant:
 
     H_k = H^k/k!    A_k = A^k/k!    X_{k+1} = (A X_k − E H_k)/(k + 1),  X_0 = 0.
 
-What is left out. With G = [[H, 0], [−E/σ, A]], whose powers have the blocks k! H_k, k! A_k and
-k! X_k/σ, the polynomial of degree p leaves out Σ_{k>p} G^k w^k/k! of (σ x_c, e_c) at most w later,
-and ‖G^{p+1+j}‖ ≤ ‖G^{p+1}‖ κ η^j, where η = ‖G⁴‖^{1/4} and κ = max_{r<4} ‖G^r‖/η^r. For
-ηw ≤ (p + 2)/2 the sum is at most 2κ ‖G^{p+1}‖ w^{p+1}/(p + 1)!, which is kept below 2⁻⁵³: the
-rounding error of the state itself. σ = ‖E‖/max(‖A‖, ‖H‖) balances the blocks, so that what a small
-E drives is cut off relative to E. The norms are Frobenius's, which bound the others from above.
+Truncation error. The powers of G = [[H, 0], [−E/σ, A]] have the blocks k! H_k, k! A_k and
+k! X_k/σ. After a time of at most w, the polynomial of degree p omits Σ_{k>p} G^k w^k/k! applied to
+(σ x_c, e_c), and ‖G^{p+1+j}‖ ≤ ‖G^{p+1}‖ κ η^j with η = ‖G⁴‖^{1/4} and κ = max_{r<4} ‖G^r‖/η^r. For
+ηw ≤ (p + 2)/2 the sum is at most 2κ ‖G^{p+1}‖ w^{p+1}/(p + 1)!. It is kept below 2⁻⁵³, the rounding
+error of the state itself. σ = ‖E‖/max(‖A‖, ‖H‖) balances the blocks, so that the truncation error
+of the part driven by a small E is relative to E. All norms are Frobenius norms, which bound the
+2-norms from above.
 """
 
 import math
@@ -43,7 +43,7 @@ from cosim.simulation.batch.vector_lanes import (
 Array = NDArray[np.float64]
 
 DEGREES = (4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24)
-"""p is one of these."""
+"""The possible values of p."""
 HIGHEST = 24
 _NEGLIGIBLE = 2.0**-53
 _MEASURED = 1e-12
@@ -52,13 +52,13 @@ _ROUNDED_UP = 1.0 + 1e-9
 
 
 def powers(H: Array, at: int, table: Array, n: Width) -> None:
-    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, one after the other, each by columns.
+    """Fill a table with H^k/k!, k = 0 … HIGHEST + 1, each matrix in column-major order.
 
     Args:
-        H: by columns, from ``at`` on.
-        at: where.
+        H: array with the matrix in column-major order.
+        at: index in ``H`` at which the matrix starts.
         table: receives (HIGHEST + 2) n² numbers.
-        n: how many states.
+        n: number of states.
     """
     size = len(n)
     for j in range(size):
@@ -84,7 +84,7 @@ def driven(A: Array, at: int, E: Array, H_k: Array, table: Array, n: Width) -> N
 
 
 def square_sum(table: Array, at: int, n: Width) -> float:
-    """Squared Frobenius norm of the matrix that lies from ``at`` on."""
+    """Return the squared Frobenius norm of the matrix that starts at index ``at``."""
     size = len(n)
     total = filled(0.0, n)
     for j in range(size):
@@ -97,22 +97,22 @@ def reaches(
     H_k: Array, A_k: Array, X_k: Array, E: Array, sizes: Array, reach_s: Array,
     measured_s: Array, n: Width,
 ) -> None:  # fmt: skip
-    """How far the polynomial of each degree of DEGREES carries, in seconds.
+    """Compute the time over which the polynomial of each degree in DEGREES is accurate.
 
     Args:
         H_k: table.
         A_k: table.
         X_k: table.
-        E: by columns.
+        E: in column-major order.
         sizes: scratch, (HIGHEST + 2,).
-        reach_s: receives them, (len(DEGREES),); 0 where the tables' numbers are not finite.
-        measured_s: receives them for what is measured, where a share of _MEASURED may be left out.
-        n: how many states.
+        reach_s: receives the times in seconds, (len(DEGREES),); 0 where a table is not finite.
+        measured_s: receives the times for the measures, which allow a relative error of _MEASURED.
+        n: number of states.
     """
     area = len(n) * len(n)
     widest = max(square_sum(A_k, area, n), square_sum(H_k, area, n))
     mismatch = square_sum(E, 0, n)
-    # σ⁻²; where E or both matrices are 0, any will do.
+    # σ⁻²; if E or both matrices are 0, any value is valid.
     balance = widest / mismatch if widest > 0.0 and mismatch > 0.0 else 1.0
     for k in range(HIGHEST + 2):
         own = square_sum(H_k, k * area, n) + square_sum(A_k, k * area, n)
@@ -135,7 +135,7 @@ def reaches(
 
 
 def degree_for(reach_s: Array, window_s: float) -> int:
-    """The lowest degree that carries so far."""
+    """Return the lowest degree that is accurate over the window."""
     for i in range(len(reach_s) - 1):
         if window_s <= reach_s[i]:
             return DEGREES[i]
@@ -143,7 +143,7 @@ def degree_for(reach_s: Array, window_s: float) -> int:
 
 
 def value(curve: Array, p: int, s: float, n: Width) -> Lanes:
-    """Σ_{k≤p} c_k s^k."""
+    """Return Σ_{k≤p} c_k s^k."""
     total = load(curve, p * len(n), n)
     for k in range(p - 1, -1, -1):
         total = fma(total, s, load(curve, k * len(n), n))
@@ -151,7 +151,7 @@ def value(curve: Array, p: int, s: float, n: Width) -> Lanes:
 
 
 def value_and_slope(curve: Array, p: int, s: float, n: Width) -> tuple[Lanes, Lanes]:
-    """The polynomial and its derivative."""
+    """Return the polynomial and its derivative."""
     total, slope = load(curve, p * len(n), n), filled(0.0, n)
     for k in range(p - 1, -1, -1):
         slope = fma(slope, s, total)
@@ -160,10 +160,10 @@ def value_and_slope(curve: Array, p: int, s: float, n: Width) -> tuple[Lanes, La
 
 
 def bend(curve: Array, p: int, s: float, n: Width) -> float:
-    """A bound on |ÿ| in [0, s].
+    """Return a bound on |ÿ| in [0, s].
 
-    N(s) = Σ_k |c_k| s^k, number by number, bounds y and ascends, as do all its derivatives, which
-    bound those of y.
+    Entry by entry, N(s) = Σ_k |c_k| s^k bounds |y|, and its derivatives bound those of y. N and its
+    derivatives are non-decreasing.
     """
     total, slope = magnitude(load(curve, p * len(n), n)), filled(0.0, n)
     half = slope
@@ -175,7 +175,7 @@ def bend(curve: Array, p: int, s: float, n: Width) -> float:
 
 
 def largest(curve: Array, p: int, s: float, n: Width) -> float:
-    """A bound on |y|² in [0, s]."""
+    """Return a bound on |y|² in [0, s]."""
     total = magnitude(load(curve, p * len(n), n))
     for k in range(p - 1, -1, -1):
         total = fma(total, s, magnitude(load(curve, k * len(n), n)))
@@ -183,7 +183,7 @@ def largest(curve: Array, p: int, s: float, n: Width) -> float:
 
 
 def squared(curve: Array, p: int, signs: Lanes, out: Array, n: Width) -> None:
-    """The coefficients of yᵀ S y, S diagonal: of degree 2p, Σ_{i+j=k} c_i · S c_j."""
+    """Write the coefficients of yᵀ S y (degree 2p, S diagonal): Σ_{i+j=k} c_i · S c_j."""
     size = len(n)
     for k in range(2 * p + 1):
         total = filled(0.0, n)

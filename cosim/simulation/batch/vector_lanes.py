@@ -1,11 +1,11 @@
-"""Vectors of n numbers that live in registers, for compiled code.
+"""Vectors of n numbers in CPU registers, for compiled code.
 
-A vector's length is part of its type, so that a matrix-vector product becomes straight code without
-loops, memory or reference counts. Where a length cannot come from another vector, it comes as a
-tuple of that length (:func:`width`), whose numbers are not looked at.
+A vector's length is part of its type. So a matrix-vector product compiles to straight-line code
+without loops, memory access or reference counts. If a length cannot be taken from another vector,
+it is passed as a tuple of that length (:func:`width`); the tuple's entries are not used.
 
-Products are added with fused rounding, x·y + z rounded once, everywhere and always: results are the
-same bits on every machine whose compiler knows IEEE 754.
+Every product is added with fused rounding: x·y + z is rounded once. So results are bit-identical on
+every machine with IEEE 754 arithmetic.
 """
 
 import operator
@@ -17,7 +17,7 @@ from numba.core import types
 from numba.extending import intrinsic, models, overload, register_model
 
 Width = tuple[int, ...]
-"""n numbers of no importance."""
+"""A tuple of n entries with arbitrary values."""
 Lanes = Any
 """A vector, in compiled code."""
 
@@ -25,17 +25,17 @@ _DOUBLE = ir.DoubleType()
 
 
 def _built_in(build: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of compiled code that writes its own instructions."""
+    """Return a function for compiled code that emits its own LLVM instructions."""
     return intrinsic(build)
 
 
 def width(n: int) -> Width:
-    """Return what says in compiled code that vectors have ``n`` numbers."""
+    """Return the tuple that sets the vector length ``n`` in compiled code."""
     return (0,) * n
 
 
 class LanesType(types.Type):
-    """The compiler's name for a vector of ``n`` numbers."""
+    """The compiler's type of a vector of ``n`` numbers."""
 
     def __init__(self, n: int) -> None:
         self.n = n
@@ -53,7 +53,7 @@ def _is_width(number: Any) -> bool:
 
 
 def _at(builder: Any, array: Any, array_type: Any, context: Any, place: Any, n: int) -> Any:
-    """Pointer to n numbers of a contiguous array."""
+    """Return the pointer to n numbers of a contiguous array."""
     from numba.np.arrayobj import make_array
 
     data = make_array(array_type)(context, builder, array).data  # type: ignore[no-untyped-call]
@@ -79,7 +79,7 @@ def _fused(builder: Any, kind: Any, a: Any, b: Any, c: Any) -> Any:
 
 @_built_in
 def load(typing: Any, array: Any, place: Any, n: Any) -> Any:
-    """The numbers of an array from ``place`` on."""
+    """Load a vector from an array, from index ``place`` on."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _at(builder, arguments[0], array, context, arguments[1], n.count)
@@ -92,7 +92,7 @@ def load(typing: Any, array: Any, place: Any, n: Any) -> Any:
 
 @_built_in
 def store(typing: Any, array: Any, place: Any, v: Any) -> Any:
-    """Put a vector into an array, from ``place`` on."""
+    """Store a vector in an array, from index ``place`` on."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer = _at(builder, arguments[0], array, context, arguments[1], v.n)
@@ -104,7 +104,7 @@ def store(typing: Any, array: Any, place: Any, v: Any) -> Any:
 
 @_built_in
 def filled(typing: Any, number: Any, n: Any) -> Any:
-    """A vector of equal numbers."""
+    """Return a vector of equal numbers."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _splat(builder, arguments[0], n.count)
@@ -127,7 +127,7 @@ def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 @_built_in
 def magnitude(typing: Any, v: Any) -> Any:
-    """The numbers without their signs."""
+    """Return the absolute values."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind, name = ir.VectorType(_DOUBLE, v.n), f"llvm.fabs.v{v.n}f64"
@@ -141,7 +141,7 @@ def magnitude(typing: Any, v: Any) -> Any:
 
 @_built_in
 def times(typing: Any, array: Any, place: Any, v: Any, rows: Any) -> Any:
-    """Matrix times vector; the matrix lies by columns in an array, from ``place`` on."""
+    """Return matrix times vector; the matrix is column-major in ``array`` from ``place`` on."""
 
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         kind = ir.VectorType(_DOUBLE, rows.count)

@@ -1,12 +1,13 @@
-"""When a polynomial curve first leaves the unit ball: root isolation in the Bernstein basis.
+"""Finds the first time at which a polynomial curve leaves the unit ball, in the Bernstein basis.
 
-A polynomial on [0, 1] in the Bernstein basis lies in the convex hull of its coefficients. Hence a
-curve whose control points all lie in the unit ball does not leave it, and a scalar polynomial whose
-coefficients are all positive has no root. The number of its roots in (0, 1) is at most the number
-of sign changes of its coefficients, and equal to it modulo 2; halving the interval until there is
-one change or none isolates every simple root (Vincent–Collins–Akritas). The basis is also the best
-conditioned of all on [0, 1] (Farouki & Rajan, 1987): conversion from Taylor coefficients, product
-and halving only add multiples with positive weights.
+A polynomial on [0, 1] in the Bernstein basis lies in the convex hull of its coefficients. So a
+curve does not leave the unit ball if all its control points lie in the ball, and a scalar
+polynomial has no root if all its coefficients are positive. The number of its roots in (0, 1) is at
+most the number of sign changes of its coefficients, and both numbers are equal modulo 2. Halving
+the interval until there is at most one sign change isolates every simple root
+(Vincent–Collins–Akritas). The basis is also the best conditioned one on [0, 1] (Farouki & Rajan,
+1987): conversion from Taylor coefficients, product and halving only add multiples with positive
+weights.
 """
 
 from functools import cached_property, lru_cache
@@ -56,9 +57,9 @@ class CurveBasis:
         return np.concatenate([left, left[::-1, ::-1]])
 
     def first_negative(self, coefficients: Vector) -> float | None:
-        """The first u in [0, 1] after which a polynomial of degree 2p is negative for a while.
+        """Return the first u in [0, 1] after which a polynomial of degree 2p becomes negative.
 
-        What is said of :meth:`first_exit` holds here, too, of rounding errors of the coefficients.
+        Rounding errors of the coefficients have the effects described in :meth:`first_exit`.
 
         Args:
             coefficients: in the Bernstein basis, shape (2p + 1,).
@@ -86,11 +87,11 @@ class CurveBasis:
         return np.array([float(comb(2 * self.degree, k)) for k in range(2 * self.degree + 1)])
 
     def first_exit(self, taylor: Matrix) -> float | None:
-        """The first u in [0, 1] after which |y(u)| > 1 for a while; None if there is none.
+        """Return the first u in [0, 1] after which |y(u)| becomes > 1; None if there is none.
 
-        Every excursion is found whose depth max |y|² − 1 is above the rounding error of the
-        polynomial, some 1e-14; a shallower one, a tangency in floating point, is either found or
-        taken for none. A curve that starts on the sphere leaves it at 0 if it goes outward.
+        An excursion is always found if its depth max |y|² − 1 exceeds the rounding error of the
+        polynomial, about 1e-14. A shallower excursion (a tangency in floating point) may be missed.
+        A curve that starts on the sphere and moves outward leaves the ball at u = 0.
 
         Args:
             taylor: coefficients of y(u) = Σ_k ``taylor``[k] u^k, shape (p + 1, n).
@@ -102,7 +103,7 @@ class CurveBasis:
         return None if bracket is None else _refine(taylor, *bracket)
 
     def _isolate(self, inside: Vector, tolerance: float) -> tuple[float, float] | None:
-        """An interval that holds the first exit and no other root, or the exit itself twice."""
+        """Return an interval with the first exit and no other root, or the exit as both ends."""
         pending = [(0.0, 1.0, inside)]
         while pending:
             start, width, coefficients = pending.pop()
@@ -122,12 +123,12 @@ class CurveBasis:
 
 @lru_cache
 def curve_basis(degree: int) -> CurveBasis:
-    """The basis of a degree, made once."""
+    """Return the cached basis of a degree."""
     return CurveBasis(degree)
 
 
 def _refine(taylor: Matrix, inside: float, outside: float) -> float:
-    """Newton's method on |y(u)| = 1, bisecting when it leaves the bracket."""
+    """Solve |y(u)| = 1 by Newton's method; bisect when a step leaves the bracket."""
     degree, n = len(taylor) - 1, taylor.shape[1]
     orders = np.arange(degree + 1.0)
     both = np.zeros((degree + 1, 2 * n))

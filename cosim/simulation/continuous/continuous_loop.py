@@ -1,7 +1,7 @@
 """The paper's loop between events, and the exact time of the next one.
 
-In the coordinates z = (x, e_s, e_c), e_s = x_s − x, e_c = x_c − x, the loop between events is
-linear and autonomous, and its errors keep their relative accuracy while everything decays:
+In the coordinates z = (x, e_s, e_c) with e_s = x_s − x and e_c = x_c − x, the loop between events
+is linear and autonomous. The errors keep their relative accuracy while all states decay:
 
     ẋ   = (A+BK) x + BK e_c
     ė_s = H e_s − E x − BK e_c          E = A + BK − H  (eq:miet_errdyn)
@@ -10,20 +10,20 @@ linear and autonomous, and its errors keep their relative accuracy while everyth
 with H = Â+B̂K in model mode and H = 0 under zero-order hold. An event is the first t > t_i at which
 ‖W e_s(t)‖ exceeds max(βe^{−αt}, ε) (eq:thre). There e_s ← 0, and e_c ← 0 if the update arrives.
 
-Why no crossing is skipped. While the threshold is βe^{−αt}, the scaled error
-y(t) = W e_s(t) / (βe^{−αt}) is the output of a linear system, too: it is [0 W 0] e^{(G+αI)(t−t₀)}
-z(t₀) over the threshold at t₀. The event is where the curve y leaves the unit ball. With the floor
-ε in place of βe^{−αt} the same holds for α = 0. Time is cut into cells of a width on which a
-polynomial of degree 18 equals y to rounding (:mod:`cosim.simulation.continuous.exact_flow`). The
-control points of all cells of a window are one matrix-vector product. A cell whose control points
-are in the ball does not leave it (convex hull); in every other one the roots of 1 − |y|² are
-isolated (:mod:`cosim.simulation.continuous.bernstein`).
-Nothing is sampled. What remains is rounding: an excursion above the threshold by less than about
-1e-15 ‖z‖/threshold of it may be taken for a tangency, which is no event.
+No crossing is skipped. While the threshold is βe^{−αt}, the scaled error
+y(t) = W e_s(t) / (βe^{−αt}) is also the output of a linear system: [0 W 0] e^{(G+αI)(t−t₀)} z(t₀)
+divided by the threshold at t₀. The event is the time at which the curve y leaves the unit ball. If
+the floor ε replaces βe^{−αt}, the same holds with α = 0. Time is divided into cells on which a
+polynomial of degree 18 equals y up to rounding (:mod:`cosim.simulation.continuous.exact_flow`). The
+control points of all cells of a window are one matrix-vector product. If all control points of a
+cell are in the ball, y stays in the ball there (convex hull). In every other cell the roots of
+1 − |y|² are isolated (:mod:`cosim.simulation.continuous.bernstein`).
+No sampling is involved. Only rounding remains: an excursion above the threshold by less than a
+share of about 1e-15 ‖z‖/threshold may be taken for a tangency and missed.
 
-When a run has diverged: when ‖z‖ passes 1e100, or so many times the threshold that e_s or x is
-compared with. This is looked at where windows and the time up to an event end, and the time of the
-passing is found by bisection between there and the last event.
+A run has diverged when ‖z‖ exceeds 1e100, or 1e100 times the threshold of e_s or x. This is tested
+at the end of each window and at each event. Bisection between that time and the last event finds
+the time of divergence.
 """
 
 import math
@@ -52,7 +52,7 @@ from noack.trigger.trigger_policy import Policy
 _SMALLEST_THRESHOLD = 1e-200
 _LONGEST_CELL_S = 1e3
 _GRID_SLACK = 1e-9
-"""Of a period: so far may an event be off the grid for rounding."""
+"""Tolerance for the rounding of an event's time on the grid, as a share of the period."""
 _GRID_BLOCK = 256
 _BISECTIONS = 60
 
@@ -118,17 +118,17 @@ class ContinuousLoop:
 
     @property
     def decaying(self) -> DecayingTrigger:
-        """The trigger, if it is the paper's.
+        """The trigger, which must be the paper's.
 
         Raises:
-            CallerError: it is another.
+            CallerError: the policy is another one.
         """
         if not isinstance(self.trigger, DecayingTrigger):
             raise CallerError('trigger.policy: needs the paper\'s trigger, "decaying"')
         return self.trigger
 
     def threshold(self, t_s: float) -> float:
-        """max(βe^{−αt}, ε) of the paper's trigger."""
+        """Return max(βe^{−αt}, ε) of the paper's trigger."""
         return self.decaying.threshold(t_s * 1e9)
 
     def norms(self, errors: Matrix) -> Vector:
@@ -140,27 +140,27 @@ class ContinuousLoop:
     def next_event(
         self, state: LoopState, until_s: float, condition: TriggerCondition | None = None
     ) -> LoopState | None:
-        """The state just before the reset at the next event in [``state.t_s``, ``until_s``].
+        """Return the state just before the reset at the next event in [``state.t_s``, ``until_s``].
 
         Args:
-            state: where the loop is.
-            until_s: how far to look.
-            condition: the rule until then; by default the policy's, if ``state`` is just after an
-                event or at the start.
+            state: the loop's state.
+            until_s: end of the search.
+            condition: the trigger condition; by default the policy's after an event (or a start) at
+                ``state``.
 
         Returns:
-            None if there is no event until then. A state that is beyond the rule's threshold
-            already, or on it and growing, is an event itself.
+            None if there is no event until ``until_s``. If ``state`` already exceeds the threshold,
+            or equals it and grows, the event is at ``state``.
 
         Raises:
-            DivergedError: the state outgrows what can be computed with before.
-            CallerError: the threshold decays below 1e-200 before, where nothing is left to resolve.
+            DivergedError: the state becomes too large to compute with before an event.
+            CallerError: the threshold decays below 1e-200 before an event.
         """
         found = self.next_crossing(state, until_s, condition or self.condition(state))
         return None if found is None else found[0]
 
     def condition(self, state: LoopState) -> TriggerCondition:
-        """The rule after an event at a state."""
+        """Return the trigger condition after an event at a state."""
         return self._rule.after(state.t_s * 1e9, state.x)
 
     @np.errstate(over="ignore", invalid="ignore")  # a run may diverge
@@ -171,16 +171,16 @@ class ContinuousLoop:
         condition: TriggerCondition,
         auxiliary: float = 0.0,
     ) -> tuple[LoopState, float] | None:
-        """The same as :meth:`next_event`, with the condition's auxiliary variable.
+        """Return the next event like :meth:`next_event`, with the condition's auxiliary variable.
 
         Args:
-            state: where the loop is.
-            until_s: how far to look.
-            condition: the rule until then.
+            state: the loop's state.
+            until_s: end of the search.
+            condition: the trigger condition.
             auxiliary: η or the integral at ``state``.
 
         Raises:
-            DivergedError: with the time of the passing.
+            DivergedError: the run diverges before an event; contains the time.
         """
         try:
             found = self._next_crossing(state, until_s, condition, auxiliary)
@@ -192,7 +192,7 @@ class ContinuousLoop:
         return found
 
     def _is_within(self, state: LoopState, condition: TriggerCondition) -> bool:
-        """Whether a state is one that can be computed with."""
+        """Return whether a state is small enough to compute with."""
         threshold, begins_ns = 0.0, min(condition.earliest_ns, condition.latest_ns)
         if len(condition.form.up) and state.t_s * 1e9 >= begins_ns:
             threshold = condition.threshold(state.t_s * 1e9)
@@ -200,7 +200,7 @@ class ContinuousLoop:
         return float(np.linalg.norm(np.concatenate(state[1:]))) < limit
 
     def _passed_s(self, state: LoopState, until_s: float, condition: TriggerCondition) -> float:
-        """When the loop passes what can be computed with, for it has at ``until_s``."""
+        """Return the time at which the loop diverged, given that it has diverged at ``until_s``."""
         low_s, high_s = state.t_s, until_s
         if not self._is_within(state, condition):
             return low_s
@@ -239,7 +239,7 @@ class ContinuousLoop:
     def _exit(
         self, z: Vector, t_s: float, end_s: float, condition: TriggerCondition, auxiliary: float
     ) -> DetectedEvent:
-        """Follow the loop until the comparison holds, or to ``end_s``; first decay, then floor."""
+        """Follow the loop until the comparison holds or ``end_s``: first decay, then floor."""
         begin_s, since_s = t_s, condition.since_ns * 1e-9
         floor_from_s, vanishes_s = -math.inf, math.inf
         if condition.level > condition.floor and condition.rate_per_s > 0:
@@ -272,7 +272,7 @@ class ContinuousLoop:
     def _detector(
         self, condition: TriggerCondition, rate_per_s: float, threshold: float
     ) -> EventDetector:
-        """The detector of a condition, made once; with η, the threshold does not decay."""
+        """Return the cached detector of a condition; with η, the threshold does not decay."""
         form, plain = condition.form, not len(condition.form.down)
         if not condition.integrates:
             plain = plain and threshold > 0 and condition.dynamic_variable is None
@@ -301,7 +301,7 @@ class ContinuousLoop:
     def _advance(
         self, z: Vector, dt_s: float, condition: TriggerCondition, auxiliary: float
     ) -> tuple[Vector, float]:
-        """The state and the auxiliary variable after a time in which the comparison is off."""
+        """Return state and auxiliary variable at the end of a span without comparison."""
         if not condition.has_auxiliary:
             return self.flow.advance(z, dt_s), auxiliary
         if condition.integrates:
@@ -339,11 +339,11 @@ class ContinuousLoop:
         return DetectedEvent(end_s - t_s, self.flow.advance(z, end_s - t_s), 0.0, exceeds=False)
 
     def propagate(self, state: LoopState, t_s: float) -> LoopState:
-        """The state at ``t_s`` ≥ ``state.t_s``, no event happening in between."""
+        """Return the state at ``t_s`` ≥ ``state.t_s``, without events in between."""
         return self._state(t_s, self.flow.advance(np.concatenate(state[1:]), t_s - state.t_s))
 
     def sample(self, state: LoopState, t_s: Vector) -> Samples:
-        """The states at many times ≥ ``state.t_s``, no event happening in between."""
+        """Return the states at many times ≥ ``state.t_s``, without events in between."""
         t_s = np.asarray(t_s, dtype=np.float64)
         states = self.flow.sample(np.concatenate(state[1:]), t_s - state.t_s)
         return Samples(t_s, *np.split(states, 3, axis=1))
@@ -354,7 +354,7 @@ class ContinuousLoop:
 
 
 def reset(state: LoopState, delivered: bool) -> LoopState:
-    """The state after an event: e_s = 0, and e_c = 0 if the update arrives."""
+    """Return the state after an event: e_s = 0, and e_c = 0 if the update arrives."""
     nothing = np.zeros_like(state.e_s)
     return LoopState(state.t_s, state.x, nothing, nothing if delivered else state.e_c)
 
@@ -363,7 +363,7 @@ def continuous_loop_of(resolved: Scenario) -> ContinuousLoop:
     """Return the exact loop of a resolved scenario.
 
     Raises:
-        CallerError: it is a scenario that exact simulation cannot take.
+        CallerError: exact simulation does not support the scenario.
     """
     resolved.coverage.require_unacknowledged()
     resolved.coverage.require_unchanging()

@@ -14,14 +14,14 @@ from noack.core.linear_systems import Vector
 from noack.trigger.decaying import DecayingTrigger
 
 POINTS = 501
-"""Number of times, evenly over the run, at which the document gives the states."""
+"""Number of evenly spaced times at which the document lists the states."""
 
 
 def run_continuous(resolved: Scenario) -> ContinuousRun:
     """Run a resolved scenario in exact continuous time, with the losses of its own network.
 
     Raises:
-        CallerError: the events accumulate, or the threshold decays to nothing.
+        CallerError: the events accumulate, or the threshold becomes too small to compute with.
     """
     return simulate_continuous(
         continuous_loop_of(resolved),

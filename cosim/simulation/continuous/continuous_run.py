@@ -18,7 +18,7 @@ MAX_EVENTS = 100_000
 
 
 class TooManyEventsError(CallerError):
-    """The events accumulate: the trigger fires ever faster."""
+    """The events accumulate: inter-event times tend to 0."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ContinuousRun:
     delivered: NDArray[np.bool_]
     """Whether the update of each event arrived, (k,)."""
     diverged_at_s: float | None
-    """When the state outgrew 1e100, or None; the run is known up to there."""
+    """Time at which the state exceeded 1e100, or None; the run is computed up to this time."""
 
     @cached_property
     def event_s(self) -> Vector:
@@ -45,17 +45,17 @@ class ContinuousRun:
 
     @property
     def reached_s(self) -> float:
-        """The run is known up to here."""
+        """The run is computed up to this time."""
         return self.horizon_s if self.diverged_at_s is None else self.diverged_at_s
 
     def at(self, t_s: Vector | Sequence[float]) -> Samples:
-        """The loop at many times, right-continuous: at an event it is shown after the reset.
+        """Return the loop at many times, right-continuous: at an event, the state after the reset.
 
         Args:
             t_s: times in [0, ``reached_s``], in ascending order, shape (k,).
 
         Raises:
-            ValueError: times out of range or order.
+            ValueError: a time is out of range, or the times are not in ascending order.
         """
         t_s = np.asarray(t_s, dtype=np.float64)
         if len(t_s) and not (t_s[0] >= 0 and t_s[-1] <= self.reached_s):
@@ -95,22 +95,22 @@ def simulate_continuous(
     x0: Vector | None = None,
     max_events: int = MAX_EVENTS,
 ) -> ContinuousRun:
-    """Run the loop from t = 0; every event time is exact to rounding.
+    """Run the loop from t = 0; every event time is exact up to rounding.
 
     Args:
-        loop: the matrices, or a :class:`ContinuousLoop` made before.
-        trigger: the event-triggering policy; not with a :class:`ContinuousLoop`, which has one.
-        horizon_s: where the run ends.
-        delivered: whether the update of event i arrives; of a sequence, which the pattern of a run
-            may be shorter than, events beyond its end arrive.
-        known_start: sensor and controller know x(0). Otherwise x_c = 0 and event 0 happens at
-            t = 0, the paper's t_0, to be delivered if the paper is to be followed.
-        x0: x(0), shape (n,); the loop's own unless given.
-        max_events: more are an error.
+        loop: the matrices, or an existing :class:`ContinuousLoop`.
+        trigger: the event-triggering policy; None for a :class:`ContinuousLoop`, which has one.
+        horizon_s: end of the run.
+        delivered: whether the update of event i arrives. If a sequence is shorter than the number
+            of events, all updates after its end arrive.
+        known_start: sensor and controller start from x(0). Otherwise x_c = 0 and event 0 happens at
+            t = 0, the paper's t_0; the paper assumes that it is delivered.
+        x0: x(0), shape (n,); by default the loop's own.
+        max_events: largest number of events.
 
     Raises:
         TooManyEventsError: more than ``max_events`` events, or two at the same time.
-        CallerError: the threshold decays to nothing before the horizon.
+        CallerError: the threshold decays below the smallest supported value before the horizon.
     """
     system = loop if isinstance(loop, ContinuousLoop) else ContinuousLoop(loop, _given(trigger))
     x = np.array(system.loop.x0 if x0 is None else x0, dtype=np.float64)

@@ -1,8 +1,8 @@
-"""When a condition's comparison first holds, while the loop follows ``dz/dt = G z``.
+"""Finds the first time at which a trigger comparison holds, while the loop follows ``dz/dt = G z``.
 
-Nothing is sampled: time is cut into cells of a width on which a polynomial of degree 18 equals z to
-rounding (:mod:`cosim.simulation.continuous.exact_flow`), and the roots of the comparison's
-polynomial are isolated in the Bernstein basis (:mod:`cosim.simulation.continuous.bernstein`).
+No sampling: time is divided into cells on which a polynomial of degree 18 equals z up to rounding
+(:mod:`cosim.simulation.continuous.exact_flow`). The roots of the comparison's polynomial are
+isolated in the Bernstein basis (:mod:`cosim.simulation.continuous.bernstein`).
 """
 
 import math
@@ -16,12 +16,12 @@ from noack.core.linear_systems import Matrix, Vector
 from noack.trigger.trigger_condition import QuadraticForm
 
 LARGEST = 1e100
-"""Beyond, a state is said to have diverged: squares and ratios must stay finite."""
+"""A state above this norm counts as diverged: squares and ratios must stay finite."""
 _SLACK = 1e-13
 
 
 class DivergedError(ArithmeticError):
-    """The state has grown beyond 1e100, or by that factor beyond the threshold, at ``t_s``."""
+    """At ``t_s`` the state exceeded 1e100, or 1e100 times the threshold."""
 
     def __init__(self, t_s: float) -> None:
         super().__init__(f"the loop diverges: the state passes 1e100 at {t_s:g} s")
@@ -29,14 +29,14 @@ class DivergedError(ArithmeticError):
 
 
 class DetectedEvent(NamedTuple):
-    """The end of a search for an event."""
+    """The result of a search for an event."""
 
     after_s: float
     z: Vector
     auxiliary: float
     """η, or the integral."""
     exceeds: bool
-    """Whether the comparison holds from there on for a while; else it is the end of the span."""
+    """Whether the comparison holds just after this time; otherwise this is the end of the span."""
 
 
 class EventDetector(Protocol):
@@ -45,7 +45,7 @@ class EventDetector(Protocol):
     def first_exit(
         self, z: Vector, t_s: float, threshold: float, span_s: float, auxiliary: float
     ) -> DetectedEvent:
-        """Follow the loop until the comparison holds, or to the end of a span.
+        """Follow the loop until the comparison holds or the span ends.
 
         Args:
             z: state at ``t_s``, shape (N,).
@@ -55,19 +55,19 @@ class EventDetector(Protocol):
             auxiliary: η or the integral at ``t_s``.
 
         Raises:
-            DivergedError: the state outgrows what can be computed with.
+            DivergedError: the state becomes too large to compute with.
         """
         ...
 
 
 class NormEventDetector:
-    """Finds where an output of the loop, over a threshold that decays, leaves the unit ball.
+    """Finds the first time at which (output / decaying threshold) leaves the unit ball.
 
     Args:
-        flow: of the state z.
+        flow: the exact flow of the state z.
         generator: G, shape (N, N).
-        output: what is compared with the threshold, as a function of z, shape (r, N).
-        rate_per_s: rate at which the threshold decays; 0 for a constant one.
+        output: C of the output C z that is compared with the threshold, shape (r, N).
+        rate_per_s: decay rate of the threshold; 0 for a constant one.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class NormEventDetector:
         control = np.tensordot(self._basis.from_taylor, self._taylor, 1).reshape(-1, size)
         starts = flow.powers[:CELLS] * self._growth[:, None, None]
         self._control = (control @ starts).reshape(-1, size)
-        """Control points of y in all cells of a window, one below the other."""
+        """Control points of y in all cells of a window, stacked as rows."""
         self._shape = (-1, DEGREE + 1, n)
         self._slack = _SLACK * max(float(np.abs(self._control).sum(axis=1).max()), 1.0)
 
@@ -117,16 +117,16 @@ class NormEventDetector:
 
 
 class QuadraticEventDetector:
-    """Finds where ‖P z‖² − ‖N z‖² − η first exceeds c², of a threshold c that decays, or 0.
+    """Finds the first time at which ‖P z‖² − ‖N z‖² − η exceeds c²; c is a decaying threshold or 0.
 
-    On a cell all of these are polynomials: those of z have degree p, their squares 2p, and η, of
-    which η̇ = −λη + ‖P_η z‖² − ‖N_η z‖², is that of its Taylor series, cut after degree 2p = 36.
+    On a cell all terms are polynomials: z has degree p, the squares have degree 2p. The dynamic
+    variable η, with η̇ = −λη + ‖P_η z‖² − ‖N_η z‖², is its Taylor series up to degree 2p = 36.
 
     Args:
-        flow: of the state z, with cells of at most 1/(λ + ρ).
+        flow: the exact flow of the state z, with cells of at most 1/(λ + ρ).
         generator: G, shape (N, N).
-        form: P and N, on the first 2n entries of z; without P, η alone is followed.
-        rate_per_s: ρ of the threshold c e^{−ρt}; 0 where there is an η.
+        form: P and N, on the first 2n entries of z; without P, only η is computed.
+        rate_per_s: ρ of the threshold c e^{−ρt}; 0 if there is an η.
         gain: P_η and N_η, if there is an η.
         decay_per_s: λ.
     """
@@ -183,7 +183,7 @@ class QuadraticEventDetector:
             begin_s += self._flow.window_s
 
     def _eta_series(self, z: Vector, auxiliary: float) -> Matrix | None:
-        """Taylor coefficients of η in all cells of a window, scaled, shape (cells, 2p + 1)."""
+        """Scaled Taylor coefficients of η in all cells of a window, shape (cells, 2p + 1)."""
         if self._gain is None:
             return None
         eta = self._gain.taylor(z) @ self._by_gain.T
@@ -215,11 +215,11 @@ class QuadraticEventDetector:
 
 
 class _Squares:
-    """A form on the first entries of z, in all cells of a window at once.
+    """A quadratic form on the first entries of z, in all cells of a window at once.
 
     Args:
         form: the form.
-        cells: Taylor coefficients of z in the cells, from z at the window's start.
+        cells: map from z at the window's start to the Taylor coefficients of z in the cells.
     """
 
     def __init__(self, form: QuadraticForm, cells: Matrix) -> None:
@@ -248,18 +248,18 @@ class _Squares:
 
 
 def _convolution(degree: int) -> Matrix:
-    """What adds up all products a_i b_j with i + j = m, shape (2p + 1, (p + 1)²)."""
+    """Return the matrix that sums all products a_i b_j with i + j = m, (2p + 1, (p + 1)²)."""
     orders = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
     return np.asarray(orders[None] == np.arange(2 * degree + 1)[:, None], dtype=np.float64)
 
 
 def _dynamic_variable_series(decay_per_s: float, width_s: float) -> tuple[Vector, Matrix]:
-    """How the Taylor coefficients of η on a cell follow from η at its start and from its gain's.
+    """Return the linear maps that give the Taylor coefficients of η on a cell.
 
-    η_{k+1} = d (w_k − λη_k)/(k + 1).
+    η_{k+1} = d (w_k − λη_k)/(k + 1), with the coefficients w_k of η's gain.
 
     Returns:
-        (2p + 1,) for a start of 1, and (2p + 1, 2p + 1) by the gain's coefficients.
+        The factor of η at the cell's start, (2p + 1,), and that of w, (2p + 1, 2p + 1).
     """
     size = 2 * DEGREE + 1
     by_start, by_gain = np.zeros(size), np.zeros((size, size))

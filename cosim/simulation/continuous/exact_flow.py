@@ -1,11 +1,11 @@
 """Exact flow of ``dz/dt = G z`` on a grid of cells, and between its points.
 
-e^{Gt} = T(s) S^j with t = j d + s, 0 ≤ s < d: S = e^{Gd} and T(s) = Σ_{k≤p} (Gs)^k/k!. The cell's
-width d makes the truncated terms smaller than rounding: with
+For t = j d + s with 0 ≤ s < d, e^{Gt} = T(s) S^j with S = e^{Gd} and T(s) = Σ_{k≤p} (Gs)^k/k!. The
+cell's width d makes the truncated terms smaller than rounding: with
 η = max(‖G⁴‖^{1/4}, ‖G⁵‖^{1/5}), ‖G^k‖ ≤ η^k for all k ≥ 12 (Al-Mohy & Higham, 2009), and η d ≤ 1
-bounds what follows degree 18 by Σ_{k>18} 1/k! < 1e-17. Sums and products of blocks keep the
-relative accuracy of a small block beside a large one (a small mismatch E), which the
-scaling-and-squaring of a general-purpose exponential does not.
+bounds the terms after degree 18 by Σ_{k>18} 1/k! < 1e-17. Sums and products of blocks keep the
+relative accuracy of a small block beside a large one (a small mismatch E). The
+scaling-and-squaring of a general-purpose exponential loses it.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""When the integral of a norm over the time since the last event exceeds its threshold."""
+"""Event detector for the integral of a norm over the time since the last event."""
 
 import math
 
@@ -16,17 +16,17 @@ _FINEST = 1e-15
 
 
 class IntegralEventDetector:
-    """Finds when ∫‖y‖dτ first exceeds a threshold that decays, y an output of the loop.
+    """Finds the first time at which ∫‖y‖dτ exceeds a decaying threshold; y is the loop's output.
 
-    The integral does not decrease and the threshold does not grow: they meet once. On a cell y is
-    a polynomial; ∫‖y‖ is computed by Gauss-Legendre quadrature on intervals that are halved until
-    the halves agree with the whole to 1e-13 of the integral so far.
+    The integral never decreases and the threshold never increases, so they cross at most once. On
+    a cell y is a polynomial. ∫‖y‖ is computed by Gauss-Legendre quadrature on intervals that are
+    halved until the two halves agree with the whole to 1e-13 of the integral so far.
 
     Args:
-        flow: of the state z.
+        flow: the exact flow of the state z.
         generator: G, shape (N, N).
-        output: y as a function of z, shape (r, N).
-        rate_per_s: rate at which the threshold decays; 0 for a constant one.
+        output: C of y = C z, shape (r, N).
+        rate_per_s: decay rate of the threshold; 0 for a constant one.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class IntegralEventDetector:
 
 
 def _norm_integral(y: Matrix, begin: float, end: float, grain: float) -> float:
-    """∫‖y(u)‖du over [begin, end], to 1e-13 of itself and ``grain``.
+    """Return ∫‖y(u)‖du over [begin, end], to a tolerance of 1e-13 times (the integral + ``grain``).
 
     Args:
         y: Taylor coefficients, shape (p + 1, r).
         begin: in [0, 1].
         end: in [begin, 1].
-        grain: a size below whose rounding nothing counts.
+        grain: scale of the integral; differences below its rounding error are ignored.
     """
     pending, total = [(begin, end)], 0.0
     while pending:

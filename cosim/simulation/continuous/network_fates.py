@@ -1,4 +1,4 @@
-"""The network's word on each update, without a network."""
+"""Computes the emulated network's decision for each update, without running a network."""
 
 from collections.abc import Callable
 
@@ -11,18 +11,17 @@ from noack.protocol.record_tables import Fate
 
 
 def timeless(settings: LinkSettings) -> LinkSettings:
-    """The part of a link that has a place in the paper's loop: losses and corruption."""
+    """Return the settings of a link that apply in the paper's loop: losses and corruption."""
     kept = tuple(one for one in settings.impairments if isinstance(one, LossOf | Corrupt))
     return settings.model_copy(update={"impairments": kept})
 
 
 def network_fates(resolved: Scenario) -> Callable[[int], bool]:
-    """Whether the scenario's network delivers update i, for i = 0, 1, …: as in a live run.
+    """Return whether the scenario's network delivers update i, for i = 0, 1, …, as in a live run.
 
-    The emulator's decisions depend on its seed and on the order of arrival only, so that they are
-    known before anything is sent: of those that depend on nothing else. Delays, rate limits and
-    blackouts have no place in the paper's loop and play no part. For
-    ``initial_sync = "first_packet"`` update 0 is delivered.
+    The emulator's losses and corruption depend only on its seed and on the order of arrival, so
+    they can be computed without sending. Delays, rate limits and blackouts do not exist in the
+    paper's loop and are ignored. For ``initial_sync = "first_packet"`` update 0 is delivered.
     """
     link = Link(timeless(resolved.network.link), resolved.seeds.loss, UPDATE_LINK)
     known: list[bool] = []

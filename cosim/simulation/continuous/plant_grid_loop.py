@@ -1,14 +1,14 @@
-"""The loop on the plant's time grid, exact between grid points: what implementation adds.
+"""The loop on the plant's time grid, exact between grid points, with three implementation effects.
 
-A real loop differs from the paper's in three ways, each of which can be switched on here:
+A real loop differs from the paper's loop by these effects:
 
-* sampling, always on here: the trigger is tested at the measured steps only, and an update leaves
+* sampling, always on here: the trigger is tested at the measured steps only, and an update is sent
   at that step;
-* delay: an update acts on the controller's model x_c(t) some time after its event, as
-  x_c ← e^{H(t−t_i)} x(t_i), the newest only;
-* held actuation: the plant's input is constant over a step, u_k = K x_c(t'_k), with the model time
-  t'_k of the actuation that was latched at step k; an update acts from the first step on that holds
-  an actuation computed with it.
+* delay, optional: an update acts on the controller's model x_c(t) some time after its event, as
+  x_c ← e^{H(t−t_i)} x(t_i); only the newest update acts;
+* held actuation, optional: the plant's input is constant over a step, u_k = K x_c(t'_k), with the
+  model time t'_k of the actuation applied at step k. An update acts from the first step that
+  applies an actuation computed from it.
 
 Without held actuation the plant follows u = K x_c(t) continuously, by e^{Gt} of
 :mod:`cosim.simulation.continuous.continuous_loop`; with it, by the exact zero-order hold that the
@@ -28,19 +28,19 @@ from noack.core.linear_systems import Matrix, Vector, discretise
 from noack.trigger.trigger_policy import Trigger
 
 NO_ACTUATION = -1
-"""Stands for "none yet" among model times."""
+"""Model time of a step without any actuation yet."""
 _BLOCK = 64
 _LONGEST_CELL_S = 1e3
 
 
 @dataclass(frozen=True)
 class StepSchedule:
-    """What happened when, counted in steps of the plant; K steps follow step 0."""
+    """Times of the run's occurrences, in steps of the plant; K steps follow step 0."""
 
     period_ns: int
     """The plant's period."""
     measured: NDArray[np.bool_]
-    """Whether the sensor tested at each step, (K + 1,); the last step is the last measured."""
+    """Whether the sensor tested the trigger at each step, (K + 1,); the last step is measured."""
     delivered: Callable[[int], bool]
     """Whether the update of each event arrives."""
     delay_ns: Callable[[int], int]
@@ -48,7 +48,7 @@ class StepSchedule:
     delay_steps: Callable[[int], int]
     """Steps from each delivered event to the first one with an input computed from it."""
     model_ns: NDArray[np.int64]
-    """Model time of the actuation that is held from each step on, −1 for none yet, (K + 1,)."""
+    """Model time of the actuation held from each step on, (K + 1,); −1 if there is none yet."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class SampledLoop:
 
     Args:
         system: matrices and trigger, of any policy.
-        schedule: what happened when.
+        schedule: times of measurements, deliveries and actuations.
         known_start: sensor and controller know x(0); otherwise the first measured step is event 0.
     """
 
@@ -86,7 +86,7 @@ class SampledLoop:
 
     @np.errstate(all="ignore")
     def run(self, *, delay: bool, hold: bool) -> SampledRun:
-        """Simulate; a state that is not finite any more stays so."""
+        """Simulate; once the state is not finite, it stays non-finite."""
         schedule, period_ns, x0 = self._schedule, self._schedule.period_ns, self._system.loop.x0
         last = len(schedule.measured) - 1
         states = np.empty((last + 1, len(x0)))
@@ -143,13 +143,14 @@ class SampledLoop:
         return self._schedule.delay_ns(event)
 
     def _continuous(self, x: Vector, updates: list["_Update"], step: int, until: int) -> Matrix:
-        """X at the steps after ``step`` up to ``until``, under u = K x_c(t).
+        """Return x at the steps after ``step`` up to ``until``, under u = K x_c(t).
 
         Args:
             x: state at ``step``.
-            updates: the newest that acts at ``step``; those that act within the one step to come.
-            step: where x is known.
-            until: the last step wanted; the next if updates act before it.
+            updates: the newest update in effect at ``step``, then those that take effect within
+                the next step.
+            step: number of the step with state ``x``.
+            until: the last step to compute; ``step`` + 1 if updates take effect before it.
         """
         n, now_ns, newest = len(x), step * self._schedule.period_ns, updates[0]
         z = self._state(x, newest, now_ns)
@@ -165,12 +166,12 @@ class SampledLoop:
         return self._system.flow.advance(z, (end_ns - now_ns) * 1e-9)[None, :n]
 
     def _state(self, x: Vector, newest: "_Update", now_ns: int) -> Vector:
-        """(x, e_s, e_c) for e_s = 0, which the plant does not feel."""
+        """Return (x, e_s, e_c) with e_s = 0; e_s does not act on the plant."""
         x_c = self._model.advance(newest.x, (now_ns - newest.event_ns) * 1e-9)
         return np.concatenate([x, np.zeros_like(x), x_c - x])
 
     def _held(self, x: Vector, newest: "_Update", step: int, until: int) -> Matrix:
-        """X at the steps after ``step`` up to ``until``, under the inputs latched there."""
+        """Return x at the steps after ``step`` up to ``until``, under the inputs applied there."""
         model_ns = self._schedule.model_ns[step:until]
         age_ns = np.maximum(model_ns - newest.event_ns, 0)
         inputs = self._model.sample(newest.x, age_ns * 1e-9) @ self._system.loop.K.T
@@ -183,7 +184,7 @@ class SampledLoop:
 
 
 class _Update(NamedTuple):
-    """An update of the controller's model; number −1 is what the controller starts from."""
+    """An update of the controller's model; number −1 is the controller's initial state."""
 
     number: int
     event_ns: int

@@ -59,7 +59,7 @@ events = of_family(4) | of_family(6)
 
 
 def batch(*described: dict[str, Any]) -> tuple[Events, Bytes]:
-    """Events from their fields, payloads and addresses; other fields have usual values."""
+    """Return events with these fields, payloads and addresses; other fields have default values."""
     table = np.zeros(len(described), EVENT)
     data = b"other bytes"
     for row, given in zip(table, described, strict=True):
@@ -77,6 +77,6 @@ def batch(*described: dict[str, Any]) -> tuple[Events, Bytes]:
 
 
 def file_of(*described: dict[str, Any]) -> bytes:
-    """A whole capture file."""
+    """Return a whole capture file."""
     section = PcapngSection(INTERFACES)
     return section.header() + bytes(section.packets(*batch(*described))) + section.statistics()

@@ -1,4 +1,4 @@
-"""tshark, the judge of what is written."""
+"""Fixture: tshark checks the written files."""
 
 import shutil
 import subprocess
@@ -12,7 +12,7 @@ Tshark = Callable[..., str]
 
 @pytest.fixture
 def tshark(tmp_path: Path) -> Tshark:
-    """Runs tshark over a file and returns what it prints; it must find nothing wrong with it."""
+    """Run tshark on a file and return its output; it must report no error."""
     program = shutil.which("tshark")
     if program is None:
         pytest.skip("tshark is not installed")

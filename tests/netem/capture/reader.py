@@ -1,4 +1,4 @@
-"""Reads pcapng as the draft describes it (draft-ietf-opsawg-pcapng), strictly, and UDP over IP."""
+"""A strict reader of pcapng (draft-ietf-opsawg-pcapng) and of UDP over IP."""
 
 import ipaddress
 import struct
@@ -101,13 +101,13 @@ def read(data: bytes) -> File:
 
 
 def ones_complement(data: bytes) -> int:
-    """The sum that RFC 1071 defines; 0xffff over data that contains its right checksum."""
+    """Return the RFC 1071 sum; it is 0xffff if the data contain their correct checksum."""
     words = int.from_bytes(data + bytes(len(data) % 2), "big")
     return (words - 1) % 0xFFFF + 1 if words else 0
 
 
 def datagram(frame: bytes) -> Datagram:
-    """Take a datagram from its headers; its checksums must be right."""
+    """Return the datagram in a frame; its checksums must be correct."""
     version = frame[0] >> 4
     if version == 4:
         first, tos, total, ident, fragment, hops, protocol, _ = struct.unpack_from(

@@ -29,7 +29,7 @@ Dissect = Callable[..., list[Fields]]
 
 @pytest.fixture
 def dissect(tshark: Tshark, tmp_path: Path) -> Dissect:
-    """The fields that tshark finds in each payload: ``show`` for people, ``value`` as hex."""
+    """Return tshark's fields of each payload: ``show`` as text, ``value`` as hex."""
 
     def run(*payloads: bytes) -> list[Fields]:
         return fields_of(tshark, capture_of(tmp_path, *payloads))
@@ -116,7 +116,7 @@ def test_every_field_is_shown(dissect: Dissect) -> None:
         (Flow.UPDATE, 1, -(2**63), "update #1 t=-9223372036.854775808 s"),
     ],
 )
-def test_the_list_tells_flow_number_and_time(
+def test_the_packet_list_shows_flow_number_and_time(
     tshark: Tshark, tmp_path: Path, flow: Flow, sequence: int, t_ns: int, info: str
 ) -> None:
     vector = [] if flow is Flow.ACKNOWLEDGEMENT else [1.0, 2.0]
@@ -126,7 +126,7 @@ def test_the_list_tells_flow_number_and_time(
     assert shown == f"noack\t{info}\n"
 
 
-def test_fields_filter(tshark: Tshark, tmp_path: Path) -> None:
+def test_packets_can_be_filtered_by_field(tshark: Tshark, tmp_path: Path) -> None:
     payloads = [encoded(Flow(1 + i % 3), i, i * 10**9, [i - 5.0]) for i in range(12)]
     path = capture_of(tmp_path, *payloads)
 
@@ -177,12 +177,14 @@ def test_a_damaged_datagram_is_shown_with_its_fault(
     "payload",
     [b"", b"NA", WHOLE[: HEADER_BYTES - 1], with_byte(0, 0x4F), b"NAME" * 20, b"NA" + bytes(70)],
 )
-def test_what_is_not_ours_is_left_alone(dissect: Dissect, payload: bytes) -> None:
+def test_other_protocols_are_not_dissected(dissect: Dissect, payload: bytes) -> None:
     (fields,) = dissect(payload)
     assert not any(name.startswith("noack") for name in fields)
 
 
-def test_a_truncated_datagram_is_shown_as_far_as_it_goes(tshark: Tshark, tmp_path: Path) -> None:
+def test_the_available_fields_of_a_truncated_datagram_are_shown(
+    tshark: Tshark, tmp_path: Path
+) -> None:
     (packet,) = read(capture_of(tmp_path, WHOLE).read_bytes()).packets
     frame = packet.frame[: 28 + HEADER_BYTES + 8 + 7]
     head = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 262_144, 101)  # a pcap file of raw IP

@@ -1,4 +1,4 @@
-"""Every file here is read by ``reader``, made from the draft and the RFCs and not from the code."""
+"""``reader`` reads every file; it implements the draft and the RFCs independently of the code."""
 
 import struct
 from decimal import Decimal
@@ -59,7 +59,7 @@ def test_the_file_does_not_depend_on_batching_or_old_memory(
     assert parts + section.statistics() == whole
 
 
-def test_a_file_says_who_wrote_it_and_describes_the_interfaces() -> None:
+def test_a_file_names_its_program_and_describes_the_interfaces() -> None:
     interfaces = (
         PcapngInterface("link0 client", "[::]:5000 → here"),
         PcapngInterface("link0 server"),
@@ -123,7 +123,7 @@ def test_a_delay_is_told_to_the_microsecond(delay_ns: int) -> None:
     assert "." not in told or not told.endswith("0")
 
 
-def test_a_datagram_has_one_number_wherever_it_is_seen() -> None:
+def test_a_datagram_has_the_same_number_on_both_interfaces() -> None:
     seen = [
         {"interface": 0},
         {"interface": 1, "departure": 1},
@@ -138,13 +138,13 @@ def test_a_datagram_has_one_number_wherever_it_is_seen() -> None:
 
 
 def test_a_checksum_of_0_is_sent_as_ffff() -> None:
-    """RFC 768: 0 says that there is none."""
+    """RFC 768: a checksum field of 0 means that there is no checksum."""
 
     def frame_of(payload: bytes) -> bytes:
         return read(file_of({"payload": payload})).packets[0].frame
 
     checksum = frame_of(bytes(2))[26:28]
-    frame = frame_of(checksum)  # adds just what is missing to all ones
+    frame = frame_of(checksum)  # the sum becomes all ones
     assert frame[26:28] == b"\xff\xff"
     assert datagram(frame).payload == checksum
 
@@ -176,7 +176,7 @@ def test_an_impossible_event_is_refused(field: str, value: int) -> None:
         PcapngSection(INTERFACES).packets(table, data)
 
 
-def test_missing_events_are_told_where_they_are_missing_and_at_the_end() -> None:
+def test_missing_events_are_reported_at_their_place_and_at_the_end() -> None:
     section = PcapngSection(INTERFACES)
     data = section.header()
     data += bytes(section.packets(*batch({}, {"interface": 1})))
@@ -197,7 +197,7 @@ def test_missing_events_are_told_where_they_are_missing_and_at_the_end() -> None
         assert t_ns == T_NS + 7
 
 
-def test_formatting_lets_go_of_the_interpreter() -> None:
+def test_formatting_releases_the_gil() -> None:
     assert put_blocks.targetoptions["nogil"]  # type: ignore[attr-defined]
 
 
@@ -205,7 +205,7 @@ def test_formatting_lets_go_of_the_interpreter() -> None:
 def test_a_wait_for_the_compiler_is_explained(
     kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """How long it takes: what is typical, then what it took the last time, of other sources too."""
+    """It shows the typical duration or, if known, the last one, even of other source versions."""
     monkeypatch.setattr(pcapng, "is_kept", lambda folder, function: kept)
     for digest, about_s in (("0", 10), ("1", 42)):
         monkeypatch.setattr(pcapng, "FOLDER", tmp_path / f"capture-{digest}")

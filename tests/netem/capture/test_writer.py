@@ -30,7 +30,7 @@ def fifo(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def reader(fifo: Path) -> Iterator[int]:
-    """An open reader of the FIFO that reads nothing by itself."""
+    """An open read end of the FIFO; nothing reads from it unless a test does."""
     descriptor = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
     os.set_blocking(descriptor, True)
     yield descriptor
@@ -65,14 +65,14 @@ def test_the_file_holds_the_batches(tmp_path: Path) -> None:
             events, data = batch(event)
             data = data.copy()
             capture.take(events, data)
-            events["packet"], data[:] = 9, 0  # the relay writes there again
+            events["packet"], data[:] = 9, 0  # the relay reuses these arrays
     assert path.read_bytes() == file_of(*FOUR)
     assert (capture.error, capture.missing_events, capture.written) == (None, 0, 4)
     capture.take(*batch({}))
     assert capture.missing_events == 1
 
 
-def test_events_that_the_queue_has_no_room_for_are_missing(
+def test_events_that_overflow_the_queue_are_reported_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "capture.pcapng"
@@ -180,7 +180,7 @@ def test_a_terminal_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         CaptureWriter("-", SPECS)
 
 
-def test_the_standard_output_takes_a_capture() -> None:
+def test_a_capture_can_be_written_to_standard_output() -> None:
     program = (
         "from netem.capture.capture_writer import CaptureWriter\n"
         "from tests.netem.capture.batches import *\n"
@@ -195,10 +195,10 @@ def test_the_standard_output_takes_a_capture() -> None:
     assert done.stdout == file_of({}, {"flow": 5})
 
 
-def test_the_section_is_made_before_the_file_is_touched(
+def test_a_failed_compilation_does_not_change_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failing compilation leaves an older capture alone."""
+    """A failed compilation does not change an older capture."""
 
     def fail(*_: object) -> None:
         raise RuntimeError

@@ -1,4 +1,4 @@
-"""What links would do, in tables and as JSON."""
+"""``netem explain`` describes links in tables and as JSON."""
 
 import json
 import re
@@ -41,7 +41,7 @@ words = "loss 20%"
 
 
 class Explain:
-    """The program, with what it prints."""
+    """Runs the program and returns its output."""
 
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
@@ -87,7 +87,7 @@ def test_words_are_explained(explain: Explain) -> None:
     assert "tc lacks: mansd 2 (a cap on consecutive losses), first (that the first" in out
 
 
-def test_what_the_prediction_does_not_count_is_said(explain: Explain) -> None:
+def test_the_exclusions_of_the_prediction_are_shown(explain: Explain) -> None:
     out = one_line(explain("loss 50% delay 10ms 20ms mansd 1"))
     assert (
         "33.33% (without the cap 50%), not counting packets delivered out of order (stale)" in out
@@ -95,7 +95,7 @@ def test_what_the_prediction_does_not_count_is_said(explain: Explain) -> None:
     assert "negative delays become 0 (25% of the draws)" in out
 
 
-def test_where_tc_can_do_nothing_that_is_said(explain: Explain) -> None:
+def test_links_without_a_tc_equivalent_are_named(explain: Explain) -> None:
     out = one_line(explain("loss worst mansd 2"))
     assert "not possible with tc, which lacks: loss worst (a worst case), mansd 2 (" in out
     assert "tc qdisc" not in out
@@ -134,7 +134,7 @@ def test_each_link_of_a_file_is_explained(explain: Explain, links_file: Path) ->
 
 
 @pytest.mark.parametrize("columns", [120, 80, 60])
-def test_all_of_it_fits_into_a_terminal(
+def test_the_explanation_fits_into_a_terminal(
     explain: Explain, links_file: Path, monkeypatch: pytest.MonkeyPatch, columns: int
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
@@ -143,7 +143,7 @@ def test_all_of_it_fits_into_a_terminal(
         assert max(map(len, out.splitlines())) <= columns
 
 
-def test_what_is_to_be_copied_is_whole_at_any_width(
+def test_commands_to_copy_are_complete_at_any_width(
     explain: Explain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     commands = set()
@@ -170,7 +170,7 @@ def test_what_is_to_be_copied_is_whole_at_any_width(
         "",
     ],
 )
-def test_what_is_explained_as_toml_is_what_the_command_line_says(
+def test_the_toml_output_equals_the_command_line_settings(
     explain: Explain, tmp_path: Path, arguments: str
 ) -> None:
     given = shlex.split(arguments)

@@ -1,4 +1,4 @@
-"""From a command line to links, and what is told of mistakes."""
+"""A command line gives links; mistakes give error messages."""
 
 import json
 import re
@@ -192,7 +192,7 @@ def test_a_mistake_ends_the_program(
 
 
 @pytest.mark.parametrize("columns", ["120", "80", "60"])
-def test_the_examples_of_the_help_are_right(
+def test_the_examples_of_the_help_are_valid(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -218,18 +218,18 @@ def test_the_help_fits_into_a_terminal(monkeypatch: pytest.MonkeyPatch, columns:
 def test_the_help_has_every_word() -> None:
     text = parser().format_help()
     for word in (*KEYWORDS, *LOSS_WORDS):
-        # Other words for the same stand in the documentation.
+        # The documentation lists these synonyms.
         assert word in ("latency", "drop", "random") or re.search(rf"\b{word}\b", text), word
 
 
 @pytest.mark.parametrize(("word", "example"), EXAMPLES.items())
-def test_each_word_has_an_example_that_has_it(word: str, example: str) -> None:
+def test_each_word_occurs_in_its_example(word: str, example: str) -> None:
     assert parse(example)
     synonyms = {"drop": "loss", "random": "loss", "latency": "delay", "jitter": "delay"}
     assert synonyms.get(word, word) in example.split()
 
 
-def test_each_word_that_is_no_option_has_an_example() -> None:
+def test_each_word_except_options_has_an_example() -> None:
     assert set(KEYWORDS) - EXAMPLES.keys() == {"seed"}
     options = {word for group in parser()._action_groups for action in group._group_actions
                for word in action.option_strings}  # fmt: skip

@@ -1,4 +1,4 @@
-"""The closing table."""
+"""The table of totals that the emulator prints at its end."""
 
 import io
 from typing import Any

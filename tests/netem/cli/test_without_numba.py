@@ -1,4 +1,4 @@
-"""Where there is no numba, the portable engine takes its place."""
+"""Without numba, the plain engine is used."""
 
 import signal
 import subprocess
@@ -50,7 +50,7 @@ def test_the_plain_engine_relays() -> None:
         ("--engine=batched", "the batched engine needs numba, which is not installed; "),
     ],
 )
-def test_what_needs_it_says_so(option: str, says: str, tmp_path: Path) -> None:
+def test_options_that_need_numba_name_it(option: str, says: str, tmp_path: Path) -> None:
     file = [str(tmp_path / "x.pcapng")] if option == "--capture" else []
     with started("--to", "127.0.0.1:9", option, *file) as process:
         _, error = process.communicate(timeout=60)

@@ -10,7 +10,7 @@ from tests.netem.control.relays import FakeRelay, running
 
 @pytest.fixture(autouse=True)
 def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A runtime directory of the test's own, in which nobody else's emulators are."""
+    """A separate runtime directory for the test, without other emulators."""
     folder = tmp_path / "runtime"
     folder.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
@@ -24,13 +24,13 @@ def relay() -> FakeRelay:
 
 @pytest.fixture
 def commands(relay: FakeRelay) -> Iterator[CommandQueue]:
-    """Of a relay that runs."""
+    """The command queue of a running relay."""
     with running(relay) as commands:
         yield commands
 
 
 @pytest.fixture
 def server(commands: CommandQueue) -> Iterator[ControlServer]:
-    """Of an emulator named ``lab``."""
+    """The control server of an emulator named ``lab``."""
     with ControlServer("lab", commands) as server:
         yield server

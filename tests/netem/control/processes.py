@@ -1,4 +1,4 @@
-"""Real emulators, in processes of their own."""
+"""Real emulators in separate processes."""
 
 import os
 import select
@@ -15,7 +15,7 @@ _PATIENCE_S = 60.0
 
 
 def read_until(descriptor: int, done: Callable[[str], bool]) -> str:
-    """Read text until it is what is waited for."""
+    """Read text until ``done(text)`` is true; return the text."""
     text = b""
     deadline_s = time.monotonic() + _PATIENCE_S
     while not done(text.decode(errors="replace")):
@@ -27,7 +27,7 @@ def read_until(descriptor: int, done: Callable[[str], bool]) -> str:
 
 
 def address_in(text: str) -> Address | None:
-    """Where an emulator listens, from the line that says so."""
+    """Return the listening address from an emulator's output, or None."""
     for line in text.splitlines(keepends=True):
         if "Ctrl-C ends\n" in line:
             host, _, port = line.removeprefix("noack netem: ").split(" ")[0].rpartition(":")
@@ -39,7 +39,7 @@ def address_in(text: str) -> Address | None:
 def emulator(
     to: Address, *arguments: str, status: int = 0
 ) -> Iterator[tuple[Address, subprocess.Popen[bytes]]]:
-    """Run an emulator; yield where it listens, and its process. It is ended by SIGINT."""
+    """Run an emulator; yield its address and its process. SIGINT ends it."""
     command = [sys.executable, "-m", "netem", "--listen", "127.0.0.1:0", "--to"]
     with subprocess.Popen(
         [*command, f"{to[0]}:{to[1]}", *arguments],
@@ -60,7 +60,7 @@ def emulator(
 
 @contextmanager
 def udp_socket(to: Address | None = None) -> Iterator[socket.socket]:
-    """A socket on loopback that waits long."""
+    """A socket on loopback with a long timeout."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.settimeout(_PATIENCE_S)
         if to is None:
@@ -71,7 +71,7 @@ def udp_socket(to: Address | None = None) -> Iterator[socket.socket]:
 
 
 def send_through(address: Address, payloads: Sequence[bytes]) -> None:
-    """Send datagrams, from one socket."""
+    """Send datagrams from one socket."""
     with udp_socket(address) as client:
         for payload in payloads:
             client.send(payload)

@@ -1,4 +1,4 @@
-"""A relay without sockets: what it reports is what a test says."""
+"""A relay without sockets; a test sets its reports."""
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,7 +41,7 @@ def times(*t_ns: int) -> NDArray[np.int64]:
 
 
 class FakeRelay:
-    """Links whose counters a test sets."""
+    """A relay with links and counters that a test sets."""
 
     engine = "plain"
 
@@ -57,7 +57,7 @@ class FakeRelay:
         self.flows: list[FlowReport] = []
         self.changes = 0
         self.threads: set[int] = set()
-        """Of those that have looked or changed."""
+        """The threads that have read or changed the relay."""
 
     def addresses(self) -> Mapping[str, Address]:
         return {spec.name: spec.listen for spec in self.specs}
@@ -99,7 +99,7 @@ _: Relay = FakeRelay()
 
 @contextmanager
 def running(relay: Relay) -> Iterator[CommandQueue]:
-    """Run a relay in a thread of its own."""
+    """Run a relay in a separate thread."""
     commands, stopping = CommandQueue(relay), threading.Event()
     thread = threading.Thread(target=relay.run, args=(stopping.is_set, commands.run_pending))
     thread.start()

@@ -11,7 +11,7 @@ from noack.impairments.link_records import Counters
 from tests.netem.control.relays import SETTINGS, FakeRelay, spec_of
 
 
-def test_the_relay_is_touched_in_its_own_thread_only(
+def test_the_relay_is_accessed_from_its_own_thread_only(
     relay: FakeRelay, commands: CommandQueue
 ) -> None:
     commands.snapshot()
@@ -20,7 +20,9 @@ def test_the_relay_is_touched_in_its_own_thread_only(
     assert thread != threading.get_ident()
 
 
-def test_a_change_says_since_when_it_holds(relay: FakeRelay, commands: CommandQueue) -> None:
+def test_a_change_returns_the_time_from_which_it_applies(
+    relay: FakeRelay, commands: CommandQueue
+) -> None:
     relay.counters["up", "reverse"] = Counters(arrived=17)
     commands.change("up", ["reverse"], settings_of("loss 50% mansd 1"))
     relay.counters["up", "reverse"].arrived = 20
@@ -31,7 +33,7 @@ def test_a_change_says_since_when_it_holds(relay: FakeRelay, commands: CommandQu
     assert in_force["up", "forward"].words == "loss 10% delay 10ms mansd 2"
 
 
-def test_an_errands_error_is_the_askers(commands: CommandQueue) -> None:
+def test_an_error_of_a_command_is_raised_at_its_caller(commands: CommandQueue) -> None:
     def refuse() -> None:
         raise CallerError("no")
 
@@ -45,7 +47,7 @@ def test_an_errands_error_is_the_askers(commands: CommandQueue) -> None:
     assert commands.submit(lambda: 7) == 7
 
 
-def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
+def test_a_command_fails_at_once_if_the_relay_has_ended(relay: FakeRelay) -> None:
     commands = CommandQueue(relay)
     found: list[BaseException] = []
 
@@ -58,19 +60,19 @@ def test_when_the_relay_has_ended_nobody_waits(relay: FakeRelay) -> None:
     asker = threading.Thread(target=ask)
     asker.start()
     while asker.is_alive():
-        commands.close()  # whether it has asked already, or asks after this
+        commands.close()  # before or after the thread submits its command
     assert [str(error) for error in found] == ["the emulator has ended"]
     assert commands.look().links[0].name == "up"
 
 
-def test_a_relay_that_is_stuck_is_not_waited_for_forever(
+def test_a_command_to_a_stuck_relay_times_out(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("netem.control.command_queue._PATIENCE_S", 0.01)
     commands = CommandQueue(relay)
     with pytest.raises(PeerError, match="has not answered for"):
         commands.snapshot()
-    commands.run_pending()  # what nobody waits for any more is not done
+    commands.run_pending()  # commands that have timed out do not run
     assert relay.threads == set()
 
 

@@ -1,4 +1,4 @@
-"""Commands against an emulator in this process."""
+"""Control commands to an emulator in this process."""
 
 import json
 import os
@@ -21,14 +21,14 @@ from tests.netem.control.processes import read_until
 from tests.netem.control.relays import SETTINGS, FakeRelay, running
 
 LEAVE = "\x1b[?1049l"
-"""Ends a terminal's other screen."""
+"""The escape sequence that leaves a terminal's alternate screen."""
 
 
 def run(arguments: str) -> ExitStatus:
     return emulator_commands.main(arguments.split())
 
 
-def test_what_has_happened_is_shown(
+def test_show_prints_the_statistics(
     relay: FakeRelay, server: ControlServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     relay.counters["up", "forward"].dropped = 12
@@ -100,7 +100,7 @@ def test_files_are_read_where_the_command_is_given(
         ("watch lba", "no emulator 'lba'; running: lab"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(
+def test_a_mistake_gets_one_line(
     relay: FakeRelay,
     server: ControlServer,
     capsys: pytest.CaptureFixture[str],
@@ -116,14 +116,14 @@ def test_what_is_wrong_is_said_in_a_line(
     assert relay.settings["up", "forward"] == SETTINGS
 
 
-def test_among_several_one_is_named(
+def test_with_several_emulators_a_name_is_required(
     server: ControlServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = FakeRelay("x")
     with running(other) as commands, ControlServer("loss", commands):
         assert run("show") == ExitStatus.CALLER
         assert "which emulator? Running: lab, loss" in capsys.readouterr().err
-        assert run("set loss loss 5%") == ExitStatus.OK  # its name is a word, too
+        assert run("set loss loss 5%") == ExitStatus.OK  # the name is also a netem word
     assert other.settings["x", "forward"] == settings_of("loss 5%")
 
 
@@ -142,7 +142,7 @@ def watching(stdout: int, stdin: int) -> Iterator[subprocess.Popen[bytes]]:
             process.kill()
 
 
-def test_a_pipe_gets_lines_until_its_reader_closes_it(
+def test_watch_prints_lines_to_a_pipe_until_its_reader_closes_it(
     relay: FakeRelay, server: ControlServer
 ) -> None:
     relay.counters["up", "forward"].arrived = 7
@@ -168,7 +168,7 @@ def test_watch_fails_when_the_emulator_ends(relay: FakeRelay, commands: CommandQ
             assert process.stderr.read() == b"noack netem watch: emulator 'lab' has ended\n"
 
 
-def test_on_a_terminal_it_is_drawn_until_q(relay: FakeRelay, server: ControlServer) -> None:
+def test_watch_redraws_on_a_terminal_until_q(relay: FakeRelay, server: ControlServer) -> None:
     relay.counters["up", "forward"].arrived = 7
     terminal, end = pty.openpty()
     termios.tcsetwinsize(end, (24, 80))
@@ -177,7 +177,7 @@ def test_on_a_terminal_it_is_drawn_until_q(relay: FakeRelay, server: ControlServ
         drawn = read_until(terminal, lambda text: "q ends" in text and "→ up" in text)
         assert LEAVE not in drawn
         os.write(terminal, b"q")
-        # The last picture stays.
+        # The last screen stays visible.
         read_until(terminal, lambda text: "╯" in text.partition(LEAVE)[2])
         assert process.wait(60) == ExitStatus.OK
     assert termios.tcgetattr(end) == before

@@ -1,4 +1,4 @@
-"""docs/netem-control.md says what is."""
+"""docs/netem-control.md agrees with the code."""
 
 import re
 import subprocess
@@ -31,7 +31,7 @@ PAGE = (Path(__file__).parents[3] / "docs/netem-control.md").read_text()
 
 
 def rows(title: str) -> dict[str, str]:
-    """The table with a title: from what its rows begin with, to what they say."""
+    """Return the table with this title as a mapping from first column to second column."""
     (table,) = re.findall(rf"^\| {title} \| \|\n\|---\|---\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     return dict(row.strip("| \n").split(" | ", 1) for row in table.splitlines())
 
@@ -55,7 +55,7 @@ def test_every_key_is_documented_and_no_other(title: str, keys: dict[str, Any]) 
     assert set().union(*map(names, rows(title))) == set(keys)
 
 
-def test_what_lies_deeper_is_documented() -> None:
+def test_nested_keys_are_documented() -> None:
     said = rows("direction")
     assert names(said["`loss`"]) == set(get_type_hints(LossStatistics))
     assert names(said["`flows`"]) == set(get_type_hints(FlowStatistics))
@@ -66,7 +66,7 @@ def programs() -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 
 
-def test_the_program_runs() -> None:
+def test_the_documented_program_runs() -> None:
     relay = FakeRelay("relay")
     program, _ = programs()
     with running(relay) as commands, ControlServer("lab", commands):
@@ -78,7 +78,7 @@ def test_the_program_runs() -> None:
     assert relay.settings["relay", "reverse"].mansd == 2
 
 
-def test_the_metadata_of_a_fate_trace_are_read(tmp_path: Path) -> None:
+def test_the_documented_program_reads_the_metadata_of_a_fate_trace(tmp_path: Path) -> None:
     _, program = programs()
     specs = [LinkSpec("relay", ("127.0.0.1", 1), ("127.0.0.1", 2), settings_of("mansd 3"), NOTHING)]
     with FateRecorder(tmp_path / "monday.parquet", specs):

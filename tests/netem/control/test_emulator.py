@@ -1,4 +1,4 @@
-"""Live control of real emulators, end to end."""
+"""End-to-end tests: control real emulators while they run."""
 
 import json
 import signal
@@ -19,7 +19,7 @@ from tests.netem.fates.links import spec_of
 
 
 def shown(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """The statistics of the only emulator that runs."""
+    """Return the statistics of the only running emulator."""
     capsys.readouterr()
     assert emulator_commands.main(["show", "--json"]) == ExitStatus.OK
     document: dict[str, Any] = json.loads(capsys.readouterr().out)
@@ -27,7 +27,7 @@ def shown(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("engine", ["auto", "plain"])
-def test_a_cap_set_while_it_runs_is_kept(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cap_set_at_runtime_is_kept(engine: str, capsys: pytest.CaptureFixture[str]) -> None:
     sent = [number.to_bytes(2) for number in range(320)]
     with (
         udp_socket() as server,
@@ -91,7 +91,7 @@ PAYLOADS = [number.to_bytes(2) * 20 for number in range(150)]
 def run_through(
     capsys: pytest.CaptureFixture[str], *options: str, payloads: Sequence[bytes] = PAYLOADS
 ) -> list[bytes]:
-    """Send payloads through an emulator; return what comes out."""
+    """Send payloads through an emulator; return the received datagrams."""
     with (
         udp_socket() as server,
         emulator(server.getsockname(), "--control", "lab", *options) as (address, _),
@@ -106,7 +106,7 @@ def run_through(
 WORDS = ("loss", "gemodel", "10%", "30%", "duplicate", "20%", "corrupt", "20%")
 
 
-def test_a_recorded_run_is_repeated_exactly(
+def test_a_recorded_run_is_replayed_exactly(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = str(tmp_path / "fates.parquet")
@@ -117,7 +117,7 @@ def test_a_recorded_run_is_repeated_exactly(
 
 
 @pytest.mark.parametrize(("words", "cap"), [("loss 100%", 2), ("loss 100% mansd 4", 4)])
-def test_a_replay_has_the_cap_of_its_trace_unless_it_has_its_own(
+def test_a_replay_uses_the_cap_of_its_trace_by_default(
     tmp_path: Path, words: str, cap: int
 ) -> None:
     path = tmp_path / "fates.parquet"

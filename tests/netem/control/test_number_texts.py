@@ -47,7 +47,7 @@ def test_rates_and_elapsed_times() -> None:
     assert [elapsed_text(t_s) for t_s in (0.9, 61, 3661)] == ["0:00", "1:01", "1:01:01"]
 
 
-def test_a_sparkline_reaches_from_nothing_to_the_top() -> None:
+def test_a_sparkline_uses_the_whole_height() -> None:
     assert sparkline([None, 0, 5, 10, 20], 10) == " ▁▅██"
     assert sparkline([0, None], 0) == "▁ "
 

@@ -33,17 +33,17 @@ def test_options() -> None:
 
 
 @pytest.mark.parametrize("period", ["0", "-1", "nan", "inf", "0.001"])
-def test_a_period_must_make_sense(period: str) -> None:
+def test_an_invalid_period_is_refused(period: str) -> None:
     with pytest.raises(CallerError, match=r"must be 0\.01 s or more"):
         options("--stats", period)
 
 
-def test_lines_and_view_do_not_share_a_terminal() -> None:
+def test_json_lines_and_view_on_one_terminal_are_refused() -> None:
     with pytest.raises(CallerError, match="both use standard output"):
         options("--stats", "1", "--view")
 
 
-def test_a_file_that_cannot_be_written_is_said_before_the_relay_runs(relay: FakeRelay) -> None:
+def test_an_unwritable_file_is_reported_before_the_relay_runs(relay: FakeRelay) -> None:
     wanted = Options(stats_s=1.0, stats_file=Path("/nowhere/x"))
     with (
         pytest.raises(CallerError, match=r"--stats-file /nowhere/x: cannot be written \(No such"),
@@ -52,8 +52,8 @@ def test_a_file_that_cannot_be_written_is_said_before_the_relay_runs(relay: Fake
         pass
 
 
-def test_what_is_at_its_side_ends_with_the_relay(relay: FakeRelay, tmp_path: Path) -> None:
-    """Even if it ends before anyone has been served."""
+def test_attachments_end_with_the_relay(relay: FakeRelay, tmp_path: Path) -> None:
+    """Even if the relay ends before the first command."""
     threads = threading.active_count()
     file = tmp_path / "lines"
     interval = sys.getswitchinterval()
@@ -71,7 +71,7 @@ def test_what_is_at_its_side_ends_with_the_relay(relay: FakeRelay, tmp_path: Pat
     assert json.loads(last)["links"][0]["forward"]["arrived"] == 5
 
 
-def test_a_full_disk_is_told_and_the_relay_goes_on(
+def test_a_full_disk_is_reported_and_the_relay_continues(
     relay: FakeRelay, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     error = io.StringIO()
@@ -104,7 +104,7 @@ def test_the_view_of_an_emulator_in_its_own_terminal() -> None:
             assert process.wait(60) == ExitStatus.OK
         finally:
             process.kill()
-    # What was said meanwhile, below the picture, is still to be read.
+    # Messages printed during the view stay visible below it.
     assert "forward →" in rest.partition("\x1b[?1049l")[2]
     os.close(terminal)
     os.close(end)

@@ -1,4 +1,4 @@
-"""Live control over real zenoh, on loopback."""
+"""Control of a running emulator over real zenoh on loopback."""
 
 import json
 import threading
@@ -28,7 +28,7 @@ def client(server: ControlServer) -> Any:
         yield client
 
 
-def test_statistics_are_asked_for(relay: FakeRelay, client: Client) -> None:
+def test_statistics_can_be_queried(relay: FakeRelay, client: Client) -> None:
     relay.counters["down", "reverse"] = Counters(arrived=12, delivered=12)
     document = client.ask("report")
     assert [link["name"] for link in document["links"]] == ["up", "down"]
@@ -42,13 +42,16 @@ def test_statistics_are_published(relay: FakeRelay, client: Client) -> None:
     relay.counters["up", "forward"].arrived = 1001
     second = next(heard)
     before, after = (document["links"][0]["forward"] for document in (first, second))
-    assert after["arrived"] - before["arrived"] in (0, 1000)  # it may just have been looked at
+    assert after["arrived"] - before["arrived"] in (
+        0,
+        1000,
+    )  # the server may have sampled the counters just before the change
     third = next(heard)["links"][0]["forward"]["recent"]
     assert third is not None
     assert third["seconds"] > 0
 
 
-def test_settings_are_told_in_words_and_as_settings(client: Client) -> None:
+def test_settings_are_reported_in_words_and_as_an_object(client: Client) -> None:
     up, down = client.ask("settings")["links"]
     assert (up["name"], down["name"]) == ("up", "down")
     assert up["forward"]["words"] == "loss 10% delay 10ms mansd 2"
@@ -113,7 +116,7 @@ def test_the_link_may_be_left_out_if_there_is_one() -> None:
         ({"link": "up", "words": "loss 5%", "wordz": 1}, "wordz"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_changed(
+def test_a_mistake_gets_one_line_and_changes_nothing(
     relay: FakeRelay, client: Client, content: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CallerError, match=message) as caught:
@@ -123,7 +126,7 @@ def test_what_is_wrong_is_said_in_a_line_and_nothing_is_changed(
 
 
 def ask_with(session: Session, payload: str | bytes | None, what: str = "change") -> str:
-    """Ask on a connection that is let in; return the error."""
+    """Send a query on an authenticated connection; return the error."""
     secret = secret_of(session.token)
     with open_session(session.endpoint, secret, listen=False) as connection:
         key = f"netem/{session.name}/{what}"
@@ -149,7 +152,7 @@ def test_a_wrong_token_is_refused(
 
 
 @pytest.mark.parametrize("payload", [None, "{", "[]", "{}", b"\xff\xfe"])
-def test_what_is_no_query_is_refused(
+def test_an_invalid_query_is_refused(
     relay: FakeRelay, server: ControlServer, payload: str | bytes | None
 ) -> None:
     expected = 'a query is a JSON object with "token", the secret'
@@ -162,7 +165,9 @@ def test_what_is_no_query_is_refused(
     [{}, {"user": "netem", "password": "0" * 64}, {"user": "root"}],
     ids=["none", "wrong", "other user"],
 )
-def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict[str, str]) -> None:
+def test_a_client_without_the_secret_cannot_connect(
+    server: ControlServer, secret: dict[str, str]
+) -> None:
     session = find("lab")
     secret = {"password": session.token, **secret} if "user" in secret else secret
     more: dict[str, Any] = {f"transport/auth/usrpwd/{key}": value for key, value in secret.items()}
@@ -171,7 +176,7 @@ def test_nobody_without_the_secret_is_let_in(server: ControlServer, secret: dict
         zenoh.open(session_config(session.endpoint, listen=False, more=more))
 
 
-def test_it_listens_on_loopback_only(server: ControlServer) -> None:
+def test_the_control_server_listens_on_loopback_only(server: ControlServer) -> None:
     port = int(find("lab").endpoint.rpartition(":")[2])
     own = psutil.Process().net_connections()
     listening = [c.laddr for c in own if c.status == psutil.CONN_LISTEN and c.laddr.port == port]
@@ -187,7 +192,7 @@ def test_the_secret_is_nowhere_but_in_the_session_file(server: ControlServer) ->
     assert running() == ["lab"]
 
 
-def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
+def test_a_client_that_blocks_the_server_does_not_block_the_relay(
     commands: CommandQueue, server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held, free = threading.Event(), threading.Event()
@@ -200,12 +205,12 @@ def test_a_client_that_holds_up_the_server_does_not_hold_up_the_relay(
     assert held.wait(60)
     try:
         for _ in range(10):
-            commands.snapshot()  # done by the relay's thread
+            commands.snapshot()  # runs in the relay's thread
     finally:
         free.set()
 
 
-def test_when_it_ends_nothing_is_left(commands: CommandQueue) -> None:
+def test_the_server_leaves_nothing_behind_at_its_end(commands: CommandQueue) -> None:
     with ControlServer("lab", commands):
         session = find("lab")
     assert running() == []

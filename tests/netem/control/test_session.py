@@ -69,12 +69,12 @@ def test_the_file_of_a_killed_emulator_is_recognised() -> None:
 def test_a_name_is_free_again_after_its_emulator_was_killed(runtime_dir: Path) -> None:
     with published(LAB) as path:
         text = path.read_text()
-    path.write_text(text)  # nobody holds its lock
+    path.write_text(text)  # the file is not locked
     with published(LAB._replace(token="new")):
         assert find("lab").token == "new"
 
 
-def test_who_is_not_there_is_answered_with_who_is() -> None:
+def test_an_unknown_name_gets_the_running_names() -> None:
     with pytest.raises(CallerError, match="no emulator accepts commands; start one"):
         find(None)
     with pytest.raises(CallerError, match="no emulator 'lab' accepts commands"):
@@ -95,14 +95,14 @@ def test_a_folder_open_to_others_is_refused() -> None:
             use()
 
 
-def test_a_file_of_another_version_is_said_to_be_unreadable() -> None:
+def test_a_file_of_another_version_is_reported_as_unreadable() -> None:
     with published(LAB) as path:
         path.write_text("{}")
         with pytest.raises(PeerError, match="its session file cannot be read"):
             find("lab")
 
 
-def test_a_file_that_another_has_replaced_is_not_removed(runtime_dir: Path) -> None:
+def test_a_file_replaced_by_another_emulator_is_not_removed(runtime_dir: Path) -> None:
     with published(LAB) as path:
         other = path.with_name("other")
         other.write_text("mine")

@@ -32,7 +32,7 @@ def forward(document: Statistics, link: int = 0) -> DirectionStatistics:
     return document["links"][link]["forward"]
 
 
-def test_everything_that_a_relay_counts_is_there(relay: FakeRelay) -> None:
+def test_the_statistics_contain_every_counter_of_a_relay(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
         arrived=100, arrived_bytes=7200, delivered=80, dropped=8, forced=5, corrupted=4,
         overflowed=2, blacked_out=1, duplicated=3, held_back=6, forwarded=91,
@@ -82,7 +82,7 @@ def test_the_document_is_json_and_has_the_documented_keys(relay: FakeRelay) -> N
         assert set(found["recent"]) == set(get_type_hints(RecentRates))
 
 
-def test_rates_are_those_between_two_documents(relay: FakeRelay) -> None:
+def test_rates_are_differences_of_two_documents(relay: FakeRelay) -> None:
     relay.counters["up", "forward"] = Counters(
         arrived=50, arrived_bytes=5000, delivered=40, dropped=10, forwarded=40, forwarded_bytes=4000
     )
@@ -102,7 +102,7 @@ def test_rates_are_those_between_two_documents(relay: FakeRelay) -> None:
     assert recent["delay_ns"]["p50"] == pytest.approx(5_000_000, rel=0.03)
 
 
-def test_loss_is_that_since_the_settings_came_into_force(relay: FakeRelay) -> None:
+def test_loss_is_counted_since_the_settings_came_into_force(relay: FakeRelay) -> None:
     now = Counters(arrived=300, delivered=150, dropped=150)
     relay.counters["up", "forward"] = now
     since = {("up", "forward"): Counters(arrived=100, delivered=100)}
@@ -112,13 +112,13 @@ def test_loss_is_that_since_the_settings_came_into_force(relay: FakeRelay) -> No
     assert (found["arrived_before"], found["arrived"]) == (100, 300)
 
 
-def test_the_prediction_is_that_of_the_settings_in_force(relay: FakeRelay) -> None:
-    """Bernoulli p, at most m in a row: p(1 − p^m)/(1 − p^(m+1))."""
+def test_the_prediction_uses_the_settings_in_force(relay: FakeRelay) -> None:
+    """Bernoulli p, at most m consecutive losses: p(1 − p^m)/(1 − p^(m+1))."""
     found = forward(statistics(look(relay, 1)))
     assert found["loss"]["predicted"] == pytest.approx(0.1 * (1 - 0.1**2) / (1 - 0.1**3))
 
 
-def test_what_is_overtaken_late_is_no_loss_beyond_everything(relay: FakeRelay) -> None:
+def test_late_stale_packets_do_not_raise_the_loss_above_one(relay: FakeRelay) -> None:
     before = look(relay, 1)
     relay.counters["up", "forward"] = Counters(arrived=1, delivered=1, delivered_out_of_order=5)
     recent = forward(statistics(look(relay, 2), before))["recent"]
@@ -126,13 +126,13 @@ def test_what_is_overtaken_late_is_no_loss_beyond_everything(relay: FakeRelay) -
     assert recent["loss"] == 1
 
 
-def test_nothing_is_said_of_what_has_not_happened(relay: FakeRelay) -> None:
+def test_values_without_data_are_null(relay: FakeRelay) -> None:
     found = forward(statistics(look(relay, 1)))
     assert found["loss"]["realised"] is None
     assert set(found["delay_ns"].values()) == {None}
 
 
-def test_quantiles_are_those_of_the_times(relay: FakeRelay) -> None:
+def test_delay_quantiles_match_the_delays(relay: FakeRelay) -> None:
     drawn_ns = np.random.default_rng(4).lognormal(13, 2, 20_000).astype(np.int64)
     relay.delays = times(*drawn_ns.tolist())
     found = forward(statistics(look(relay, 1)))["delay_ns"]

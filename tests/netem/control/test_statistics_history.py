@@ -17,7 +17,7 @@ def series(history: History, points: int, key: str = "arrived_per_s") -> list[fl
     return [*history.series("up", "forward", key, points)]
 
 
-def test_without_a_value_a_point_is_none() -> None:
+def test_a_point_without_a_value_is_none() -> None:
     history = History()
     assert series(history, 3) == [None] * 3
     history.add(statistics(1, None))
@@ -34,7 +34,7 @@ def test_the_last_minute_is_kept() -> None:
     assert series(history, 30) == [41.5 + 2 * k for k in range(30)]
 
 
-def test_a_sample_is_valid_from_the_one_before() -> None:
+def test_a_sample_applies_to_the_time_since_the_previous_one() -> None:
     history = History()
     history.add(statistics(50, 7, seconds=10))
     history.add(statistics(60, 9, seconds=10))

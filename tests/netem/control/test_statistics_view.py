@@ -1,4 +1,4 @@
-"""The view as text, from statistics of constructed reports."""
+"""The view as text, from the statistics of constructed reports."""
 
 import io
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from tests.netem.control.relays import SETTINGS, FakeRelay, times
 
 
 def documents(relay: FakeRelay, seconds: int = 3) -> Sequence[Statistics]:
-    """In the k-th second, from 0, 1000 k datagrams of 100 bytes come on each link."""
+    """In second k, from 0 on, 1000 k datagrams of 100 bytes arrive on each link."""
     commands, found, before = CommandQueue(relay), [], None
     for second in range(seconds):
         for name, way in relay.counters:
@@ -83,7 +83,7 @@ def test_the_last_minute_is_drawn() -> None:
     lines = text_of(FakeRelay("up"), seconds=61)
     chart = lines[[line.startswith("│ received ") for line in lines].index(True) + 1]
     forward = chart[12:44]
-    assert forward == "".join(sorted(forward))  # it rises all the time
+    assert forward == "".join(sorted(forward))  # monotonically increasing
     assert forward.startswith("▁")
     assert forward.endswith("█")
 
@@ -113,13 +113,13 @@ def test_more_links_than_fit_are_a_table() -> None:
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 200])
-def test_any_width_will_do(width: int) -> None:
+def test_the_view_fits_into_any_width(width: int) -> None:
     relay = FakeRelay("up", "down")
     assert all(len(line) <= width for line in text_of(relay, width))
     assert all(len(line) <= width for line in text_of(relay, width, None))
 
 
-def test_long_words_and_names_with_brackets_are_no_trouble() -> None:
+def test_long_words_and_names_with_brackets_are_shown_correctly() -> None:
     relay = FakeRelay("up")
     words = settings_of("loss 10% delay 1ms samples " + ",".join(["1ms"] * 500))
     relay.specs = [
@@ -133,13 +133,13 @@ def test_long_words_and_names_with_brackets_are_no_trouble() -> None:
     assert " → [bold]up" in "\n".join(text_of(relay, height=5))
 
 
-def test_without_statistics_there_is_little_to_see() -> None:
+def test_the_view_without_statistics_is_almost_empty() -> None:
     file = io.StringIO()
     Console(file=file, width=80).print(render(History(), "lab", 80, 24))
     assert file.getvalue() == "lab: waiting for statistics\n"
 
 
-def test_what_is_no_terminal_gets_a_line_for_each_direction_in_use() -> None:
+def test_a_pipe_gets_one_line_per_direction_in_use() -> None:
     relay = FakeRelay("up", "down")
     relay.unintended["send_errors"] = 3
     first, *_, last = documents(relay)
@@ -154,7 +154,7 @@ def test_what_is_no_terminal_gets_a_line_for_each_direction_in_use() -> None:
 
 
 @pytest.mark.parametrize("width", [40, 60, 80, 120])
-def test_with_many_links_figures_are_whole_in_any_width(width: int) -> None:
+def test_with_many_links_numbers_are_not_cut_at_any_width(width: int) -> None:
     names = [f"a-link-with-a-long-name-{number}" for number in range(30)]
     lines = text_of(FakeRelay(*names), width, 24)
     assert len(lines) <= 24

@@ -1,4 +1,4 @@
-"""A relay that runs in a thread, clients and a server of its own, and a tap that keeps all."""
+"""A relay in a thread, sockets for clients and servers, and a tap that keeps all events."""
 
 import queue
 import socket
@@ -17,7 +17,7 @@ from noack.impairments.link_settings import LinkSettings
 from noack.runtime.udp_sockets import enlarge_buffer
 
 PATIENCE_S = 60
-"""What never happens fails by then; nothing is measured."""
+"""Timeout for events that never happen; no test measures time with it."""
 HOSTS = {4: "127.0.0.1", 6: "::1"}
 
 
@@ -47,7 +47,7 @@ class KeepAll:
 
 
 class Running:
-    """A relay in its thread."""
+    """A relay that runs in its own thread."""
 
     def __init__(self, relay: Relay) -> None:
         self.relay = relay
@@ -68,13 +68,13 @@ class Running:
         assert self._failure is None
 
     def ask(self, what: Callable[[], Any]) -> Any:
-        """Do something in the relay's thread, between two datagrams."""
+        """Call a function in the relay's thread, between two datagrams; return its result."""
         answer: Future[Any] = Future()
         self._asked.put((what, answer))
         return answer.result(PATIENCE_S)
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Wait until something holds in the relay's thread."""
+        """Wait until a condition holds, evaluated in the relay's thread."""
         done: Future[None] = Future()
         self._asked.put((lambda: self._waiting.append((condition, done)), Future()))
         done.result(PATIENCE_S)
@@ -84,7 +84,7 @@ class Running:
         return report
 
     def settled(self, arrived: int, side: str = "forward", number: int = 0) -> None:
-        """Wait until so many datagrams have come, and nothing is under way."""
+        """Wait until ``arrived`` datagrams have arrived and none is in flight."""
 
         def is_settled() -> bool:
             found = getattr(self.relay.report()[number], side)
@@ -121,7 +121,7 @@ def running(
     taps: Sequence[Tap] = (),
     start: bool = True,
 ) -> Iterator[Running]:
-    """Yield a relay that runs; it ends with the block."""
+    """Yield a running relay; it ends with the block."""
     relay = open_relay(specs, engine, segment, taps)
     one = Running(relay)
     try:
@@ -154,7 +154,7 @@ def name_of(endpoint: socket.socket) -> Address:
 
 
 def drain(endpoint: socket.socket) -> list[tuple[bytes, Address]]:
-    """Take all that has come."""
+    """Read all received datagrams."""
     found = []
     endpoint.settimeout(0)
     while True:
@@ -174,7 +174,7 @@ def link(
     host: str = HOSTS[4],
     **others: Any,
 ) -> LinkSpec:
-    """A link on loopback, to a server, on any free port."""
+    """Return a link on loopback from a free port to a server."""
     own = {"name": "test", "listen": (host, 0), "seed": 7} | others
     nothing = LinkSettings()
     return LinkSpec(to=to, forward=forward or nothing, reverse=reverse or nothing, **own)

@@ -1,4 +1,4 @@
-"""What only the Linux engine has: its table of clients, its store, its cache of compiled code."""
+"""Parts of the Linux engine only: client table, datagram store, cache of compiled code."""
 
 import os
 import subprocess
@@ -30,7 +30,7 @@ addresses = st.tuples(hosts, st.integers(1, 12))
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1", "2001:db8::7", "fe80::1%lo"])
-def test_socket_addresses_come_back(host: str) -> None:
+def test_socket_addresses_survive_encoding_and_decoding(host: str) -> None:
     name, length = name_of(place_of((host, 4711), "test"))
     assert length == (28 if ":" in host else 16)
     found, port = address_of_name(name)
@@ -42,7 +42,7 @@ def test_socket_addresses_come_back(host: str) -> None:
 def test_the_table_of_clients_is_a_dictionary(
     steps: list[tuple[bool, tuple[str, int], int]],
 ) -> None:
-    """A small one, so that many keys meet."""
+    """A small table, so that many keys collide."""
     memory = PumpMemory(2, segment=False, taps=0).memory
     table = np.full(2 * ROWS, -1, np.int32)
     model: dict[tuple[tuple[str, int], int], int] = {}
@@ -65,7 +65,7 @@ def test_the_table_of_clients_is_a_dictionary(
 @settings(max_examples=50)
 @given(st.lists(st.integers(-3, 5), max_size=150), st.data())
 def test_the_store_is_a_queue_by_time_and_arrival(steps: list[int], data: st.DataObject) -> None:
-    """Negative steps take out what is due first; others keep something until then."""
+    """A negative step removes the first due entry; any other adds an entry with this due time."""
     holder = PumpMemory(1, segment=False, taps=0)
     free = (int(holder.pump["free_slots"]), int(holder.pump["free_blocks"]))
     do_keep, do_push = compile_rule(keep), compile_rule(push)
@@ -95,7 +95,7 @@ def resident_bytes() -> int:
 
 
 def test_memory_stays_flat_over_a_million_datagrams() -> None:
-    """Half of them delayed or copied, from clients that come and go."""
+    """Half of the datagrams are delayed or copied; clients appear and expire."""
     rounds, size = 100, 10_000
     harsh = LinkSettings(
         impairments=(
@@ -151,7 +151,7 @@ relay.close()
 """
 
 
-def test_first_starts_at_the_same_time_both_say_so_and_later_ones_do_not(
+def test_concurrent_first_starts_report_the_compilation_and_later_starts_do_not(
     tmp_path: Path,
 ) -> None:
     def start() -> subprocess.Popen[str]:

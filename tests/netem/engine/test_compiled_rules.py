@@ -1,4 +1,4 @@
-"""Compiled rules decide bit for bit as the same rules run by Python."""
+"""Compiled rules and the same rules in Python make the same decisions, bit for bit."""
 
 from dataclasses import astuple
 from typing import Any
@@ -35,7 +35,7 @@ arrivals = st.lists(
 
 
 class Compiled:
-    """A link with compiled rules, whose rows do not lie in the order of its flows."""
+    """A link with compiled rules; its rows are not in the order of its flows."""
 
     def __init__(self, own: LinkSettings, **others: Any) -> None:
         self.program: LinkProgram = compiled_program(plain := program_of(own, 3, "a", **others))

@@ -1,4 +1,4 @@
-"""At the receiver: never more than M − 1 in a row that are missing, damaged or stale."""
+"""At the receiver, at most M − 1 consecutive datagrams are missing, damaged or stale."""
 
 import hashlib
 from collections import defaultdict
@@ -17,7 +17,7 @@ CLIENTS = 4
 
 
 def sealed(number: int, way: str, size: int) -> bytes:
-    """A payload that tells its number, and whether it is intact."""
+    """Return a payload with its number and a check of its integrity."""
     head = number.to_bytes(4, "big") + way.encode()
     body = head.ljust(size, b".")
     return hashlib.blake2b(body, digest_size=8).digest() + body
@@ -29,7 +29,7 @@ def number_of(payload: bytes) -> int | None:
 
 
 def longest_loss_burst(received: Sequence[bytes], sent: int) -> int:
-    """Most in a row of ``sent`` that a receiver who wants the newest gets no use of."""
+    """Return the most consecutive datagrams of ``sent`` that are missing, damaged or stale."""
     newest, longest = -1, 0
     for payload in received:
         number = number_of(payload)
@@ -95,7 +95,7 @@ def test_the_cap_holds_in_both_directions_for_every_client(
         assert way.unintended == {"lost_in_kernel": 0}
 
 
-def test_the_judge_sees_what_is_missing_damaged_or_stale() -> None:
+def test_the_burst_counter_includes_missing_damaged_and_stale_datagrams() -> None:
     all_of_them = [sealed(number, "there", 20) for number in range(6)]
     assert longest_loss_burst(all_of_them, 6) == 0
     assert longest_loss_burst(all_of_them[:2] + all_of_them[4:], 6) == 2

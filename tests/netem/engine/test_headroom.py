@@ -1,4 +1,4 @@
-"""An emulator whose memory is limited (``ulimit -v``), and much that is delayed."""
+"""An emulator with limited memory (``ulimit -v``) and many delayed datagrams."""
 
 import errno
 import json
@@ -14,12 +14,12 @@ from tests.netem.control.processes import emulator, send_through, udp_socket
 
 SIZE_BYTES, BATCH, MOST = 60_000, 100, 40_000
 MORE_BYTES = 120 * 1024 * 1024
-"""What the emulator may take when it runs; all datagrams have much more."""
+"""Memory that the emulator may use in addition at runtime; all datagrams together exceed it."""
 NO_MEMORY = os.strerror(errno.ENOMEM)
 
 
 @pytest.mark.parametrize("engine", ["batched", "plain"])
-def test_what_there_is_no_memory_for_is_dropped_and_counted(engine: Engine) -> None:
+def test_datagrams_beyond_the_memory_limit_are_dropped_and_counted(engine: Engine) -> None:
     options = ("--engine", engine, "--stats", "0.05", "delay", "1000s")
     status = ExitStatus.UNINTENDED_LOSSES
     with udp_socket() as server, emulator(server.getsockname(), *options, status=status) as running:

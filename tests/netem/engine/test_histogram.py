@@ -15,7 +15,7 @@ def test_a_bucket_holds_its_times_to_three_percent(t_ns: int) -> None:
     assert lower_ns(bucket + 1) - lower_ns(bucket) <= max(1, lower_ns(bucket) / 32)
 
 
-def test_what_has_no_bucket_of_its_own() -> None:
+def test_times_out_of_range_use_the_first_or_last_bucket() -> None:
     assert bucket_of(-5) == 0
     assert bucket_of(2**60) == BUCKETS - 1
 
@@ -40,6 +40,6 @@ def test_the_coarse_one_counts_the_same_times(times_ns: list[int]) -> None:
     assert begins == sorted(begins)
     assert sum(n for _, n in steps) == len(times_ns)
     for begin, n in steps:
-        # Four for each doubling; below 32 ns eight ns each.
+        # Four buckets per doubling; below 32 ns, each bucket is 8 ns wide.
         width = 8 if begin < 32 else 1 << (begin.bit_length() - 3)
         assert n == sum(begin <= t_ns < begin + width for t_ns in times_ns)

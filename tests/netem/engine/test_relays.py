@@ -1,4 +1,4 @@
-"""What both engines do, seen from outside."""
+"""The externally visible behaviour of both engines."""
 
 import errno
 import io
@@ -46,7 +46,7 @@ def numbers(datagrams: Sequence[tuple[bytes, Any]]) -> list[int]:
 
 @pytest.mark.parametrize("client_side", [4, 6])
 @pytest.mark.parametrize("server_side", [4, 6])
-def test_there_and_back_over_both_versions_of_ip(
+def test_both_directions_work_over_both_versions_of_ip(
     engine: Engine, client_side: int, server_side: int
 ) -> None:
     here, far = HOSTS[client_side], HOSTS[server_side]
@@ -69,10 +69,10 @@ def test_there_and_back_over_both_versions_of_ip(
 
 @pytest.mark.parametrize("client_side", [4, 6])
 @pytest.mark.parametrize("server_side", [4, 6])
-def test_one_way_all_leaves_from_one_port_and_answers_go_nowhere(
+def test_a_one_way_link_sends_from_one_port_and_discards_answers(
     engine: Engine, client_side: int, server_side: int
 ) -> None:
-    """An answer that were taken for a client's datagram would come back to the server for ever."""
+    """If the relay took an answer for a client's datagram, it would loop to the server forever."""
     here, far = HOSTS[client_side], HOSTS[server_side]
     tap = KeepAll()
     with endpoints(far, here, here) as (server, *clients):
@@ -98,7 +98,7 @@ def test_one_way_all_leaves_from_one_port_and_answers_go_nowhere(
     assert {port for _, port in sources} == set(ports.tolist())
 
 
-def test_a_server_on_all_addresses_that_answers_from_another_is_no_client(engine: Engine) -> None:
+def test_answers_from_another_address_of_the_server_do_not_make_it_a_client(engine: Engine) -> None:
     with endpoints("0.0.0.0", HOSTS[4]) as (server, client):
         spec = link(("127.0.0.2", name_of(server)[1]), return_path=False)
         with running([spec], engine) as one:
@@ -109,7 +109,7 @@ def test_a_server_on_all_addresses_that_answers_from_another_is_no_client(engine
             assert one.report().clients_ever == 1
 
 
-def test_only_the_servers_answers_come_back(engine: Engine) -> None:
+def test_only_answers_of_the_server_reach_the_client(engine: Engine) -> None:
     with (
         endpoints(*[HOSTS[4]] * 3) as (server, client, stranger),
         running([link(name_of(server))], engine) as one,
@@ -123,10 +123,10 @@ def test_only_the_servers_answers_come_back(engine: Engine) -> None:
         assert one.report().reverse.counters.arrived == 1
 
 
-def test_a_server_that_is_not_there_yet_is_told_and_costs_nothing_later(
+def test_an_absent_server_is_reported_and_causes_no_later_loss(
     engine: Engine, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Each datagram to a closed port makes an ICMP error, which must not fail the next send."""
+    """Each datagram to a closed port causes an ICMP error, which must not fail the next send."""
     with endpoints(HOSTS[4], HOSTS[4]) as (reserved, client):
         address = name_of(reserved)
         with running([link(address)], engine) as one:
@@ -154,7 +154,9 @@ def test_a_server_that_is_not_there_yet_is_told_and_costs_nothing_later(
 
 @pytest.mark.parametrize("size", [0, 1, 511, 512, 513, 1472, 65_507])
 @pytest.mark.parametrize("delay_s", [0.0, 0.002])
-def test_any_size_comes_through_with_its_copy(engine: Engine, size: int, delay_s: float) -> None:
+def test_datagrams_of_any_size_and_their_copies_arrive(
+    engine: Engine, size: int, delay_s: float
+) -> None:
     payload = bytes(np.random.default_rng(size).integers(0, 256, size, np.uint8))
     ways = (Duplicate(probability=1), Delay(delay_s=delay_s), Corrupt(probability=1))
     there_and_back = LinkSettings(impairments=ways[:2]), LinkSettings(impairments=ways)
@@ -177,7 +179,7 @@ def test_any_size_comes_through_with_its_copy(engine: Engine, size: int, delay_s
             assert flipped.sum() == (1 if size else 0)
 
 
-def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> None:
+def test_a_change_keeps_flows_and_datagrams_in_flight(engine: Engine) -> None:
     late = LinkSettings(impairments=(Delay(delay_s=0.05),), mansd=1)
     lossy = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=1)
     with (
@@ -195,7 +197,7 @@ def test_a_change_leaves_flows_and_what_is_under_way_alone(engine: Engine) -> No
         one.ask(lambda: one.relay.change("test", "forward", lossy))
         send(4)
         one.settled(8)
-        # Nothing overtakes what was under way; then every second one is lost.
+        # The datagrams in flight keep their order; after them, every second one is lost.
         assert numbers(drain(server)) == [0, 1, 2, 3, 5, 7]
         report = one.report()
         assert report.forward.settings == lossy
@@ -223,7 +225,7 @@ def test_idle_clients_are_forgotten_and_come_back_as_new_flows(engine: Engine) -
     assert found == [[bytes([flow, 1]), bytes([flow, 2])] for flow in range(3)]
 
 
-def test_a_client_with_something_under_way_is_not_idle(engine: Engine) -> None:
+def test_a_client_with_datagrams_in_flight_is_not_idle(engine: Engine) -> None:
     late = LinkSettings(impairments=(Delay(delay_s=0.9),))
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
@@ -234,8 +236,8 @@ def test_a_client_with_something_under_way_is_not_idle(engine: Engine) -> None:
         one.until(lambda: one.relay.report()[0].clients == 0)
 
 
-def test_a_client_is_not_idle_for_what_was_not_read(engine: Engine) -> None:
-    """An emulator that was stopped for longer than clients may be idle finds their datagrams."""
+def test_a_client_with_unread_datagrams_is_not_idle(engine: Engine) -> None:
+    """A stall longer than the idle time does not make clients with queued datagrams idle."""
     cap = LinkSettings(impairments=(LossOf(loss=WorstCaseLoss()),), mansd=3)
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
@@ -274,7 +276,7 @@ def test_more_clients_than_allowed_are_refused_and_counted(
     assert capfd.readouterr().err.count("no more than 2 clients at once") == 1
 
 
-def test_out_of_file_descriptors_is_said_and_counted(
+def test_a_lack_of_file_descriptors_is_reported_and_counted(
     engine: Engine, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import resource
@@ -303,10 +305,10 @@ def sum_of(report: Any) -> int:
 
 
 @pytest.mark.parametrize("return_path", [True, False])
-def test_what_cannot_be_sent_is_counted_by_its_reason(
+def test_send_errors_are_counted_by_reason(
     engine: Engine, return_path: bool, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Broadcasting is not permitted to a socket that did not ask for it."""
+    """The kernel refuses broadcasts from a socket without the broadcast option."""
     with endpoints(HOSTS[4]) as (client,):
         spec = link(("255.255.255.255", 9), return_path=return_path)
         with running([spec], engine) as one:
@@ -319,7 +321,7 @@ def test_what_cannot_be_sent_is_counted_by_its_reason(
 
 
 @pytest.mark.parametrize("version", [4, 6])
-def test_what_the_kernel_drops_is_counted_to_the_last(
+def test_all_kernel_drops_are_counted(
     engine: Engine, version: int, capfd: pytest.CaptureFixture[str]
 ) -> None:
     host, many = HOSTS[version], 20_000
@@ -349,8 +351,8 @@ def test_what_the_kernel_drops_is_counted_to_the_last(
     assert "lost in the kernel" in said
 
 
-def test_what_the_kernel_drops_of_cut_messages_is_counted_to_the_last(engine: Engine) -> None:
-    """Every datagram of them, though a client hands them over as one."""
+def test_all_kernel_drops_of_segmented_messages_are_counted(engine: Engine) -> None:
+    """Each segment counts, although the client sends them in one call."""
     messages, size = 3000, 72
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
@@ -370,8 +372,8 @@ def all_of(way: Any) -> int:
 
 
 @pytest.mark.parametrize("segment", [False, True])
-def test_segments_are_datagrams_of_their_own(engine: Engine, segment: bool) -> None:
-    """What a client sends as one message that the kernel cuts."""
+def test_segments_are_separate_datagrams(engine: Engine, segment: bool) -> None:
+    """The client sends one message, and the kernel cuts it into segments."""
     third = LinkSettings(impairments=(LossOf(loss=PeriodicLoss(period=3)),))
     with (
         endpoints(HOSTS[4], HOSTS[4]) as (server, client),
@@ -394,7 +396,7 @@ def test_segments_are_datagrams_of_their_own(engine: Engine, segment: bool) -> N
         assert [data for data, _ in drain(server)] == kept
 
 
-def test_links_are_apart(engine: Engine) -> None:
+def test_links_are_independent(engine: Engine) -> None:
     half = LinkSettings(impairments=(HALF,))
     with endpoints(*[HOSTS[4]] * 3) as (one_server, other_server, client):
         specs = [
@@ -413,7 +415,7 @@ def test_links_are_apart(engine: Engine) -> None:
 
 
 class CountOnly:
-    """A tap that does not look at payloads."""
+    """A tap that does not read payloads."""
 
     wants_data = False
 
@@ -429,7 +431,7 @@ class CountOnly:
         raise AssertionError(events)
 
 
-def test_taps_are_told_of_everything(engine: Engine) -> None:
+def test_taps_receive_every_event(engine: Engine) -> None:
     many, tap = 9000, CountOnly()
     half = LinkSettings(impairments=(HALF,))
     with (
@@ -470,12 +472,14 @@ def test_a_link_that_leads_back_to_itself_is_refused(engine: Engine, listen: str
     ("listen", "to"),
     [("127.0.0.1", "127.0.0.2"), ("0.0.0.0", "192.0.2.1"), ("127.0.0.2", "0.0.0.0")],
 )
-def test_one_to_the_same_port_elsewhere_is_not(engine: Engine, listen: str, to: str) -> None:
+def test_a_link_to_the_same_port_of_another_address_is_allowed(
+    engine: Engine, listen: str, to: str
+) -> None:
     port = free_port(listen)
     open_relay([link((to, port), listen=(listen, port))], engine).close()
 
 
-def test_links_may_follow_one_another_but_not_in_a_circle(engine: Engine) -> None:
+def test_links_may_form_a_chain_but_not_a_cycle(engine: Engine) -> None:
     ports = {name: free_port(HOSTS[4]) for name in "abc"}
 
     def chain(*names: str) -> list[LinkSpec]:
@@ -501,7 +505,7 @@ def test_a_server_needs_a_port(engine: Engine) -> None:
         ({"listen": ("192.0.2.1", 0)}, "is no address of this machine"),
     ],
 )
-def test_a_link_that_cannot_be_is_refused(
+def test_an_impossible_link_is_refused(
     engine: Engine, others: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CallerError, match=message):
@@ -551,7 +555,7 @@ class _Broken(io.TextIOBase):
 
 
 @pytest.mark.parametrize("stderr", [_Broken(), None])
-def test_it_goes_on_if_nobody_can_hear_what_it_says(
+def test_the_relay_continues_if_standard_error_is_unusable(
     engine: Engine, stderr: io.TextIOBase | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with endpoints(*[HOSTS[4]] * 3) as (server, one, another):
@@ -568,7 +572,7 @@ def test_it_goes_on_if_nobody_can_hear_what_it_says(
             assert [server.recv(10) for _ in range(2)] == [b"first", b"second"]
 
 
-def test_a_change_leaves_the_record_that_is_repeated_alone(engine: Engine) -> None:
+def test_a_change_does_not_interrupt_a_replay(engine: Engine) -> None:
     lost = RecordedDecision(Fate.DROPPED, -1, -1, -1, -1)
     passed = RecordedDecision(Fate.DELIVERED, 0, -1, -1, -1)
     record = [lost, passed, lost, lost, passed, lost]
@@ -585,7 +589,7 @@ def test_a_change_leaves_the_record_that_is_repeated_alone(engine: Engine) -> No
             assert numbers(drain(server)) == [1, 4, 8]
 
 
-def test_there_may_be_more_links_than_select_can_count(engine: Engine) -> None:
+def test_more_links_than_the_limit_of_select_work(engine: Engine) -> None:
     raise_file_limit()
     with endpoints(HOSTS[4], HOSTS[4]) as (server, client):
         specs = [link(name_of(server), name=f"link{number}") for number in range(1100)]

@@ -1,4 +1,4 @@
-"""What the engines do with datagrams is what the machine says, whatever the settings."""
+"""For any settings, both engines treat datagrams as the pure link machine decides."""
 
 from collections import defaultdict
 from typing import Any
@@ -23,7 +23,7 @@ DECIDED = ("packet", "fate", "consecutive_losses", "hold_back_ns", "bit", "copy_
 def replayed(
     spec: LinkSpec, side: int, events: NDArray[Any], payloads: list[bytes], began_ns: int
 ) -> dict[int, list[bytes]]:
-    """Give the machine what arrived, when it did; check decisions; return what leaves, by flow."""
+    """Pass the arrivals to the machine, check its decisions; return the departures by flow."""
     own: LinkSettings = (spec.forward, spec.reverse)[side]
     machine = Link(own, spec.seed, spec.name, ("forward", "reverse")[side])
     left: dict[int, list[bytes]] = defaultdict(list)

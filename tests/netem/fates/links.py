@@ -1,4 +1,4 @@
-"""Datagrams for links with any impairments, and traces of their fates."""
+"""Drive links with any impairments, and record traces of the packets' fates."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -23,7 +23,7 @@ class Arrival(NamedTuple):
     """A received datagram."""
 
     gap_ns: int
-    """After the one before."""
+    """Time since the previous arrival."""
     flow: int
     size_bytes: int
 

@@ -1,4 +1,4 @@
-"""Fate traces that no emulator wrote, or that are damaged: one line, whatever is wrong."""
+"""Fate traces that are damaged or not written by an emulator give one error line."""
 
 import json
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def with_values(column: str, values: Callable[[list[Any]], list[Any]]) -> pa.Tab
     return TABLE.set_column(at, field, pa.array(values(TABLE[column].to_pylist()), field.type))
 
 
-def test_what_is_spoilt_below_is_right(tmp_path: Path) -> None:
+def test_the_undamaged_trace_is_accepted(tmp_path: Path) -> None:
     assert len(read_fates(write(tmp_path / "a", TABLE)).decisions["up", "forward"]) == 2
 
 
@@ -51,7 +51,7 @@ def test_what_is_spoilt_below_is_right(tmp_path: Path) -> None:
         DOCUMENT | {"links": [DOCUMENT["links"][0] | {"reverse": {"mansd": 1_000_001}}]},
     ],
 )  # fmt: skip
-def test_a_document_is_the_programs(document: object, tmp_path: Path) -> None:
+def test_a_trace_with_an_invalid_document_is_refused(document: object, tmp_path: Path) -> None:
     assert "not a fate trace of this program" in refused(write(tmp_path / "a", TABLE, document))
 
 
@@ -86,12 +86,12 @@ def test_another_format_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("column", TABLE.column_names)
-def test_no_value_is_missing(column: str, tmp_path: Path) -> None:
+def test_a_missing_value_is_refused(column: str, tmp_path: Path) -> None:
     table = with_values(column, lambda values: [*values[:-1], None])
     assert "an incomplete trace cannot be replayed" in refused(write(tmp_path / "a", table))
 
 
-def test_a_file_that_lost_bytes_gets_one_line(tmp_path: Path) -> None:
+def test_a_truncated_file_gets_one_line(tmp_path: Path) -> None:
     whole = write(tmp_path / "a", TABLE).read_bytes()
     for size in range(0, len(whole), 37):
         (tmp_path / "b").write_bytes(whole[:size])

@@ -38,7 +38,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "fates.parquet"
 
 
-def test_a_row_says_what_an_event_says(path: Path) -> None:
+def test_a_row_contains_the_fields_of_its_event(path: Path) -> None:
     event = arrivals(1, link=1, direction=1)
     told = {
         "t_ns": 1_790_000_000_123_456_789, "size_bytes": 1400, "fate": Fate.CORRUPTED,
@@ -57,7 +57,7 @@ def test_a_row_says_what_an_event_says(path: Path) -> None:
     }  # fmt: skip
 
 
-def test_the_file_says_of_which_links_it_is(path: Path) -> None:
+def test_the_file_contains_the_description_of_its_links(path: Path) -> None:
     record(path, LINK, [])
     document = json.loads(pq.ParquetFile(path).metadata.metadata[METADATA.encode()])
     assert document["missing_events"] == 0
@@ -66,7 +66,7 @@ def test_the_file_says_of_which_links_it_is(path: Path) -> None:
     assert LinkSettings.model_validate_json(json.dumps(link["forward"])) == LINK
 
 
-def test_directions_are_kept_apart_and_a_flow_may_be_silent_in_one(path: Path) -> None:
+def test_directions_are_separate_and_a_flow_may_have_packets_in_only_one(path: Path) -> None:
     back = arrivals(2, direction=1)
     back["flow"] = 1
     back["fate"], back["delay_ns"] = Fate.DROPPED, -1
@@ -96,7 +96,7 @@ def test_many_rows_are_written_in_groups(path: Path) -> None:
     assert len(flow) == rows
 
 
-def test_what_comes_too_fast_is_missing_and_told_at_once(
+def test_events_beyond_the_queue_limit_are_reported_missing_at_once(
     path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free = threading.Event()
@@ -109,7 +109,7 @@ def test_what_comes_too_fast_is_missing_and_told_at_once(
     monkeypatch.setattr(pq.ParquetWriter, "write_table", slow)
     with FateRecorder(path, [spec_of(LINK)], max_waiting=100_000) as recorder:
         recorder.take(arrivals(100_000), NOTHING)
-        recorder.take(arrivals(7), NOTHING)  # returns, although nothing can be written
+        recorder.take(arrivals(7), NOTHING)  # returns at once, although the write is blocked
         assert recorder.missing_events == 7
         free.set()
     error = capsys.readouterr().err
@@ -119,7 +119,7 @@ def test_what_comes_too_fast_is_missing_and_told_at_once(
         read_fates(path)
 
 
-def test_events_that_the_relay_had_no_room_for_are_missing(
+def test_events_that_the_relay_lost_are_reported_missing(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with FateRecorder(path, [spec_of(LINK)]) as recorder:
@@ -132,7 +132,7 @@ def test_events_that_the_relay_had_no_room_for_are_missing(
         read_fates(path)
 
 
-def test_when_the_file_cannot_grow_the_relay_goes_on(
+def test_the_relay_continues_if_the_file_cannot_grow(
     path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -151,7 +151,7 @@ def test_when_the_file_cannot_grow_the_relay_goes_on(
         read_fates(path)
 
 
-def test_a_file_that_cannot_be_made_is_said_at_once(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_created_is_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"none/x: cannot be written \(No such file"):
         FateRecorder(tmp_path / "none" / "x", [spec_of(LINK)])
     with pytest.raises(CallerError, match=r"cannot be written \(No space left on device\)"):
@@ -171,7 +171,7 @@ def test_other_files_are_refused(path: Path, tmp_path: Path) -> None:
         read_fates(path)
 
 
-def test_a_link_that_the_trace_does_not_know_is_named(path: Path) -> None:
+def test_a_link_that_is_not_in_the_trace_is_named(path: Path) -> None:
     record(path, LINK, [])
     with pytest.raises(CallerError, match="has no link 'b'; its links: a"):
         read_fates(path, ["b"])

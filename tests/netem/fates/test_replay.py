@@ -1,4 +1,4 @@
-"""A replay does what was recorded."""
+"""A replay repeats the recorded fates."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ BAD = LinkSettings(
     mansd=3,
     limit=12,
 )
-"""Everything happens, often."""
+"""Every impairment acts, frequently."""
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def fates_of(folder: Path) -> Sequence[Sequence[RecordedDecision]]:
 
 
 def seen(run: Run) -> list[tuple[int, ...]]:
-    """What a datagram's sender and receiver could tell."""
+    """Return the values that the sender and the receiver can observe."""
     return [
         (
             one.fate,
@@ -66,7 +66,7 @@ def seen(run: Run) -> list[tuple[int, ...]]:
 def test_the_same_arrivals_meet_the_same_fates(
     folder: Path, link: LinkSettings, came: list[Arrival], capped: bool
 ) -> None:
-    """Whatever the replaying link would have decided: another seed, and no impairments at all."""
+    """The fates do not depend on the replaying link: another seed, no impairments."""
     before = record(folder / "fates.parquet", link, came)
     bare = LinkSettings(mansd=link.mansd) if capped else LinkSettings()
     for replaying in (link, bare):
@@ -79,7 +79,7 @@ def test_the_same_arrivals_meet_the_same_fates(
 def test_at_other_times_the_delays_are_kept_and_so_is_the_cap(
     folder: Path, link: LinkSettings, came: list[Arrival], data: st.DataObject
 ) -> None:
-    """Even a lower one than that of the record."""
+    """Even if the cap is lower than the recorded one."""
     before = record(folder / "fates.parquet", link, came)
     gaps = st.lists(st.integers(0, MAX_GAP_NS), min_size=len(came), max_size=len(came))
     mansd = data.draw(st.sampled_from([link.mansd, 0, 1, 2]))
@@ -88,7 +88,7 @@ def test_at_other_times_the_delays_are_kept_and_so_is_the_cap(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_long_records_are_repeated(folder: Path, seed: int) -> None:
+def test_long_traces_are_replayed_exactly(folder: Path, seed: int) -> None:
     random = np.random.default_rng(seed)
     came = [
         Arrival(int(gap_ns), 0, int(size_bytes))
@@ -129,7 +129,7 @@ def check_moved(
 
 
 def longest_loss_burst(run: Run) -> int:
-    """Most successive datagrams of a flow that a receiver which wants the newest does not get."""
+    """Return the most consecutive datagrams of a flow that were lost or delivered out of order."""
     longest = 0
     for flow in {flow for _, flow, _ in run.arrivals}:
         sizes = [size_bytes for _, other, size_bytes in run.arrivals if other == flow]
@@ -137,7 +137,7 @@ def longest_loss_burst(run: Run) -> int:
         received = [data for _, other, data in run.departures if other == flow]
         newest = -1
         for data in received:
-            # Payloads may be equal by chance, the short ones: it then is the one that helps most.
+            # Short payloads may be equal by chance: choose the most favourable match.
             fresh = [packet for packet in range(newest + 1, len(sent)) if sent[packet] == data]
             if fresh:
                 longest = max(longest, fresh[0] - newest - 1)
@@ -164,7 +164,7 @@ def test_a_bit_that_a_datagram_does_not_have_is_not_flipped(
         assert (0 <= verdict.bit < 8 * now.size_bytes) == corrupted
 
 
-def test_what_is_not_in_the_trace_meets_the_links_own_settings(folder: Path) -> None:
+def test_packets_that_are_not_in_the_trace_use_the_links_own_settings(folder: Path) -> None:
     record(folder / "fates.parquet", BAD, [Arrival(1000, 0, 8)] * 5)
     again = drive(
         Link(

@@ -1,4 +1,4 @@
-"""Emulators for real programs, each a process of its own."""
+"""Emulators for real programs, each in a separate process."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,7 +12,7 @@ Emulate = Callable[..., Emulator]
 
 @pytest.fixture
 def emulate(tmp_path: Path) -> Iterator[Emulate]:
-    """Starts emulators; those that still run at the end are killed."""
+    """Start emulators; kill the remaining ones at the end."""
     started: list[Emulator] = []
 
     def start(

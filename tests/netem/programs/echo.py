@@ -1,10 +1,10 @@
-"""Servers and clients that are run in network namespaces, by their path.
+"""Servers and clients for network namespaces, run by the path of this file.
 
-``echo.py serve HOST`` says its port, and for each datagram from where it came, a line each.
-``echo.py ask HOST PORT FROM_HOST FROM_PORT COUNT`` sends so many datagrams, one after the other,
-with nothing but their numbers, and says which numbers came back.
-``echo.py count HOST`` says its port and, when its standard input has ended, how many came.
-``echo.py send HOST PORT COUNT`` sends so many datagrams.
+``echo.py serve HOST`` prints its port, then the source address of each datagram, one per line.
+``echo.py ask HOST PORT FROM_HOST FROM_PORT COUNT`` sends COUNT datagrams one after the other, each
+with its number only, and prints the numbers that came back.
+``echo.py count HOST`` prints its port and, at the end of its standard input, the number received.
+``echo.py send HOST PORT COUNT`` sends COUNT datagrams.
 """
 
 import json
@@ -15,7 +15,7 @@ from contextlib import suppress
 
 TIMEOUT_S = 0.1
 QUIET_S = 1.0
-"""The last datagram on its way takes less, once it has left the queue that it waits in."""
+"""Longer than the travel time of the last datagram after it has left the queue."""
 SIZE_BYTES = 500
 SO_RCVBUFFORCE = 33
 BUFFER_BYTES = 4 * 1024 * 1024
@@ -45,7 +45,7 @@ def ask(host: str, port: str, from_host: str, from_port: str, count: str) -> Non
             client.send(f"{from_host} {number}".encode())
             with suppress(TimeoutError):
                 came.append(client.recv(2048).decode())
-        with suppress(TimeoutError):  # what is late
+        with suppress(TimeoutError):  # the answer is late or lost
             while True:
                 came.append(client.recv(2048).decode())
     print(json.dumps(came))

@@ -1,4 +1,4 @@
-"""A running emulator, started by its command line."""
+"""Start an emulator by its command line and read its results."""
 
 import json
 import signal
@@ -16,23 +16,23 @@ LET_OUT = (Fate.DELIVERED, Fate.FORCED, Fate.CORRUPTED)
 
 
 class Departure(NamedTuple):
-    """A datagram, or a copy of it, that left."""
+    """A departed datagram or copy."""
 
     due_ns: int
     packet: int
-    """Its number in its flow."""
+    """Number of the datagram in its flow."""
     delay_ns: int
 
 
 class Emulator:
-    """``python -m netem`` with one link, in a folder of its own.
+    """``python -m netem`` with one link, in a separate folder.
 
     Args:
-        folder: where its fate trace goes.
+        folder: the folder for its fate trace.
         to: the server, HOST:PORT.
-        words: what it does, and options.
-        listen: where clients send to.
-        inside: begin of a command line that runs another, e.g. in a network namespace.
+        words: impairments and options.
+        listen: the address to which clients send.
+        inside: a command prefix, e.g. to run the emulator in a network namespace.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class Emulator:
         self.port = int(port)
 
     def finish(self) -> dict[str, Any]:
-        """End it, which has lost nothing by itself; return what it says of its link."""
+        """End the emulator and check for unintended losses; return its link's statistics."""
         link, status, stderr = self.end()
         assert status == 0, stderr
         for line in stderr.splitlines():
-            # A program may end with something on its way to it.
+            # A program may end with datagrams to it in flight.
             usual = ("compiling", "Ctrl-C ends", "ICMP port unreachable")
             assert any(words in line for words in usual), stderr
         for direction in ("forward", "reverse"):
@@ -66,7 +66,7 @@ class Emulator:
         return link
 
     def end(self) -> tuple[dict[str, Any], int, str]:
-        """End it; return what it says of its link, its exit status, and its standard error."""
+        """End the emulator; return its link's statistics, exit status and standard error."""
         self._process.send_signal(signal.SIGINT)
         stdout, stderr = self._process.communicate(timeout=60)
         (link,) = json.loads(stdout)["links"]
@@ -78,12 +78,12 @@ class Emulator:
         self._process.communicate()
 
     def fates(self, direction: str, flow: int = 0) -> list[dict[str, Any]]:
-        """What became of each datagram of a flow, in the order of arrival."""
+        """Return the fate of each datagram of a flow, in the order of arrival."""
         rows: list[dict[str, Any]] = pq.read_table(self._trace).to_pylist()
         return [row for row in rows if row["direction"] == direction and row["flow"] == flow]
 
     def departures(self, direction: str, flow: int = 0) -> list[Departure]:
-        """What left of a flow, in the order in which it was to leave."""
+        """Return the departures of a flow in the order of their due times."""
         leaving = []
         for row in self.fates(direction, flow):
             if row["fate"] in LET_OUT:

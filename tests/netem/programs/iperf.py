@@ -1,7 +1,7 @@
-"""iperf3 over UDP through an emulator, and how its receiver counts.
+"""Run iperf3 over UDP through an emulator, and model the counters of its receiver.
 
-iperf3 has a TCP connection for control on the port that its datagrams go to. The emulator takes the
-datagrams; a forwarder here, on the same port, takes the connection.
+iperf3 uses the same port number for its UDP datagrams and its TCP control connection. The emulator
+relays the datagrams; a forwarder in this module relays the connection.
 """
 
 import asyncio
@@ -19,16 +19,16 @@ from tests.netem.programs.ports import HOST
 
 
 class Counts(NamedTuple):
-    """What an iperf3 receiver has counted of a stream."""
+    """The counters of an iperf3 receiver for a stream."""
 
     newest: int
-    """Greatest number among the datagrams; they begin at 1."""
+    """Greatest datagram number; numbers begin at 1."""
     lost: int
     out_of_order: int
 
 
 class Measured(NamedTuple):
-    """What iperf3 reports."""
+    """The reports of iperf3's client and server."""
 
     client: dict[str, Any]
     server: dict[str, Any]
@@ -36,16 +36,16 @@ class Measured(NamedTuple):
     def counts(self, stream: int, reverse: bool) -> Counts:
         receiver = self.client if reverse else self.server
         udp = receiver["end"]["streams"][stream]["udp"]
-        # At the end it tells how many were sent, at intervals by how much the newest number rose.
+        # The final report has the number sent; the intervals have increments of the newest number.
         newest = sum(one["streams"][stream]["packets"] for one in receiver["intervals"])
         return Counts(newest, udp["lost_packets"], udp["out_of_order"])
 
 
 def counted(departures: Iterable[Departure]) -> Iterator[Counts]:
-    """What a receiver has counted after each datagram, as iperf3's manual and source tell it.
+    """Yield a receiver's counters after each datagram, by iperf3's manual and source.
 
-    A gap in the numbers is lost until something arrives out of order, which fills it. Datagram 0 of
-    a flow only says that there is a stream.
+    iperf3 counts a gap in the numbers as losses; a datagram out of order reduces this count by one.
+    Datagram 0 of a flow only opens the stream.
     """
     counts = Counts(0, 0, 0)
     for departure in departures:
@@ -58,12 +58,12 @@ def counted(departures: Iterable[Departure]) -> Iterator[Counts]:
 
 
 async def iperf_server(port: int) -> AsyncProcess:
-    """An iperf3 server for one test, which listens; OSError if it cannot."""
+    """Start an iperf3 server for one test; raise OSError if it cannot listen."""
     server = await asyncio.create_subprocess_exec(
         "iperf3", "--server", "--bind", HOST, "--port", str(port), "--one-off", "--json",
         stdout=PIPE,
     )  # fmt: skip
-    # It does not say when it listens, if its report shall be JSON.
+    # With JSON output, iperf3 does not report that it listens.
     while server.returncode is None:
         with suppress(NoSuchProcess):
             if any(one.laddr.port == port for one in Process(server.pid).net_connections()):

@@ -1,4 +1,4 @@
-"""Ports for servers that cannot choose one and say which."""
+"""Find ports for servers that cannot choose and report a port themselves."""
 
 import socket
 from collections.abc import Awaitable, Callable
@@ -11,7 +11,7 @@ _ATTEMPTS = 20
 
 
 async def open_server(begin: Callable[[int], Awaitable[T]]) -> tuple[T, int]:
-    """Begin something on a port that is free for TCP and UDP; return it and the port."""
+    """Start a server on a port that is free for TCP and UDP; return the server and the port."""
     for _ in range(_ATTEMPTS):
         with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
             tcp.bind((HOST, 0))

@@ -1,11 +1,11 @@
-"""A DNS client that repeats its question: with MANSD it knows how often at most.
+"""With a loss cap in both directions, a DNS client needs a bounded number of tries.
 
-Let at most m of a client's successive datagrams be lost on the way there, and at most k on the way
-back. If n tries in a row got no answer, d of them came to the server, and all d answers were lost,
-so d ≤ k. Before, between and after those d there are d + 1 runs of lost questions, of at most m
+Let at most m consecutive datagrams be lost in the forward direction and at most k in the reverse
+direction. Suppose that n consecutive tries get no answer and that d of them reach the server. All d
+answers are lost, so d ≤ k. The other n − d questions form at most d + 1 loss bursts of at most m
 each: n ≤ d + (d + 1) m ≤ k + (k + 1) m = (m + 1)(k + 1) − 1. So (m + 1)(k + 1) tries are enough.
-This holds from any question on, as runs that began before it are shorter from there; and it needs
-that the client keeps its socket, as a new one is a new flow.
+The bound holds from any question on, because an earlier start of a loss burst only shortens the
+rest of it. The client must keep its socket, because a new socket is a new flow.
 """
 
 import shlex
@@ -27,7 +27,7 @@ from tests.netem.programs.conftest import Emulate
 from tests.netem.programs.emulator import LET_OUT
 
 TIMEOUT_S = 0.03
-"""Of a try. An answer that comes later costs another try, but tells which one it answers."""
+"""Timeout of a try. A later answer costs another try but carries the number of its own try."""
 QUESTIONS = 4
 
 
@@ -35,7 +35,7 @@ class Case(NamedTuple):
     forward: str
     reverse: str
     most: int
-    """Tries that are enough."""
+    """Sufficient number of tries."""
 
 
 CASES = {
@@ -48,15 +48,15 @@ UNCAPPED = Case("loss 70%", "loss 70%", CASES["random"].most)
 
 
 class Asked(NamedTuple):
-    """A question; tries are numbered from 0 on, over all questions."""
+    """A question; tries are numbered from 0 over all questions."""
 
     first: int
     answered: int
-    """The try that got the first answer."""
+    """The try that was answered first."""
 
 
 class Zone(BaseResolver):
-    """A server's zone, in which every name has an address that tells its number."""
+    """The zone of a server; the address of each name contains the name's number."""
 
     def resolve(self, request: DNSRecord, handler: DNSHandler) -> DNSRecord:
         reply = request.reply()
@@ -68,7 +68,7 @@ class Zone(BaseResolver):
 @contextmanager
 def dns_server() -> Iterator[str]:
     silent = DNSLogger(logf=lambda _: None)
-    # Its own class answers in threads, and so in any order.
+    # dnslib's own server answers in threads, and so in any order.
     server = DNSServer(
         Zone(), address="127.0.0.1", port=0, logger=silent, server=socketserver.UDPServer
     )
@@ -82,7 +82,7 @@ def dns_server() -> Iterator[str]:
 
 
 class Client:
-    """Repeats a question until it is answered; each try has an identifier of its own."""
+    """Repeats a question until it is answered; each try has its own identifier."""
 
     def __init__(self, host: str, port: int) -> None:
         self._socket = socket.socket(type=socket.SOCK_DGRAM)
@@ -109,7 +109,7 @@ class Client:
 
 
 def answered(case: Case) -> Iterator[bool]:
-    """Whether each try gets an answer, by the rules alone."""
+    """Yield for each try whether it gets an answer, as the links decide without sockets."""
     there, back = (
         Link(settings_of(shlex.split(words)), 0, LINK_NAME, direction)
         for words, direction in ((case.forward, "forward"), (case.reverse, "reverse"))
@@ -123,7 +123,7 @@ def passes(link: Link) -> bool:
 
 
 def ask(emulate: Emulate, case: Case) -> list[Asked]:
-    """Ask all questions; what is answered is what the rules foretell."""
+    """Ask all questions; check that the answered tries are those that ``answered`` predicts."""
     with dns_server() as server:
         emulator = emulate(server, case.forward, "--reverse", case.reverse)
         with closing(Client(emulator.host, emulator.port)) as client:
@@ -136,20 +136,20 @@ def ask(emulate: Emulate, case: Case) -> list[Asked]:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_with_a_cap_a_client_knows_how_often_it_must_ask(emulate: Emulate, case: Case) -> None:
+def test_with_a_cap_the_number_of_tries_is_bounded(emulate: Emulate, case: Case) -> None:
     needed = [one.answered - one.first + 1 for one in ask(emulate, case)]
     assert max(needed) <= case.most
-    if case is CASES["worst"]:  # from its beginning on, so that no smaller number would do
+    if case is CASES["worst"]:  # here the bound is reached
         assert needed[0] == case.most
 
 
-def test_without_a_cap_it_does_not(emulate: Emulate) -> None:
+def test_without_a_cap_the_number_of_tries_exceeds_the_bound(emulate: Emulate) -> None:
     needed = [one.answered - one.first + 1 for one in ask(emulate, UNCAPPED)]
     assert needed[0] > UNCAPPED.most
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_so_many_tries_are_enough_wherever_one_begins(case: Case) -> None:
+def test_the_bound_on_tries_holds_from_any_question_on(case: Case) -> None:
     expected = list(islice(answered(case), 20_000))
     runs = [len(list(run)) for got, run in groupby(expected) if not got]
     assert max(runs) == case.most - 1

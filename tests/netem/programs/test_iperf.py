@@ -1,4 +1,4 @@
-"""What iperf3 reports of a stream is what the emulator says that it did to it."""
+"""iperf3's report on a stream agrees with the emulator's record."""
 
 import asyncio
 import shutil
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.skipif(shutil.which("iperf3") is None, reason="iperf3 i
 SIZE = ("--length", "200")
 STREAMS = 2
 ATTEMPTS = 3
-"""At a jitter, which a machine that stalls adds to."""
+"""Attempts to measure a jitter, because a stall of the machine adds jitter."""
 
 
 class Ran(NamedTuple):
@@ -57,8 +57,8 @@ def run(emulate: Emulate, words: Sequence[str], *options: str) -> Ran:
 
 
 @pytest.mark.parametrize("reverse", [False, True], ids=["forward", "reverse"])
-def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, reverse: bool) -> None:
-    # The first datagram of a stream opens it: iperf3 does not repeat it.
+def test_iperf3_counts_the_emulators_drops_as_lost(emulate: Emulate, reverse: bool) -> None:
+    # The first datagram of a stream opens it, and iperf3 does not repeat it.
     words = ("--both", "loss 10% mansd 3 first")
     options = (*SIZE, "--bitrate", "1M", "--time", "1", "--parallel", str(STREAMS))
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
@@ -71,7 +71,7 @@ def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, rever
         assert of["flows"][stream]["client"] == f"{HOST}:{connected['local_port']}"
         fates = [row["fate"] for row in ran.emulator.fates(direction, flow=stream)]
         counts = ran.iperf.counts(stream, reverse)
-        # Its receiver stops when it hears by TCP that all is sent, and may leave some unread.
+        # iperf3's receiver stops at the end message over TCP and may leave datagrams unread.
         assert len(fates) / 2 < counts.newest < len(fates)
         assert fates[0] != Fate.DROPPED
         assert fates[counts.newest] != Fate.DROPPED
@@ -82,9 +82,7 @@ def test_iperf3_counts_as_lost_what_the_emulator_dropped(emulate: Emulate, rever
 
 
 @pytest.mark.parametrize("reverse", [False, True], ids=["forward", "reverse"])
-def test_iperf3_sees_the_order_in_which_the_emulator_lets_out(
-    emulate: Emulate, reverse: bool
-) -> None:
+def test_iperf3_reports_the_packet_order_of_the_emulator(emulate: Emulate, reverse: bool) -> None:
     words = ("--both", "delay 10ms reorder 20% loss 5% duplicate 3% mansd 5 first")
     options = (*SIZE, "--bitrate", "1M", "--time", "1")
     ran = run(emulate, words, *options, *(["--reverse"] if reverse else []))
@@ -110,12 +108,12 @@ def test_iperf3_sees_the_order_in_which_the_emulator_lets_out(
     assert told.out_of_order > 50
 
 
-def test_iperf3_measures_the_jitter_that_the_emulator_makes(emulate: Emulate) -> None:
+def test_iperf3_measures_the_jitter_of_the_emulator(emulate: Emulate) -> None:
     for _ in range(ATTEMPTS):
         ran = run(emulate, ["delay 20ms 5ms"], *SIZE, "--bitrate", "160k", "--time", "1")
         departures = ran.emulator.departures("forward")
         read = list(counted(departures)).index(ran.iperf.counts(0, reverse=False)) + 1
-        # RFC 3550, A.8, of the delays that were decided; iperf3's own times add to them.
+        # RFC 3550, A.8, for the decided delays; iperf3's own processing times add to them.
         jitter_ns = 0.0
         for before, after in pairwise(departures[1:read]):
             jitter_ns += (abs(after.delay_ns - before.delay_ns) - jitter_ns) / 16

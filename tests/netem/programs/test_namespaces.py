@@ -1,6 +1,6 @@
-"""Client, emulator and server in three network namespaces, with addresses of their own.
+"""Client, emulator and server in three network namespaces with separate addresses.
 
-There is no other way from client to server: nobody forwards packets.
+Without IP forwarding, packets reach the server only through the emulator.
 """
 
 import errno
@@ -29,10 +29,10 @@ ROLES = ("client", "emulator", "server")
 
 
 class Side(NamedTuple):
-    """Addresses of one network between two namespaces, by version of IP."""
+    """Addresses of the network between two namespaces, by IP version."""
 
     clients: Sequence[str]
-    """Of the side that sends first: two."""
+    """Two addresses of the side that sends first."""
     servers: str
 
 
@@ -45,13 +45,13 @@ WIDTH = {4: 24, 6: 64}
 
 
 class Namespaces:
-    """Three namespaces in a row, joined by two pairs of devices."""
+    """Three namespaces in a line, connected by two pairs of devices."""
 
     def __init__(self) -> None:
         self._names = {role: f"noack-{os.getpid()}-{role}" for role in ROLES}
 
     def inside(self, role: str) -> tuple[str, ...]:
-        """Begin of a command line that runs another in a namespace."""
+        """Return the command prefix that runs a command in a namespace."""
         return ("ip", "netns", "exec", self._names[role])
 
     def make(self) -> None:
@@ -109,7 +109,7 @@ def url(host: str, port: int) -> str:
 
 @pytest.mark.parametrize("there", [4, 6], ids=["to IPv4", "to IPv6"])
 @pytest.mark.parametrize("here", [4, 6], ids=["from IPv4", "from IPv6"])
-def test_each_client_address_is_a_flow_with_a_way_back(
+def test_each_client_address_is_a_flow_with_a_reverse_direction(
     namespaces: Namespaces, emulate: Emulate, here: int, there: int
 ) -> None:
     outer, inner = OUTER[here], INNER[there]
@@ -154,7 +154,7 @@ def test_each_client_address_is_a_flow_with_a_way_back(
         back_fates = [row["fate"] for row in emulator.fates("reverse", flow["flow"])]
         passed = [f"{address} {n}" for n, fate in enumerate(there_fates) if fate in LET_OUT]
         of_server = [one for one in seen if one[2].startswith(f"{address} ")]
-        # The server sees the emulator, at a port for each client, and what the emulator let out.
+        # The server receives the forwarded datagrams from the emulator, one port per client.
         assert [text for _, _, text in of_server] == passed
         sources = {(host, port) for host, port, _ in of_server}
         assert len(sources) == 1
@@ -170,7 +170,7 @@ def test_each_client_address_is_a_flow_with_a_way_back(
     assert len(seen) == link["forward"]["forwarded"]
 
 
-# It holds less than comes, for seconds.
+# For seconds, this queue is smaller than the number of arriving packets.
 SLOW_LINE = ["tbf", "rate", "800kbit", "burst", "80kb", "limit", "160kb"]
 MANY = 3000
 QUEUE_FULL = os.strerror(errno.ENOBUFS)
@@ -178,7 +178,7 @@ QUEUE_FULL = os.strerror(errno.ENOBUFS)
 
 @pytest.fixture
 def slow_line(namespaces: Namespaces) -> Iterator[Callable[[], int]]:
-    """A queue on the way from emulator to server; tells how many datagrams are in it."""
+    """Install a slow queue from emulator to server; return a function that reads its length."""
     tc = (*namespaces.inside("emulator"), "tc")
     if shutil.which("tc") is None:
         pytest.skip("tc (iproute2) is not installed")
@@ -198,7 +198,7 @@ def slow_line(namespaces: Namespaces) -> Iterator[Callable[[], int]]:
 
 
 def unread(namespaces: Namespaces, version: int, port: int) -> int:
-    """Bytes that have come to a port of the emulator, and that it has not taken yet."""
+    """Return the number of received bytes that the emulator has not read yet from a port."""
     table = "/proc/net/udp" if version == 4 else "/proc/net/udp6"
     rows = subprocess.check_output([*namespaces.inside("emulator"), "cat", table], text=True)
     for row in rows.splitlines()[1:]:
@@ -212,14 +212,14 @@ def unread(namespaces: Namespaces, version: int, port: int) -> int:
 @pytest.mark.parametrize(
     "options", [(), ("--one-way",), ("--segment",), ("--engine", "plain")], ids=" ".join
 )
-def test_what_a_full_queue_on_the_way_out_refuses_is_counted(
+def test_packets_refused_by_a_full_output_queue_are_counted(
     namespaces: Namespaces,
     slow_line: Callable[[], int],
     emulate: Emulate,
     version: int,
     options: Sequence[str],
 ) -> None:
-    """Every datagram is in one counter, and the guarantee is not said to hold."""
+    """Every datagram is in one counter, and the emulator does not claim the guarantee."""
     outer, inner = OUTER[version], INNER[version]
     with subprocess.Popen(
         [*namespaces.inside("server"), sys.executable, str(ECHO), "count", inner.servers],
@@ -232,7 +232,7 @@ def test_what_a_full_queue_on_the_way_out_refuses_is_counted(
                 listen=url(outer.servers, 0), inside=namespaces.inside("emulator"),
             )  # fmt: skip
             send = [sys.executable, str(ECHO), "send", outer.servers, str(emulator.port), str(MANY)]
-            # From the emulator's own side, where nothing is lost before it.
+            # From the emulator's namespace: no packet is lost before the emulator.
             subprocess.run([*namespaces.inside("emulator"), *send], check=True, timeout=60)
             while unread(namespaces, version, emulator.port):
                 time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""QUIC through everything at once: what arrives is what was sent."""
+"""QUIC delivers its content unchanged through all impairments together."""
 
 import asyncio
 import datetime
@@ -23,7 +23,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture
 def certificate(tmp_path: Path) -> tuple[Path, Path]:
-    """A certificate for localhost, signed by itself, and its key."""
+    """A self-signed certificate for localhost and its key."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
     now = datetime.datetime.now(datetime.UTC)
@@ -50,7 +50,7 @@ def certificate(tmp_path: Path) -> tuple[Path, Path]:
     return files
 
 
-def test_content_comes_through_unchanged_both_ways(
+def test_content_arrives_unchanged_in_both_directions(
     emulate: Emulate, certificate: tuple[Path, Path]
 ) -> None:
     content = np.random.default_rng(0).bytes(CONTENT_BYTES)

@@ -10,7 +10,7 @@ from noack.impairments.loss_models.bernoulli import BernoulliLoss
 
 
 @pytest.mark.parametrize("p", [0.02, 0.3, 0.8])
-def test_it_loses_at_its_rate_and_without_memory(
+def test_losses_are_independent_and_have_the_given_rate(
     decide: Any, share_is: Callable[..., None], p: float
 ) -> None:
     lost = decide([LossOf(loss=BernoulliLoss(probability=p))], 400_000).fates == 1
@@ -24,7 +24,7 @@ def test_it_loses_at_its_rate_and_without_memory(
 def test_under_a_cap_the_rate_is_the_predicted_one(
     decide: Any, share_is: Callable[..., None], p: float, mansd: int
 ) -> None:
-    """p (1 − pᵐ)/(1 − pᵐ⁺¹): from delivery to delivery Σ pᵏ, k = 1 … m, are lost."""
+    """p (1 − pᵐ)/(1 − pᵐ⁺¹): between two deliveries, Σ pᵏ packets are lost, k = 1 … m."""
     loss = LossOf(loss=BernoulliLoss(probability=p))
     decided = decide(LinkSettings(impairments=(loss,), mansd=mansd), 400_000)
     lost = decided.fates == 1
@@ -33,6 +33,6 @@ def test_under_a_cap_the_rate_is_the_predicted_one(
         share_is(decided.fates == 2, p)
     else:
         share_is(lost, p * (1 - p**mansd) / (1 - p ** (mansd + 1)))
-    # The cap overrules the model; it changes nothing else about it.
+    # The cap overrides the loss model and does not change its other draws.
     freely = decide([loss], 400_000).fates == 1
     np.testing.assert_array_equal(decided.fates != 0, freely)

@@ -1,4 +1,4 @@
-"""Against the definition, to the nanosecond: begin ≤ t < end."""
+"""Compare blackouts with their definition, to the nanosecond: begin ≤ t < end."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ def test_every_packet_is_lost_from_begin_until_just_before_end(
         intervals_s=tuple((a * 1e-6, b * 1e-6) for a, b in intervals),
         every_s=None if period is None else period * 1e-6,
     )
-    other = Blackout(intervals_s=((10.0, 11.0),))  # so that the table does not begin at 0
+    other = Blackout(intervals_s=((10.0, 11.0),))  # so that the interval's table offset is not 0
     link = Link(LinkSettings(impairments=(other, blackout)), 0, "a")
     borders_ns = [1000 * t for t in range(200)]
     for t_ns in sorted({*borders_ns, *(t - 1 for t in borders_ns[1:])}):

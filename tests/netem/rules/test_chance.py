@@ -1,4 +1,4 @@
-"""Correlated chances keep their probability; how alike neighbours are, by a closed form."""
+"""Correlated losses keep their probability; joint probabilities match a closed form."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +19,7 @@ def lost(decide: Any, p: float, correlation: float, seed: int = 0) -> Any:
 
 
 def both(p: float, correlation: float) -> float:
-    """P(z₁ > t, z₂ > t) for bivariate normal z of a correlation, with P(z > t) = p."""
+    """P(z₁ > t, z₂ > t) for bivariate normal z with this correlation, where P(z > t) = p."""
     t = stats.norm.ppf(p)
     normal = stats.multivariate_normal(cov=np.array([[1, correlation], [correlation, 1]]))
     return float(normal.cdf([t, t]))
@@ -32,12 +32,12 @@ def test_probability_and_correlation_are_exact(
 ) -> None:
     flags = lost(decide, p, correlation)
     share_is(flags, p)
-    for lag in (1, 2, 3):  # autoregressive: the latent correlation at lag k is its kth power
+    for lag in (1, 2, 3):  # AR(1): the latent correlation at lag k is ρᵏ
         share_is(flags[lag:] & flags[:-lag], both(p, correlation**lag))
 
 
-def test_the_first_datagram_has_the_probability_too(decide: Any) -> None:
-    """The latent process begins stationary: over many flows, not over time."""
+def test_the_first_datagram_has_the_same_loss_probability(decide: Any) -> None:
+    """The latent process starts in its stationary distribution (average over many flows)."""
     loss = LossOf(loss=BernoulliLoss(probability=0.2, correlation=0.95))
     flows = np.tile(np.arange(20_000), 2)
     fates = decide([loss], len(flows), flows=flows).fates.reshape(2, -1)
@@ -46,6 +46,6 @@ def test_the_first_datagram_has_the_probability_too(decide: Any) -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.999])
-def test_never_and_always_are_exact(decide: Any, correlation: float) -> None:
+def test_probabilities_0_and_1_are_exact(decide: Any, correlation: float) -> None:
     assert not lost(decide, 0.0, correlation).any()
     assert lost(decide, 1.0, correlation).all()

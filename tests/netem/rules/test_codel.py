@@ -1,4 +1,4 @@
-"""Against the pseudocode of RFC 8289, Section 5, on a queue that is simulated event by event."""
+"""Compare CoDel with the pseudocode of RFC 8289, Section 5, on an event-driven queue."""
 
 import math
 from collections import deque
@@ -21,7 +21,7 @@ from noack.impairments.link_settings import LinkSettings
 
 MS = 10**6
 RATE_BPS = 8_000_000
-"""A byte takes 1 µs."""
+"""Sending a byte takes 1 µs."""
 PER_BYTE_NS = 1000
 
 
@@ -123,7 +123,7 @@ def behind(mtu_bytes: int) -> Callable[[Reference, Packet, int], bool]:
 def reference(
     arrivals: Sequence[tuple[int, int]], codel: Codel, spare: Any, mansd: int | None = None
 ) -> list[int | None]:
-    """When each packet leaves, None if it is dropped; arrivals are (ns, bytes), ascending."""
+    """Return departures in ns, None if dropped; arrivals are (ns, bytes), ascending."""
     leaves_ns: dict[int, int | None] = {}
 
     def must_pass(number: int) -> bool:
@@ -185,8 +185,8 @@ def test_any_arrivals_and_any_cap(
     assert emulated(arrivals, codel, mansd) == reference(arrivals, codel, ahead(100), mansd)
 
 
-def test_under_a_standing_queue_the_rule_for_the_mtu_is_the_rfcs() -> None:
-    """Until the burst ends: then the RFC spares its last packets."""
+def test_under_a_standing_queue_the_mtu_rule_is_that_of_the_rfc() -> None:
+    """Until the burst ends; the RFC's rule does not drop the last packets of a burst."""
     arrivals, codel = [(k * 500_000, 1000) for k in range(4000)], Codel()
     found, of_rfc = emulated(arrivals, codel), reference(arrivals, codel, behind(1500))
     last = max(k for k in range(4000) if (of_rfc[k] or 0) <= arrivals[-1][0])
@@ -200,7 +200,7 @@ def test_drops_are_spaced_by_the_interval_over_the_root_of_their_number() -> Non
     leaves_ns = emulated(arrivals, Codel())
     dropped = [k for k, t_ns in enumerate(leaves_ns) if t_ns is None]
     at_ns = [max(t for t in leaves_ns[:k] if t is not None) for k in dropped[:40]]
-    # Above the target from the first packet on that waits 5 ms, i.e. the 11th, for 100 ms.
+    # The 11th packet is the first that waits 5 ms; the delay then exceeds the target for 100 ms.
     assert at_ns[0] == pytest.approx(10 * MS + 100 * MS, abs=MS)
     due_ns = at_ns[0] + np.cumsum([100 * MS / math.sqrt(n) for n in range(1, 40)])
     assert np.all(np.abs(np.array(at_ns[1:]) - due_ns) <= 1.5 * MS)  # a packet takes 1 ms

@@ -40,21 +40,21 @@ def test_nothing_in_an_empty_payload_can_be_corrupted(decide: Any) -> None:
     assert decided.fates.tolist() == [0, 3] * 50
 
 
-def test_what_must_arrive_is_not_corrupted(decide: Any) -> None:
+def test_packets_that_must_pass_are_not_corrupted(decide: Any) -> None:
     settings = LinkSettings(impairments=(Corrupt(probability=1.0),), mansd=2, first_delivered=True)
     decided = decide(settings, 9)
     assert decided.fates.tolist() == [2, 3, 3] * 3
     assert ((decided.verdicts["bit"] < 0) == (decided.fates == 2)).all()
 
 
-def test_copies_are_corrupted_on_their_own(decide: Any, share_is: Callable[..., None]) -> None:
-    """After the copying, that is; before it both carry the same flipped bit."""
+def test_copies_are_corrupted_independently(decide: Any, share_is: Callable[..., None]) -> None:
+    """If corruption comes after duplication. Otherwise both carry the same flipped bit."""
     after = decide([Duplicate(probability=1.0), Corrupt(probability=0.4)], 200_000).verdicts
     first, second = after["bit"] >= 0, after["copy_bit"] >= 0
     share_is(first, 0.4)
     share_is(second, 0.4)
     share_is(first & second, 0.16)
-    # An intact copy delivers what it is a copy of.
+    # An intact copy counts as delivery of the original.
     np.testing.assert_array_equal(after["fate"] == 3, first & second)
     before = decide([Corrupt(probability=0.4), Duplicate(probability=1.0)], 1000).verdicts
     np.testing.assert_array_equal(before["bit"], before["copy_bit"])

@@ -1,6 +1,6 @@
-"""Each shape against SciPy's distribution, by Kolmogorov and Smirnov; correlations by closed form.
+"""Kolmogorov–Smirnov tests of each shape against SciPy; correlations against closed forms.
 
-Seeds are fixed; a p-value of 1e-4 would be met by chance once in ten thousand such tests.
+Seeds are fixed. With random seeds, one in ten thousand such tests would give a p-value below 1e-4.
 """
 
 from typing import Any
@@ -33,16 +33,16 @@ def delays(decide: Any, *before: Any, count: int = COUNT, seed: int = 0, **delay
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
 def test_the_distribution_is_the_named_one(decide: Any, shape: str, correlation: float) -> None:
     found = delays(decide, distribution=shape, correlation=correlation)
-    random_part = (found + 0.5 - FIXED_NS) / JITTER_NS  # whole nanoseconds are cut
+    random_part = (found + 0.5 - FIXED_NS) / JITTER_NS  # delays are truncated to whole nanoseconds
     thinned = random_part[:: 1 if correlation == 0 else 20]  # 0.6²⁰: independent
     assert stats.kstest(thinned, SHAPES[shape].cdf).pvalue > 1e-4
 
 
 @pytest.mark.parametrize("shape", [*SHAPES, "paretonormal"])
 def test_mean_and_deviation(decide: Any, shape: str) -> None:
-    """Mean 0; the jitter is the standard deviation, and the half-width of a uniform one.
+    """Mean 0; the jitter is the standard deviation, or the half-width for a uniform shape.
 
-    Of batches, as the fourth moment of Pareto's distribution is infinite.
+    The test uses batches, because the Pareto distribution has an infinite fourth moment.
     """
     random_part = (delays(decide, distribution=shape) - FIXED_NS) / JITTER_NS
     deviation = 1 / np.sqrt(3) if shape == "uniform" else 1.0
@@ -50,13 +50,13 @@ def test_mean_and_deviation(decide: Any, shape: str) -> None:
     assert random_part.std() == pytest.approx(deviation, rel=0.05 if "pareto" in shape else 0.01)
 
 
-def test_the_mixture_is_one_of_quantiles() -> None:
-    """N/4 + 3P/4 of the same u, brought to standard deviation 1: against quadrature."""
+def test_the_mixture_combines_quantiles() -> None:
+    """N/4 + 3P/4 of the same u, scaled to standard deviation 1, compared with quadrature."""
 
     def mixed(u: float) -> float:
         return float(stats.norm.ppf(u) / 4 + PARETO.ppf(u) * 3 / 4)
 
-    def square_at(z: float) -> float:  # over normal scores, where the integrand is smooth
+    def square_at(z: float) -> float:  # in normal scores the integrand is smooth
         tail = stats.norm.sf(z)
         value = z / 4 + PARETO.isf(tail) * 3 / 4
         return float(value**2 * stats.norm.pdf(z))
@@ -74,8 +74,8 @@ def test_a_constant_delay_is_exact(decide: Any, fixed_ns: int) -> None:
     assert (delays(decide, delay_s=fixed_ns / 1e9, jitter_s=0.0, count=10) == fixed_ns).all()
 
 
-def test_observed_delays_are_drawn_by_their_quantiles(decide: Any) -> None:
-    """The distribution whose quantiles are NumPy's of the sample, in any order."""
+def test_observed_delays_have_the_quantiles_of_the_sample(decide: Any) -> None:
+    """The delays have NumPy's quantiles of the sample, in any order of the sample."""
     sample_ns = np.random.default_rng(4).gamma(2.0, 3e6, 57)
     sample_ns[:4] = sample_ns[4]  # an atom
     found = delays(decide, jitter_s=0.0, distribution="empirical", samples_s=tuple(sample_ns / 1e9))
@@ -95,7 +95,7 @@ def test_a_sample_of_two_is_uniform_between_them(decide: Any) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_no_delay_is_below_zero(decide: Any, shape: str) -> None:
-    """What would be is none at all; the others keep their distribution."""
+    """A negative delay becomes 0; positive delays keep their distribution."""
     found = delays(decide, delay_s=0.0005, distribution=shape)
     none = SHAPES[shape].cdf(-0.25)
     assert found.min() == 0
@@ -109,18 +109,18 @@ def test_no_delay_is_below_zero(decide: Any, shape: str) -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("correlation", [0.3, 0.9])
 def test_successive_delays_are_correlated(decide: Any, shape: str, correlation: float) -> None:
-    """Their normal scores, that is: an autoregressive process of order one."""
+    """Their normal scores are an autoregressive process of order one."""
     found = delays(decide, distribution=shape, correlation=correlation)
     u = SHAPES[shape].cdf((found + 0.5 - FIXED_NS) / JITTER_NS)
     z = stats.norm.ppf(u)
-    # Bartlett: variance of the measured autocorrelation of such a process.
+    # Bartlett: variance of the measured autocorrelation of an AR(1) process.
     error = np.sqrt((1 + correlation**2) / (1 - correlation**2) / COUNT)
     for lag in (1, 2, 3):
         measured = np.mean(z[lag:] * z[:-lag]) / np.mean(z * z)
         assert abs(measured - correlation**lag) < 5 * error
 
 
-def test_flows_have_delays_of_their_own(decide: Any) -> None:
+def test_flows_have_independent_delays(decide: Any) -> None:
     flows = np.arange(COUNT) % 2
     delay = Delay(delay_s=0.05, jitter_s=0.002, distribution="normal", correlation=0.5)
     one, other = decide([delay], COUNT, flows=flows).delays_ns.reshape(-1, 2).T
@@ -129,21 +129,21 @@ def test_flows_have_delays_of_their_own(decide: Any) -> None:
 
 @pytest.mark.parametrize("of_loss", [-1.0, -0.4, 0.7, 1.0])
 @pytest.mark.parametrize("correlation", [0.0, 0.5])
-def test_delays_know_of_the_losses(decide: Any, of_loss: float, correlation: float) -> None:
-    """E[z; lost] = −ρ φ(Φ⁻¹(p))…: what survives has mean score −ρ φ(t)/(1 − p), P(s > t) = p."""
+def test_delays_are_correlated_with_losses(decide: Any, of_loss: float, correlation: float) -> None:
+    """Surviving packets have the mean score −ρ φ(t)/(1 − p), with P(s > t) = p."""
     p = 0.3
     loss = LossOf(loss=BernoulliLoss(probability=p, correlation=correlation))
     found = delays(decide, loss, distribution="normal", loss_correlation=of_loss)
     z = (found + 0.5 - FIXED_NS) / JITTER_NS
     expected = -of_loss * stats.norm.pdf(stats.norm.ppf(p)) / (1 - p)
     assert abs(z.mean() - expected) < 5 * np.sqrt(3 / len(z))  # (1 + 0.5)/(1 − 0.5) = 3
-    if of_loss == 1.0:  # the delay says all about the luck: those that survive had the least
+    if of_loss == 1.0:  # the delay determines the loss: survivors have the smallest scores
         threshold = stats.norm.isf(p)
         assert z.max() <= threshold + 1e-6
 
 
-def test_without_losses_the_distribution_stays(decide: Any) -> None:
-    """A loss of probability 0 tells how bad times are, too; Gilbert and Elliott's as well."""
+def test_a_loss_of_probability_0_does_not_change_the_distribution(decide: Any) -> None:
+    """A loss of probability 0 has a latent state, too; the same holds for Gilbert–Elliott."""
     calm = GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.0)
     for loss in (BernoulliLoss(probability=0.0), calm):
         found = delays(
@@ -153,18 +153,20 @@ def test_without_losses_the_distribution_stays(decide: Any) -> None:
         assert stats.kstest(thinned, stats.norm.cdf).pvalue > 1e-4
 
 
-def test_the_bad_state_is_late(decide: Any) -> None:
-    """With correlation 1 the delay of what survives in the bad state is among the worst quarter."""
+def test_packets_in_the_bad_state_have_long_delays(decide: Any) -> None:
+    """With correlation 1, packets that survive the bad state have delays in the top quarter."""
     chain = GilbertElliottLoss(good_to_bad=0.1, bad_to_good=0.3, loss_in_bad=0.5)
     found = delays(decide, LossOf(loss=chain), distribution="uniform", loss_correlation=1.0)
-    late = (found - FIXED_NS) / JITTER_NS > 0.5  # the upper quarter of uniform within ± 1
+    late = (
+        found - FIXED_NS
+    ) / JITTER_NS > 0.5  # the upper quarter of the uniform distribution on ± 1
     survive_bad, survive_good = 0.25 * 0.5, 0.75
     expected = survive_bad / (survive_bad + survive_good)
-    # Successive ones are correlated by the chain: 1 − p − r = 0.6, which widens the error twofold.
+    # The chain correlates successive delays: 1 − p − r = 0.6 doubles the standard error.
     assert abs(late.mean() - expected) < 10 * np.sqrt(expected * (1 - expected) / len(found))
 
 
-def test_a_copy_draws_its_own_delay_and_moves_no_other(decide: Any) -> None:
+def test_a_copy_draws_its_own_delay_and_changes_no_other_delay(decide: Any) -> None:
     delay = Delay(delay_s=0.05, jitter_s=0.002, distribution="normal", correlation=0.7)
     alone = decide([delay], COUNT).verdicts
     doubled = decide([Duplicate(probability=0.5), delay], COUNT).verdicts
@@ -172,7 +174,7 @@ def test_a_copy_draws_its_own_delay_and_moves_no_other(decide: Any) -> None:
     np.testing.assert_array_equal(alone["release_ns"][~copied], doubled["release_ns"][~copied])
     own = alone["release_ns"][copied]
     first, second = doubled["release_ns"][copied], doubled["copy_ns"][copied]
-    assert ((own == first) | (own == second)).all()  # the earlier of the two goes first
+    assert ((own == first) | (own == second)).all()  # the earlier of the two is the first
     arrivals = np.arange(COUNT)[copied] * 1000
     copy = np.where(own == first, second, first) - arrivals
     z = (copy + 0.5 - FIXED_NS) / JITTER_NS

@@ -17,7 +17,7 @@ def test_a_share_is_sent_twice(decide: Any, share_is: Callable[..., None]) -> No
     assert (decided.verdicts["copy_ns"] == np.where(copied, decided.arrivals_ns, -1)).all()
 
 
-def test_what_is_lost_has_no_copy(decide: Any) -> None:
+def test_a_lost_packet_has_no_copy(decide: Any) -> None:
     loss = LossOf(loss=BernoulliLoss(probability=0.5))
     for order in ((loss, Duplicate(probability=1.0)), (Duplicate(probability=1.0), loss)):
         decided = decide(order, 1000)
@@ -25,10 +25,10 @@ def test_what_is_lost_has_no_copy(decide: Any) -> None:
         assert 0 < np.count_nonzero(decided.fates) < 1000
 
 
-def test_the_earlier_of_the_two_is_the_first(decide: Any) -> None:
+def test_the_earlier_of_original_and_copy_leaves_first(decide: Any) -> None:
     delay = Delay(delay_s=0.01, jitter_s=0.005)
     decided = decide([Duplicate(probability=1.0), delay], 100_000)
     first, second = decided.verdicts["release_ns"], decided.verdicts["copy_ns"]
     assert (first <= second).all()
-    # Two independent uniform delays are a third of their range apart, on average.
+    # The mean difference of two independent uniform delays is a third of their range.
     assert abs(np.mean(second - first) / 10_000_000 - 1 / 3) < 0.005

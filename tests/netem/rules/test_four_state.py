@@ -1,4 +1,4 @@
-"""Against the chain's stationary distribution and its powers, by linear algebra."""
+"""Compare with the chain's stationary distribution and matrix powers, by linear algebra."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ LOSES = np.array([False, False, True, True])
 
 
 def matrix(chain: FourStateLoss) -> Any:
-    """Row i: from state i + 1."""
+    """Return the transition matrix; row i contains the transitions from state i + 1."""
     c = chain
     return np.array(
         [
@@ -33,7 +33,7 @@ CHAINS = [
 
 
 @pytest.mark.parametrize("chain", CHAINS, ids=("two states", "all", "full rows"))
-def test_it_loses_as_the_chain_says(
+def test_losses_follow_the_chain(
     decide: Any, share_is: Callable[..., None], chain: FourStateLoss
 ) -> None:
     lost = decide([LossOf(loss=chain)], 1_000_000).fates == 1
@@ -47,8 +47,8 @@ def test_it_loses_as_the_chain_says(
         share_is(lost[lag:] & lost[:-lag], float(together))
 
 
-def test_it_begins_in_a_gap_and_moves_before_each_datagram(decide: Any) -> None:
-    """P(the k-th of a flow is lost) = e₁ Pᵏ⁺¹, over many flows."""
+def test_the_chain_begins_in_the_gap_state_and_moves_before_each_datagram(decide: Any) -> None:
+    """The distribution of the k-th packet's state is e₁ Pᵏ⁺¹ (average over many flows)."""
     chain, flows, steps = CHAINS[1], 20_000, 4
     order = np.tile(np.arange(flows), steps)
     fates = decide([LossOf(loss=chain)], len(order), flows=order).fates.reshape(steps, flows)

@@ -1,4 +1,4 @@
-"""Against the closed forms of the chain's stationary behaviour."""
+"""Compare with closed forms of the chain's stationary behaviour."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ def lost(decide: Any, chain: GilbertElliottLoss, count: int = 400_000, **more: A
 
 
 def burst_lengths(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Lengths of the runs of losses that have both begun and ended."""
+    """Return the lengths of the complete loss bursts."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags]).astype(np.int8)))
     pairs = edges[: len(edges) // 2 * 2].reshape(-1, 2)
     return np.asarray(pairs[:, 1] - pairs[:, 0])
@@ -28,18 +28,18 @@ def burst_lengths(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
 def test_bursts_last_as_long_as_the_bad_state(
     decide: Any, share_is: Callable[..., None], p: float, r: float
 ) -> None:
-    """Nothing lost in the good state, all in the bad: bursts are geometric with mean 1/r."""
+    """No loss in the good state, all lost in the bad state: bursts are geometric, mean 1/r."""
     flags = lost(decide, GilbertElliottLoss(good_to_bad=p, bad_to_good=r))
     share_is(flags, p / (p + r))
     bursts = burst_lengths(flags)
-    error = np.sqrt(1 - r) / r / np.sqrt(len(bursts))  # bursts are independent of each other
+    error = np.sqrt(1 - r) / r / np.sqrt(len(bursts))  # bursts are independent
     assert abs(bursts.mean() - 1 / r) <= ERRORS * error
-    # Geometric, not merely of that mean: P(length = 1) = r.
+    # Check the geometric distribution beyond its mean: P(length = 1) = r.
     assert abs(np.mean(bursts == 1) - r) <= ERRORS * np.sqrt(r * (1 - r) / len(bursts))
 
 
 def test_both_states_may_lose_some(decide: Any, share_is: Callable[..., None]) -> None:
-    """Rate π₁λ₁ + π₂λ₂; P(lost, then not) = π Λ P (1 − Λ) 1, which fixes the mean burst."""
+    """Rate π₁λ₁ + π₂λ₂; P(lost, then not) = π Λ P (1 − Λ) 1 determines the mean burst."""
     p, r = 0.1, 0.3
     rates = np.array([0.05, 0.6])
     chain = GilbertElliottLoss(good_to_bad=p, bad_to_good=r, loss_in_good=0.05, loss_in_bad=0.6)
@@ -61,7 +61,7 @@ def test_mean_loss_and_mean_burst(
 
 
 def test_the_chain_starts_in_the_good_state(decide: Any) -> None:
-    """It moves before each datagram, so that the first of a flow is lost with probability p."""
+    """The chain moves before each datagram, so the first datagram is lost with probability p."""
     chain = GilbertElliottLoss(good_to_bad=0.2, bad_to_good=0.01)
     first = lost(decide, chain, 20_000, flows=np.arange(20_000))
     assert abs(first.mean() - 0.2) <= ERRORS * np.sqrt(0.2 * 0.8 / len(first))

@@ -1,4 +1,4 @@
-"""Against SciPy's normal distribution."""
+"""Compare with SciPy's normal distribution."""
 
 import math
 
@@ -12,7 +12,7 @@ HALF = np.concatenate([np.geomspace(2.0**-54, 0.4999, 4000), np.linspace(0.001, 
 
 
 def test_the_score_is_the_quantile() -> None:
-    """Both branches of the tail and the middle; the upper half by symmetry where that is exact."""
+    """Both tail branches and the middle; the upper half by symmetry where that is exact."""
     found = np.array([score(u) for u in HALF.tolist()])
     np.testing.assert_allclose(found, ndtri(HALF), rtol=1e-14, atol=1e-16)
     upper = 1.0 - HALF[HALF > 2.0**-53]
@@ -22,18 +22,18 @@ def test_the_score_is_the_quantile() -> None:
 
 
 def test_the_distribution_function() -> None:
-    """Relative error 1e-14, besides what the argument's rounding does: a relative z² ulps."""
+    """Relative error 1e-14 plus the effect of the argument's rounding, z² ulps."""
     z = np.linspace(-8.3, 8.3, 5001)
     found = np.array([cdf(value) for value in z.tolist()])
     assert (np.abs(found / ndtr(z) - 1) <= 1e-15 * (2 + z**2)).all()
 
 
-def test_one_is_the_inverse_of_the_other() -> None:
+def test_the_score_is_the_inverse_of_the_distribution_function() -> None:
     for u in np.linspace(0.0005, 0.9995, 1999).tolist():
         assert cdf(score(u)) == pytest.approx(u, rel=2e-15)
 
 
-def test_the_ends_are_finite() -> None:
+def test_the_scores_of_0_and_1_are_finite() -> None:
     least, most = score(0.0), score(1.0)
     assert math.isfinite(least)
     assert most == -least

@@ -1,4 +1,4 @@
-"""Known answers, and what a test of statistics can find in the use that is made of them."""
+"""Known answers of Philox, and statistical tests of the random numbers that netem uses."""
 
 import itertools
 from typing import Any
@@ -20,7 +20,7 @@ DRAWS = 200_000
 
 @pytest.fixture(scope="module")
 def fill() -> Any:
-    """Two uniform numbers for each row of (key0, key1, flow, packet, block), compiled."""
+    """Return a compiled function: two uniform numbers per (key0, key1, flow, packet, block)."""
 
     def rows(places: Any, out: Any) -> None:
         for i in range(len(places)):
@@ -68,13 +68,13 @@ def test_uniform_numbers_are_the_words_of_the_counter(
     expected = tuple(((x << 32 | y) >> 11) / 2**53 for x, y in ((a, b), (c, d)))
     found = uniforms(key0, key1, flow, packet, block)
     assert all(0 <= u < 1 and u * 2**53 == int(u * 2**53) for u in found)
-    # The upper 27 bits are the first word's; the lower 26 are the upper ones of the second.
+    # Upper 27 bits: from the first word; lower 26 bits: the upper bits of the second word.
     for u, (x, y) in zip(found, ((a, b), (c, d)), strict=True):
         assert divmod(int(u * 2**53), 2**26) == (x >> 5, y >> 6)
     assert np.allclose(found, expected, rtol=0, atol=2**-27)
 
 
-def test_compiled_ones_are_the_same(fill: Any) -> None:
+def test_compiled_random_numbers_are_the_same(fill: Any) -> None:
     rng = np.random.default_rng(1)
     places = rng.integers(0, 2**32, (2000, 5))
     places[:, 3] = rng.integers(0, 2**63, 2000)
@@ -96,8 +96,8 @@ VARIED = {
 
 
 @pytest.mark.parametrize("places", VARIED.values(), ids=VARIED.keys())
-def test_they_are_uniform_and_independent(fill: Any, places: dict[str, Any]) -> None:
-    """χ² over 256 cells each, over 64 × 64 of a pair and of successive ones; lags 1 to 50."""
+def test_random_numbers_are_uniform_and_independent(fill: Any, places: dict[str, Any]) -> None:
+    """χ² over 256 cells, and over 64 × 64 cells for pairs and successive numbers; lags 1 to 50."""
     pair = drawn(fill, **places)
     for u in pair.T:
         assert stats.chisquare(np.histogram(u, 256, (0, 1))[0]).pvalue > 1e-6
@@ -109,8 +109,8 @@ def test_they_are_uniform_and_independent(fill: Any, places: dict[str, Any]) -> 
         assert stats.chisquare(cells).pvalue > 1e-6
 
 
-def test_neighbours_in_every_respect_are_uncorrelated(fill: Any) -> None:
-    """All pairs of streams whose key, flow and block differ by one."""
+def test_neighbouring_streams_are_uncorrelated(fill: Any) -> None:
+    """All pairs of streams that differ by one in key, flow or block."""
     packets = np.arange(20_000)
     streams = [
         column

@@ -1,4 +1,4 @@
-"""Against a queue in exact fractions, by Lindley's recursion, that knows all departures."""
+"""Compare with a queue in exact fractions, computed by Lindley's recursion."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -39,9 +39,9 @@ def bits(rate: Rate, size_bytes: int) -> int:
 
 
 def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[int | None]:
-    """When each leaves, cut to whole nanoseconds; None if the queue is full and it need not pass.
+    """Return departures in whole ns; None if the queue is full and the packet need not pass.
 
-    A forced one in a full queue shares the place of the last.
+    A forced packet in a full queue shares the last place.
     """
     free = Fraction(0)
     waiting: list[int] = []
@@ -51,7 +51,7 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
         if len(waiting) == rate.queue and not forced:
             found.append(None)
             continue
-        # Whole nanoseconds tell whether the line is still busy.
+        # The emulator compares in whole nanoseconds whether the line is busy.
         begin = free if int(free) >= t_ns else Fraction(t_ns)
         free = begin + Fraction(bits(rate, size_bytes) * NS, rate.rate_bps)
         if len(waiting) == rate.queue:
@@ -72,7 +72,7 @@ def departures(rate: Rate, arrivals: Sequence[tuple[int, int, bool]]) -> list[in
 def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
     times = np.cumsum([step[0] for step in steps]).tolist()
     arrivals = [(t, size, forced) for t, (_, size, forced) in zip(times, steps, strict=True)]
-    other = Rate(rate_bps=1000, queue=3)  # so that the ring does not begin at 0
+    other = Rate(rate_bps=1000, queue=3)  # so that the ring buffer's offset is not 0
     program = program_of(LinkSettings(impairments=(other, rate)), 0, "a")
     state = empty_state(program)
     found: list[int | None] = []
@@ -85,8 +85,8 @@ def test_it_is_a_queue(rate: Rate, steps: list[tuple[int, int, bool]]) -> None:
 
 
 @pytest.mark.parametrize("rate_bps", [9_600, 999_983, 10**9 + 7])
-def test_in_the_long_run_the_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) -> None:
-    """A line that is never idle: the k-th leaves when all bits before are through."""
+def test_the_long_term_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) -> None:
+    """The line is never idle: packet k leaves when all bits up to it are sent."""
     count = 20_000
     sizes = np.random.default_rng(3).integers(0, 1500, count)
     rate = Rate(rate_bps=rate_bps, queue=count)
@@ -96,8 +96,8 @@ def test_in_the_long_run_the_rate_is_exact_to_a_bit(decide: Any, rate_bps: int) 
     assert decided.verdicts["release_ns"].tolist() == expected
 
 
-def test_what_finds_the_queue_full_is_dropped(decide: Any) -> None:
-    """1 kB every ms through 4 Mbit/s: one in two has room once the queue is full."""
+def test_packets_that_arrive_at_a_full_queue_are_dropped(decide: Any) -> None:
+    """1 kB every ms through 4 Mbit/s: once the queue is full, it accepts every second packet."""
     rate = Rate(rate_bps=4_000_000, queue=10, overhead_bytes=0)
     arrivals = np.arange(10_000) * 10**6
     decided = decide([rate], 10_000, sizes_bytes=1000, arrivals_ns=arrivals)
@@ -107,8 +107,8 @@ def test_what_finds_the_queue_full_is_dropped(decide: Any) -> None:
     assert decided.delays_ns.max() <= 10 * 2 * 10**6
 
 
-def test_a_forced_one_has_its_turn_behind_a_full_queue(decide: Any) -> None:
-    rate = Rate(rate_bps=8_000, queue=2, overhead_bytes=0)  # 1 s each
+def test_a_forced_packet_leaves_after_a_full_queue(decide: Any) -> None:
+    rate = Rate(rate_bps=8_000, queue=2, overhead_bytes=0)  # 1 s per packet
     settings = LinkSettings(impairments=(rate,), mansd=2)
     decided = decide(settings, 8, sizes_bytes=1000, arrivals_ns=0)
     assert decided.fates.tolist() == [0, 0, 4, 4, 2, 4, 4, 2]
@@ -116,7 +116,7 @@ def test_a_forced_one_has_its_turn_behind_a_full_queue(decide: Any) -> None:
     assert leaving[decided.leaves].tolist() == [k * NS for k in (1, 2, 3, 4)]
 
 
-def test_what_is_lost_before_takes_no_time_and_after_it_does(decide: Any) -> None:
+def test_packets_lost_before_the_queue_use_no_line_time(decide: Any) -> None:
     rate = Rate(rate_bps=8_000, queue=100, overhead_bytes=0)
     lost = LossOf(loss=WorstCaseLoss())
     for impairments, last_s in (((lost, rate), 2), ((rate, lost), 5)):
@@ -126,7 +126,7 @@ def test_what_is_lost_before_takes_no_time_and_after_it_does(decide: Any) -> Non
         assert decided.verdicts["release_ns"][-1] == (last_s + (impairments[0] is lost)) * NS
 
 
-def test_copies_take_their_time_unless_the_original_found_no_room(decide: Any) -> None:
+def test_copies_use_line_time_unless_the_original_is_dropped(decide: Any) -> None:
     rate = Rate(rate_bps=8_000, queue=3, overhead_bytes=0)
     arrivals = np.array([0, 0, 0, NS, 10 * NS])
     decided = decide([Duplicate(probability=1.0), rate], 5, sizes_bytes=1000, arrivals_ns=arrivals)
@@ -136,8 +136,8 @@ def test_copies_take_their_time_unless_the_original_found_no_room(decide: Any) -
     assert (verdicts["copy_ns"] // NS).tolist() == [2, -1, -1, -1, 12]
 
 
-def test_however_many_must_pass_they_leave_at_a_time_that_there_is(decide: Any) -> None:
-    """Centuries of work, all of which must pass, at a rate of a bit per second."""
+def test_departures_of_forced_packets_stay_within_the_largest_time(decide: Any) -> None:
+    """At 1 bit/s, packets that must all pass queue up for centuries."""
     slow = Rate(rate_bps=1, queue=1, cell_bytes=1, cell_overhead_bytes=1000)
     decided = decide(LinkSettings(impairments=(slow,), mansd=0), 30, sizes_bytes=65_507)
     assert np.all(np.diff(decided.verdicts["release_ns"]) >= 0)

@@ -12,7 +12,7 @@ FIXED = Delay(delay_s=0.01)
 
 
 @pytest.mark.parametrize("gap", [1, 2, 5])
-def test_a_share_of_those_whose_turn_it_is_leaves_at_once(
+def test_reordered_packets_leave_at_once(
     decide: Any, share_is: Callable[..., None], gap: int
 ) -> None:
     decided = decide([FIXED, Reorder(probability=0.3, gap=gap)], 200_000)
@@ -23,18 +23,18 @@ def test_a_share_of_those_whose_turn_it_is_leaves_at_once(
     share_is(at_once[turns], 0.3)
 
 
-def test_certain_ones_are_every_gapth(decide: Any) -> None:
+def test_with_probability_1_one_packet_per_gap_is_reordered(decide: Any) -> None:
     decided = decide([FIXED, Reorder(gap=4)], 100)
     assert np.flatnonzero(decided.delays_ns == 0).tolist() == list(range(3, 100, 4))
 
 
-def test_only_delays_before_it_are_skipped(decide: Any) -> None:
+def test_only_delays_before_the_reorder_are_skipped(decide: Any) -> None:
     decided = decide([FIXED, Reorder(), Delay(delay_s=0.003)], 10)
     assert (decided.delays_ns == 3_000_000).all()
 
 
-def test_overtaking_is_counted_and_held_within_the_guarantee(decide: Any) -> None:
-    """Every fifth would overtake all four before it; under a cap of 2 it waits for the second."""
+def test_reordered_packets_are_held_back_for_the_guarantee(decide: Any) -> None:
+    """Every fifth packet would overtake four packets; with cap 2 it waits for the second one."""
     freely = decide(LinkSettings(impairments=(FIXED, Reorder(gap=5)), mansd=4), 50)
     assert freely.verdicts["makes_stale"].reshape(-1, 5).tolist() == [[0, 0, 0, 0, 4]] * 10
     capped = decide(LinkSettings(impairments=(FIXED, Reorder(gap=5)), mansd=2), 50)

@@ -1,4 +1,4 @@
-"""Losses that are written down, against sets."""
+"""Compare scripted and periodic losses with sets of packet numbers."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from noack.impairments.loss_models.worst_case import WorstCaseLoss
 
 
 def flags(loss: Loss, packets: Any) -> list[bool]:
-    """Which packets are lost; another script stands first, so that the table begins elsewhere."""
+    """Return which packets are lost; another script comes first, so the table offset is not 0."""
     other = LossOf(loss=ScriptedLoss(lost=(2**39, 2**39 + 1)))
     link = Link(LinkSettings(impairments=(other, LossOf(loss=loss))), 0, "a")
     link.decide(0, 1, 0)
@@ -30,7 +30,7 @@ def flags(loss: Loss, packets: Any) -> list[bool]:
 
 @given(st.sets(st.integers(0, 60)), st.integers(0, 40))
 def test_exactly_the_named_ones_are_lost(names: set[int], extra: int) -> None:
-    """Played once, and again and again."""
+    """A script applied once, and a repeated script."""
     script = tuple(sorted(names))
     assert flags(ScriptedLoss(lost=script), range(80)) == [k in names for k in range(80)]
     every = max(names, default=0) + 1 + extra
@@ -46,13 +46,13 @@ def test_of_every_period_a_burst_is_lost(period: int, data: st.DataObject, first
     assert found == [k in expected for k in range(200)]
 
 
-def test_great_numbers() -> None:
+def test_large_packet_numbers_can_be_scripted() -> None:
     assert flags(ScriptedLoss(lost=(0, 2**40 - 1)), [0, 1, 2**40 - 2, 2**40 - 1, 2**40]) == [
         True, False, False, True, False,
     ]  # fmt: skip
 
 
-def test_each_flow_has_its_own_count(decide: Any) -> None:
+def test_each_flow_has_its_own_packet_count(decide: Any) -> None:
     flows = np.array([0, 1, 1, 0, 1, 0, 0, 1])
     decided = decide([LossOf(loss=ScriptedLoss(lost=(0, 2)))], len(flows), flows=flows)
     assert (decided.fates == 1).tolist() == [
@@ -60,5 +60,5 @@ def test_each_flow_has_its_own_count(decide: Any) -> None:
     ]
 
 
-def test_the_worst_case_loses_all_that_may_be_lost(decide: Any) -> None:
+def test_the_worst_case_without_a_cap_loses_every_packet(decide: Any) -> None:
     assert (decide([LossOf(loss=WorstCaseLoss())], 1000).fates == 1).all()

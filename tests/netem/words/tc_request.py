@@ -1,4 +1,4 @@
-"""What ``tc`` itself reads in words: the request that it would send to the kernel, decoded."""
+"""Decode the request that ``tc`` would send to the kernel for given words."""
 
 import shutil
 import struct
@@ -24,7 +24,7 @@ _UNIT = 2**32 - 1
 
 
 class Request(NamedTuple):
-    """What netem is asked to do; probabilities and correlations are shares, times are seconds."""
+    """A netem request; probabilities and correlations are in [0, 1], times in seconds."""
 
     limit: int
     delay_s: float
@@ -45,7 +45,7 @@ class Request(NamedTuple):
 
 
 class Tc:
-    """The program ``tc``, which is kept from asking the kernel."""
+    """The program ``tc``; its request to the kernel is intercepted."""
 
     def __init__(self, folder: Path) -> None:
         source = folder / "shim.c"
@@ -58,11 +58,11 @@ class Tc:
 
     @staticmethod
     def available() -> bool:
-        """Whether ``tc`` and a compiler are here."""
+        """Whether ``tc`` and a compiler are installed."""
         return shutil.which("tc") is not None and shutil.which("gcc") is not None
 
     def request(self, words: str) -> Request | None:
-        """Return what words ask for; None if tc refuses them."""
+        """Return the request for these words; None if tc refuses them."""
         return self._read(words.split())
 
     def _read(self, words: Sequence[str]) -> Request | None:

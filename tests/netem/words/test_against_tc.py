@@ -1,4 +1,4 @@
-"""The same words, read here and by ``tc`` itself."""
+"""Compare the parser of netem's words with ``tc`` itself."""
 
 import pytest
 from hypothesis import given
@@ -29,9 +29,9 @@ from tests.netem.words.tc_request import Request, Tc
 pytestmark = pytest.mark.skipif(not Tc.available(), reason="needs tc and gcc")
 
 SHARE = 1 / 2**31
-"""tc counts probabilities in 2³² steps."""
+"""Tolerance for probabilities: tc has steps of 2⁻³²."""
 TIME_S = 1.1e-6
-"""tc counts whole microseconds."""
+"""Tolerance for times: tc has whole microseconds."""
 ETHERNET_BYTES = 42
 
 
@@ -107,8 +107,8 @@ def assert_the_same_loss(loss: Loss, request: Request) -> None:
         "limit 50 delay 1ms", "loss 1% delay 10ms 1ms duplicate 2% rate 1gbit 0 limit 77",
     ],
 )  # fmt: skip
-def test_words_of_tc_say_here_what_they_say_there(tc: Tc, words: str) -> None:
-    # tc holds at most 1000 datagrams unless told otherwise.
+def test_words_of_tc_have_the_same_meaning_here(tc: Tc, words: str) -> None:
+    # tc's default limit is 1000 datagrams.
     limited = words if "limit" in words else f"{words} limit 1000"
     assert_the_same(settings_of(limited), tc.request(words), overhead=0)
 
@@ -121,21 +121,21 @@ def test_words_of_tc_say_here_what_they_say_there(tc: Tc, words: str) -> None:
         "duplicate 5%%", "corrupt", "limit", "delay 10ms distribution", "help",
     ],
 )  # fmt: skip
-def test_what_tc_refuses_is_refused_here(tc: Tc, words: str) -> None:
+def test_words_that_tc_refuses_are_refused_here(tc: Tc, words: str) -> None:
     assert tc.request(words) is None
     with pytest.raises(CallerError):
         settings_of(words)
 
 
 @pytest.mark.parametrize("words", ["slot 800us", "loss 5% ecn"])
-def test_what_tc_takes_and_this_emulator_cannot_do_is_refused(tc: Tc, words: str) -> None:
+def test_unsupported_words_of_tc_are_refused(tc: Tc, words: str) -> None:
     assert tc.request(words) is not None
     with pytest.raises(CallerError, match="this emulator"):
         settings_of(words)
 
 
 times_s = st.floats(3e-6, 200)
-"""From tc's smallest to its largest, of 32 bits."""
+"""From tc's smallest to its largest time, in 32 bits."""
 probabilities = st.floats(0, 1)
 correlations = st.floats(0, 1, exclude_max=True)
 tcs_losses = st.one_of(
@@ -158,7 +158,7 @@ tcs_reorders = st.builds(
 
 @st.composite
 def tcs_settings(draw: st.DrawFn) -> LinkSettings:
-    """What tc can do; a reorder after a delay, everything else anywhere."""
+    """Settings that tc supports; a reorder comes after a delay, all others anywhere."""
     chance = {"probability": probabilities}
     chain: list[AnyImpairment] = draw(
         st.lists(
@@ -216,7 +216,7 @@ NUMBERS = "losses by the packets' numbers"
          [f"loss script 0,1,2,3,4,5,6,7,8,9,10,11,12,13,14,15,16,17,1... ({NUMBERS})"]),
     ],
 )  # fmt: skip
-def test_what_tc_lacks_is_left_out_and_named(
+def test_settings_that_tc_lacks_are_left_out_and_named(
     tc: Tc, words: str, remains: str, lacks: list[str]
 ) -> None:
     command = tc_command(settings_of(words))
@@ -226,7 +226,7 @@ def test_what_tc_lacks_is_left_out_and_named(
 
 
 @pytest.mark.parametrize("words", ["loss worst", "loss periodic 1/2 mansd 4", "blackout 1s-2s"])
-def test_where_nothing_remains_there_is_no_command(words: str) -> None:
+def test_without_any_supported_setting_there_is_no_tc_command(words: str) -> None:
     command = tc_command(settings_of(words))
     assert command.words is None
     assert command.lacks

@@ -150,13 +150,13 @@ def test_a_mistake_among_links_gets_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_the_published_schema_is_the_codes() -> None:
-    """``noack schema --netem > docs/netem.schema.json`` brings it up to date."""
+def test_the_published_schema_matches_the_code() -> None:
+    """``noack schema --netem > docs/netem.schema.json`` updates the published schema."""
     published = json.loads((ROOT / "docs/netem.schema.json").read_text(encoding="utf-8"))
     assert published == json_schema()
 
 
-def test_the_schema_takes_what_the_code_takes() -> None:
+def test_the_schema_accepts_what_the_code_accepts() -> None:
     jsonschema.Draft202012Validator.check_schema(json_schema())
     validator = jsonschema.Draft202012Validator(json_schema())
     assert [error.message for error in validator.iter_errors(tomllib.loads(TWO))] == []
@@ -164,7 +164,7 @@ def test_the_schema_takes_what_the_code_takes() -> None:
         assert not validator.is_valid(wrong)
 
 
-def test_a_file_of_delays_is_read_from_beside_the_links(tmp_path: Path) -> None:
+def test_a_file_of_delays_is_relative_to_the_links_file(tmp_path: Path) -> None:
     (tmp_path / "delays.txt").write_text("1ms\n3ms\n")
     (link,) = load(
         tomli_w.dumps({"link": [LINK | {"words": "delay 5ms distribution delays.txt"}]}), tmp_path

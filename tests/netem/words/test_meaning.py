@@ -1,4 +1,4 @@
-"""What words are said to mean."""
+"""The explanations of words."""
 
 import re
 
@@ -24,13 +24,13 @@ DRAWS = 20_000
         "delay 0 samples -5ms,-1ms,3ms",
     ],
 )
-def test_a_delay_that_is_cut_at_zero_says_how_often(words: str) -> None:
+def test_the_share_of_delays_cut_at_zero_is_shown(words: str) -> None:
     settings = settings_of(words)
     (delay,) = settings.impairments
     said = re.search(r"negative delays become 0 \((.*)% of the draws\)", delay.meaning())
     assert said is not None
     share = float(said[1]) / 100
-    # Each flow has its own draw, so that they are independent under a correlation, too.
+    # One draw per flow: draws are independent even with a correlation.
     link = Link(settings, 3, "test")
     cut = np.mean([link.decide(flow, 1, 0).release_ns == 0 for flow in range(DRAWS)])
     error = np.sqrt(share * (1 - share) / DRAWS)
@@ -47,12 +47,12 @@ def test_a_delay_that_is_cut_at_zero_says_how_often(words: str) -> None:
         "delay 5ms samples -5ms,3ms",
     ],
 )
-def test_a_delay_that_is_hardly_cut_says_nothing_of_it(words: str) -> None:
+def test_a_delay_that_is_hardly_cut_at_zero_has_no_note(words: str) -> None:
     (delay,) = settings_of(words).impairments
     assert "negative" not in delay.meaning()
 
 
-def test_the_first_datagram_is_no_cap() -> None:
+def test_the_word_first_is_not_explained_as_a_cap() -> None:
     (first,) = settings_meaning(settings_of("loss 5% first"))
     assert first[0] == "first"
     ((word, cap),) = settings_meaning(settings_of("loss 5% mansd 3"))

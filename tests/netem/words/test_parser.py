@@ -1,4 +1,4 @@
-"""Words in the syntax of tc, and back."""
+"""Parse words in the syntax of tc, and write settings as words."""
 
 from contextlib import suppress
 
@@ -44,7 +44,7 @@ def loss(model: Loss) -> tuple[AnyImpairment, ...]:
 @pytest.mark.parametrize(
     ("words", "impairments"),
     [
-        # The manual page of tc-netem, and what it says of what is left out.
+        # Examples and defaults of the tc-netem manual page.
         ("loss 5%", loss(BernoulliLoss(probability=0.05))),
         ("loss 5", loss(BernoulliLoss(probability=0.05))),
         ("loss 0.3% 25%", loss(BernoulliLoss(probability=0.003, correlation=0.25))),
@@ -100,7 +100,7 @@ def loss(model: Loss) -> tuple[AnyImpairment, ...]:
             (Rate(rate_bps=5000, overhead_bytes=20, cell_bytes=100, cell_overhead_bytes=5),),
         ),
         ("rate 1mbit -14", (Rate(rate_bps=1_000_000, overhead_bytes=-14),)),
-        # What tc has no words for.
+        # Words that tc does not have.
         ("loss none", loss(NoLoss())),
         ("loss burst 5% 2.5", loss(GilbertElliottLoss(mean_loss=0.05, mean_burst=2.5))),
         ("loss periodic 2/100", loss(PeriodicLoss(period=100, burst=2))),
@@ -128,21 +128,23 @@ def loss(model: Loss) -> tuple[AnyImpairment, ...]:
                 Delay(delay_s=0.01, jitter_s=1e-3, loss_correlation=0.8),
             ),
         ),
-        # Words may be shortened as long as it is clear which is meant.
+        # Unambiguous abbreviations are allowed.
         (
             "duplicate 1% loss 5%",
             (Duplicate(probability=0.01), LossOf(loss=BernoulliLoss(probability=0.05))),
         ),
     ],
 )
-def test_what_words_say(words: str, impairments: tuple[AnyImpairment, ...]) -> None:
+def test_words_are_parsed_into_impairments(
+    words: str, impairments: tuple[AnyImpairment, ...]
+) -> None:
     said = parse(words)
     assert said.settings == LinkSettings(impairments=impairments)
     assert said.seed is None
     assert parse(text_of(*said)) == said
 
 
-def test_settings_stand_anywhere_and_impairments_in_their_order() -> None:
+def test_settings_may_come_anywhere_and_impairments_keep_their_order() -> None:
     words = "mansd 4 delay 10ms limit 50 loss 5% seed 7 delay 1ms first"
     settings, seed = parse(words)
     assert (settings.mansd, settings.limit, settings.first_delivered, seed) == (4, 50, True, 7)
@@ -159,7 +161,7 @@ def test_settings_stand_anywhere_and_impairments_in_their_order() -> None:
         ["loss trace", "my file", "mansd 4"],
     ],
 )
-def test_words_may_be_joined(words: str | list[str]) -> None:
+def test_words_may_be_one_string_or_a_list(words: str | list[str]) -> None:
     assert settings_of(words) == LinkSettings(impairments=loss(TraceLoss(file="my file")), mansd=4)
 
 
@@ -167,7 +169,7 @@ def test_words_may_be_joined(words: str | list[str]) -> None:
 def test_all_settings_survive_being_written_and_read(
     settings: LinkSettings, seed: int | None
 ) -> None:
-    assume(words_can_say(settings))  # what is refused is below
+    assume(words_can_say(settings))  # another test covers refused settings
     text = text_of(settings, seed)
     assert parse(text) == (settings, seed)
     assert "'" in text or parse(text.split()) == (settings, seed)
@@ -285,7 +287,7 @@ def test_a_mistake_gets_one_line_that_names_the_word(words: str, says: str) -> N
     assert "\n" not in line
 
 
-def test_a_direction_has_no_seed_of_its_own() -> None:
+def test_a_seed_for_one_direction_is_refused() -> None:
     with pytest.raises(CallerError, match="seed 7: belongs to the link"):
         settings_of("loss 5% seed 7")
 
