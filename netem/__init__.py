@@ -1,1 +1,1 @@
-"""A user-space network emulator for UDP that guarantees at most M-1 successive drops per flow."""
+"""A user-space UDP network emulator that guarantees at most M - 1 consecutive losses per flow."""

@@ -1,6 +1,6 @@
-"""The network emulator's process.
+"""Entry point of the network emulator.
 
-In a run it joins like every other process. On its own it serves any UDP program::
+In a run, it is one of the run's processes. On its own, it relays for any UDP program::
 
     python -m netem --listen 127.0.0.1:9000 --to 127.0.0.1:9001 loss 30% mansd 4
 """
@@ -20,7 +20,7 @@ with quiet_interrupt():
 
 
 def main(arguments: Sequence[str] | None = None) -> ExitStatus:
-    """Run the emulator: on its own, or in a run; or a command on one that runs."""
+    """Run the emulator (stand-alone or in a run), or a command for a running emulator."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given and given[0] in ("show", "set", "watch"):
         from netem.control import emulator_commands

@@ -1,4 +1,4 @@
-"""Says how long compiling takes, and remembers it beside the compiled code for the next time."""
+"""Announces a compilation and its expected duration, and stores the duration for the next time."""
 
 import time
 from collections.abc import Iterator
@@ -11,15 +11,15 @@ from noack.core.code_cache import while_compiling
 
 @contextmanager
 def announced(what: str, folder: Path | None, typical_s: float) -> Iterator[None]:
-    """Say that something is compiled while the context lasts, and how long that will take.
+    """Print that code is compiled within the context, and the expected duration.
 
     Args:
-        what: is compiled.
-        folder: where it is kept; None if it is not.
-        typical_s: how long it takes on a usual machine, for the first time on this one.
+        what: name of the code.
+        folder: cache folder of the compiled code; None if there is no cache.
+        typical_s: expected duration, until one has been measured on this machine.
     """
     about_s = typical_s
-    # Not in the folder, which is another one when the sources have changed.
+    # Not in the folder itself: its name changes with the sources.
     record = (
         None if folder is None else folder.with_name(f"{folder.name.rpartition('-')[0]}.seconds")
     )

@@ -1,7 +1,7 @@
-"""Both directions of a link as one machine, for the loop that acknowledges its updates.
+"""Both directions of a link as one machine, for a loop with acknowledged updates.
 
-Flow 0 takes the way forward, flow 1 the way back. Neither direction knows of the other: settings,
-random streams and guarantees are each one's own.
+Flow 0 uses the forward direction, flow 1 the reverse direction. The two are independent: each has
+its own settings, random streams and guarantee.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,12 @@ ACKNOWLEDGEMENT_LINK = "acknowledgement"
 
 
 class Duplex(FixedMachine):
-    """The machine of a network with a way back.
+    """The machine of a network with a reverse direction.
 
     Args:
-        forward: takes the datagrams of flow 0.
-        back: takes those of flow 1.
-        first_number: of its inputs.
+        forward: the link for flow 0.
+        back: the link for flow 1.
+        first_number: number of the first input.
     """
 
     def __init__(
@@ -32,18 +32,18 @@ class Duplex(FixedMachine):
         self._inputs = first_number
 
     def next_deadline_ns(self) -> int | None:
-        """When the next datagram leaves, in whichever direction."""
+        """Time of the next departure in either direction; None: nothing is in flight."""
         due = (way.next_deadline_ns() for way in self._ways.values())
         return min((t_ns for t_ns in due if t_ns is not None), default=None)
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Let the datagram out that is due; of two, the one that goes forward."""
+        """Forward the datagram that is due; if one is due in each direction, the one of flow 0."""
         next_ns = self.next_deadline_ns()
         way = next(way for way in self._ways.values() if way.next_deadline_ns() == next_ns)
         return self._numbered(way.on_timer(now_ns))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Take a datagram; return it if it survives and is not delayed."""
+        """Process a datagram; return it if it is neither lost nor delayed."""
         if message.flow not in self._ways:
             raise ValueError(f"a network with a way back has no flow {message.flow}")
         return self._numbered(self._ways[message.flow].handle(message, now_ns))
@@ -51,7 +51,7 @@ class Duplex(FixedMachine):
     def _numbered(
         self, outputs: Sequence[Datagram | Record | Notice]
     ) -> list[Datagram | Record | Notice]:
-        """Number the inputs over both directions; each answers an input with one row."""
+        """Number the inputs of both directions in one sequence; an input produces one row."""
         number, self._inputs = self._inputs, self._inputs + 1
         return [
             output._replace(row=(number, *output.row[1:])) if isinstance(output, Record) else output
@@ -66,8 +66,8 @@ def network_of(
 
     Args:
         resolved: the scenario.
-        start: where in the run it takes up its work.
-        forward: takes the place of the link from sensor to controller.
+        start: where in the run the network starts.
+        forward: replaces the link from sensor to controller.
     """
     forward = update_link_of(resolved, start) if forward is None else forward
     if not resolved.protocol.acknowledges:

@@ -1,7 +1,7 @@
-"""One direction of a link as a machine: datagrams in, what survives out, now or later.
+"""One direction of a link as a state machine: datagrams in, surviving datagrams out, maybe later.
 
-It reads no payload. The rules are those of :mod:`netem.rules`; here they run as plain Python, in a
-run of the loop, in simulation and in replay, and in the relay where nothing faster is to be had.
+It does not interpret payloads. It runs the rules of :mod:`netem.rules` as plain Python: in a run of
+the loop, in simulation, in replay, and in the relay where the compiled engine is not available.
 """
 
 import heapq
@@ -36,21 +36,21 @@ UPDATE_LINK = "update"
 
 
 class Datagram(NamedTuple):
-    """A datagram of a flow; flows are numbered in the order of their first datagram."""
+    """A datagram of a flow; flows are numbered in the order of their first datagrams."""
 
     flow: int
     data: bytes
 
 
 class _InFlight(NamedTuple):
-    """A datagram, or a copy, that is to leave; ties leave in the order in which they came."""
+    """A delayed datagram or copy; at equal times, datagrams leave in their order of arrival."""
 
     release_ns: int
     number: int
     packet: int
     copy: bool
     counts: bool
-    """Whether it is the first intact copy."""
+    """Whether it is the datagram's first intact copy."""
     delayed: bool
     datagram: Datagram
 
@@ -59,11 +59,11 @@ class Link:
     """The machine of the network emulator.
 
     Args:
-        settings: what it does to datagrams; files are read already.
+        settings: the settings; they must not name files.
         seed: seed of its random streams.
         name: names of the link and the direction; part of its random streams' names.
-        decisions: recorded decisions of each flow, taken again before the settings apply.
-        first_number: of its inputs and of its packets.
+        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        first_number: number of the first input and of the first packet.
     """
 
     def __init__(
@@ -93,37 +93,37 @@ class Link:
 
     @property
     def counters(self) -> Counters:
-        """What has happened so far."""
+        """Counts so far."""
         return self._state.counters
 
     @property
     def decision(self) -> PacketDecision:
-        """What was decided of the last datagram; overwritten by the next."""
+        """The decision for the last datagram; overwritten by the next."""
         return self._decision
 
     @property
     def in_flight(self) -> int:
-        """Datagrams, and copies, that are delayed now."""
+        """Number of datagrams and copies in flight."""
         return self._state.link.in_flight
 
     @property
     def delays(self) -> bool:
-        """Whether what passes may have to be kept."""
+        """Whether datagrams can be delayed."""
         return self._program.tracks
 
     def flow(self, flow: int) -> FlowState | None:
-        """What is remembered of a flow; None if none of its datagrams has come."""
+        """The state of a flow; None if none of its datagrams has arrived."""
         row = self._rows.get(flow)
         return None if row is None else self._flows[row]
 
     def forget(self, flow: int) -> None:
-        """Forget a flow that has ended, and of which nothing is under way."""
+        """Remove a flow that has ended and has no datagram in flight."""
         row = self._rows.pop(flow, None)
         if row is not None:
             self._free_rows.append(row)
 
     def change(self, settings: LinkSettings) -> None:
-        """Go on with other settings; see :mod:`netem.rules.settings_change`."""
+        """Apply other settings; see :mod:`netem.rules.settings_change`."""
         old, before = self._program, self._state
         self._first_delivered = settings.first_delivered
         self._program = program_of(settings, self._seed, *self._name, tracks=old.tracks)._replace(
@@ -145,11 +145,11 @@ class Link:
         carry(old, before, self._program, self._state, latest_ns)
 
     def next_deadline_ns(self) -> int | None:
-        """When the next datagram leaves."""
+        """Time of the next departure; None: nothing is in flight."""
         return self._in_flight[0].release_ns if self._in_flight else None
 
     def on_timer(self, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Let the datagram out that is due."""
+        """Forward the datagram that is due."""
         due = heapq.heappop(self._in_flight)
         stale = self._leave(due)
         row = (
@@ -160,7 +160,7 @@ class Link:
         return (due.datagram, Record(NETEM_RELEASE, row))
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Take a datagram; return it if it survives and is not delayed."""
+        """Process a datagram; return it if it is neither lost nor delayed."""
         decision = self.decide(message.flow, len(message.data), now_ns)
         head = message.data[:PACKET_HEAD_BYTES].ljust(PACKET_HEAD_BYTES, b"\0")
         row = (
@@ -186,7 +186,7 @@ class Link:
         return (*outputs, record)
 
     def decide(self, flow: int, size_bytes: int, now_ns: int) -> PacketDecision:
-        """Decide for a flow's next packet; the decision is overwritten by the next one."""
+        """Decide for a flow's next packet; the next call overwrites the decision."""
         row = self._rows.get(flow)
         if row is None:
             row = self._add_flow(flow)
@@ -204,7 +204,7 @@ class Link:
         copy: bool,
         counts: bool,
     ) -> None:
-        """Send a datagram, or keep it until it is due."""
+        """Forward a datagram, or keep it until it is due."""
         if bit >= 0:
             message = message._replace(data=flipped(message.data, bit))
         self._put_in_flight += 1
@@ -212,7 +212,7 @@ class Link:
             release_ns, self._put_in_flight, self._decision.packet, copy, counts,
             release_ns > now_ns, message,
         )  # fmt: skip
-        # What was due before leaves before, even if nobody has come to let it out.
+        # Overdue datagrams leave first, even if ``on_timer`` has not been called for them yet.
         overdue = bool(self._in_flight) and self._in_flight[0].release_ns <= release_ns
         if leaving.delayed or overdue:
             heapq.heappush(self._in_flight, leaving)
@@ -249,11 +249,11 @@ class RunLink(Link):
     """The link from sensor to controller in a run: its settings may change at set times.
 
     Args:
-        settings: what it does to datagrams at first.
+        settings: the settings at the start.
         seed: seed of its random streams.
         name: names of the link and the direction; part of its random streams' names.
-        schedule: what it knows of changes.
-        first_number: of its inputs and of its packets.
+        schedule: the changes of settings.
+        first_number: number of the first input and of the first packet.
     """
 
     def __init__(
@@ -270,11 +270,11 @@ class RunLink(Link):
         self._reached_ns = -1
 
     def announce(self, change: ParameterChange, now_ns: int) -> Sequence[Record | Notice]:
-        """Take a change; it is in force from the first datagram on that comes not before T.
+        """Accept a change; it applies from the first datagram that arrives at or after its time T.
 
-        A smaller cap is kept from that datagram on: if as many as it allows, or more, have just
-        been lost in a row, this one passes. So a run of losses is never longer than the larger of
-        the caps that were in force during it.
+        A smaller cap applies from that datagram on: if the number of consecutive losses before it
+        has reached the new cap, the datagram passes. Hence a loss burst is never longer than the
+        largest cap that applied during it.
         """
         said = self._schedule.announce(
             NETEM_SETTING, change, self._inputs, now_ns, self._reached_ns
@@ -283,7 +283,7 @@ class RunLink(Link):
         return said
 
     def handle(self, message: Datagram, now_ns: int) -> Sequence[Datagram | Record | Notice]:
-        """Take a datagram; return it if it survives and is not delayed."""
+        """Process a datagram; return it if it is neither lost nor delayed."""
         if self._schedule.next_ns is not None:
             while (found := self._schedule.take(now_ns)) is not None:
                 self._apply(found.prepared)
@@ -291,7 +291,7 @@ class RunLink(Link):
         return super().handle(message, now_ns)
 
     def _apply(self, settings: LinkSettings) -> None:
-        first = self._settings.first_delivered  # one that was started anew has its own
+        first = self._settings.first_delivered  # a restarted emulator has its own value
         settings = settings.model_copy(update={"first_delivered": first})
         if settings != self._settings:
             self._settings = settings
@@ -299,7 +299,7 @@ class RunLink(Link):
 
 
 def flipped(data: bytes, bit: int) -> bytes:
-    """Return the data with one bit flipped; bit 0 is the first byte's lowest."""
+    """Return the data with one bit flipped; bit 0 is the least significant bit of byte 0."""
     changed = bytearray(data)
     changed[bit // 8] ^= 1 << (bit % 8)
     return bytes(changed)
@@ -316,7 +316,7 @@ def update_link_of(resolved: Scenario, start: Start = BEGINNING) -> RunLink:
 
 
 def link_of(settings: LinkSettings, seed: int, name: str, start: Start) -> Link:
-    """Return a link of a run, whose settings stay as they are."""
+    """Return a link of a run with constant settings."""
     settings, names = _at_the_start(settings, name, start)
     return Link(settings, seed, *names, first_number=start.first_number)
 
@@ -324,10 +324,10 @@ def link_of(settings: LinkSettings, seed: int, name: str, start: Start) -> Link:
 def _at_the_start(
     settings: LinkSettings, name: str, start: Start
 ) -> tuple[LinkSettings, tuple[str, ...]]:
-    """A link's settings and the names of its random streams.
+    """Return a link's settings and the names of its random streams.
 
-    One that is started anew knows nothing of how many it dropped in a row: the first passes, and
-    what follows is drawn from other streams than before.
+    A restarted emulator has lost its count of consecutive losses. Therefore its first datagram
+    passes, and later ones are drawn from other random streams than before.
     """
     if not start.is_restart:
         return settings, (name,)

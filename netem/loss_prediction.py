@@ -1,12 +1,12 @@
 """The expected loss rate of a link under its cap.
 
-Each feature that draws is a Markov chain that moves with every packet; all of them together are
-one, with transition matrix P and, for each state, the probability ℓ that the packet is not
-effectively delivered. With A = P diag(ℓ) and B = P diag(1 − ℓ), v the state's distribution at a
-delivered packet, and m = M − 1 the cap,
+Each random feature is a Markov chain that advances with every packet. Together they are one chain
+with transition matrix P; in each state, a packet is not effectively delivered with probability ℓ.
+Let A = P diag(ℓ), B = P diag(1 − ℓ), m = M − 1 the cap, and v the distribution of the state at a
+delivered packet. Then
 
-* E D = v Σ_{k=1..m} A^k 1 packets are lost before the next delivery, at most m, and
-* v is stationary under Σ_{k<m} A^k B + A^m P, as the packet after m losses must pass.
+* E D = v Σ_{k=1..m} A^k 1 is the expected number of losses before the next delivery, and
+* v is stationary under Σ_{k<m} A^k B + A^m P, since the packet after m losses must pass.
 
 The loss rate is E D/(E D + 1). For independent losses it is p(1 − p^m)/(1 − p^{m+1}).
 """
@@ -37,7 +37,7 @@ class LossPrediction(NamedTuple):
     rate: float | None
     """Expected share of a flow's packets that are dropped or corrupted."""
     note: str
-    """Why there is no rate; or on which condition it holds; or empty."""
+    """Why there is no rate, or the condition under which the rate holds; else empty."""
 
 
 def predicted_loss(settings: LinkSettings) -> float | None:
@@ -50,10 +50,10 @@ def predicted_loss(settings: LinkSettings) -> float | None:
 
 @lru_cache(maxsize=64)
 def predict(settings: LinkSettings) -> LossPrediction:
-    """Predict the loss rate of a direction; its files are read already.
+    """Predict the loss rate of a direction; the settings must not name files.
 
-    Packets that overflow a queue or are delivered out of order do not count: this depends on when
-    packets arrive.
+    Packets that overflow a queue or are delivered out of order do not count, since their number
+    depends on the arrival times.
     """
     impairments = settings.impairments
     try:
@@ -85,7 +85,7 @@ def _capped_rate(parts: Sequence[Chain | Pattern], mansd: int | None) -> float:
 
 
 def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> float:
-    """Return the loss rate of patterns together, counted over their common period."""
+    """Return the loss rate of several patterns combined, counted over their common period."""
     period = math.lcm(*map(len, patterns))
     if period > LONGEST_PATTERN:
         raise NotPredictableError(f"the loss patterns repeat together only after {period} packets")
@@ -102,7 +102,7 @@ def _pattern_rate(patterns: Sequence[NDArray[np.bool_]], mansd: int | None) -> f
 
 
 def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
-    """The joint chain: its start, its matrix, the probability of no effective delivery."""
+    """Return the joint chain: start, matrix, probability of no effective delivery."""
     states = math.prod(len(part.lost if isinstance(part, Pattern) else part.start)
                        for part in parts)  # fmt: skip
     if states > MOST_STATES:
@@ -123,10 +123,10 @@ def _together(parts: Sequence[Chain | Pattern]) -> tuple[Array, Array, Array]:
 
 
 def _ineffective(chains: Sequence[Chain], states: int) -> Array:
-    """(states,) Probability that a packet is lost, or no intact copy of it leaves."""
+    """Return the probability (states,) that no intact copy of a packet leaves."""
     passes = np.ones(states)
     shares = np.zeros((2, 3, states))
-    """By: is the packet intact, or corrupt; is there no copy, an intact, or a corrupt one."""
+    """Axis 0: packet intact, corrupt. Axis 1: no copy, intact copy, corrupt copy. Axis 2: state."""
     shares[0, 0] = 1.0
     for chain in chains:
         if chain.what == "lose":
@@ -157,9 +157,9 @@ def _geometric(matrix: Array, terms: int) -> tuple[Array, Array]:
 
 
 def _stationary(start: Array, moves: Array) -> Array:
-    """Mean distribution over the states, also of a chain that is periodic.
+    """Return the mean distribution over the states, by doubling over 2⁶⁴ steps.
 
-    Over 2⁶⁴ steps, by doubling.
+    The mean exists for periodic chains, too.
     """
     mean, power = np.eye(len(start)), moves
     for _ in range(64):

@@ -1,7 +1,7 @@
-"""From the settings of a link to the program that its rules read, and to a fresh state.
+"""Makes the program that a link's rules read from its settings, and a new state.
 
 Random streams are named after the link, the direction and the impairment, with a number if there
-are several of a kind; so adding a delay does not change what is lost.
+are several of a kind. Hence adding a delay does not change which packets are lost.
 """
 
 from collections import Counter
@@ -34,11 +34,11 @@ def program_of(
     """Return the program of one direction of a link.
 
     Args:
-        settings: what it does; files are read already.
+        settings: the settings; they must not name files.
         seed: seed of its random streams.
         name: names of the link and the direction; part of its random streams' names.
-        decisions: recorded decisions of each flow, taken again before the settings apply.
-        tracks: packets may be in flight from before.
+        decisions: recorded decisions per flow; each flow repeats them before the settings apply.
+        tracks: packets may be in flight from earlier settings.
 
     Raises:
         ValueError: the settings name a file that has not been read.
@@ -70,7 +70,7 @@ def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
     """Return the names of the random streams of a program's stages, in their order.
 
     Args:
-        settings: what the link does.
+        settings: the link's settings.
         name: names of the link and the direction.
     """
     return [stream for _, stream in _stages(settings, StageTables(), name)]
@@ -79,7 +79,7 @@ def stream_names(settings: LinkSettings, *name: str) -> list[tuple[str, ...]]:
 def _stages(
     settings: LinkSettings, tables: StageTables, name: Sequence[str]
 ) -> Iterator[tuple[RuleStage, tuple[str, ...]]]:
-    """Stages, each with the name of its random stream."""
+    """Return the stages, each with the name of its random stream."""
     numbers: Counter[str] = Counter()
     for impairment in settings.impairments:
         stage, rule = impairment.stage(tables), impairment.rule
@@ -111,7 +111,7 @@ def new_flow(number: int, first_delivered: bool) -> FlowState:
 
 
 def new_memory(program: LinkProgram) -> list[StageMemory]:
-    """Return what the stages remember of a new flow."""
+    """Return the stages' memory of a new flow."""
     return [StageMemory() for _ in program.stages]
 
 

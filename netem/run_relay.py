@@ -1,7 +1,7 @@
-"""The relay: the network emulator's socket in a run. Datagrams in, survivors out, unread.
+"""The network emulator's socket in a run: forwards surviving datagrams without reading them.
 
-It serves the sensor's address, and the controller's where there is a way back. Survivors leave from
-the port that they came in by.
+It accepts datagrams from the sensor's address and, with a reverse direction, from the controller's.
+Surviving datagrams leave from the port at which they arrived.
 """
 
 import socket
@@ -17,8 +17,8 @@ class RelayShell(CountingSocket[Datagram]):
     Args:
         endpoint: a bound socket, from :func:`noack.runtime.udp_sockets.bind`.
         destination: where surviving datagrams go.
-        source: the only address to serve.
-        duplex: what comes from the destination goes to the source, as flow 1.
+        source: datagrams from here are forwarded, as flow 0; other senders are ignored.
+        duplex: datagrams from the destination are forwarded to the source, as flow 1.
     """
 
     most_bytes = MAX_UDP_BYTES
@@ -37,7 +37,7 @@ class RelayShell(CountingSocket[Datagram]):
         super().__init__(endpoint, destination, list(self._flows))
 
     def judge(self, data: bytes, source: Address) -> Datagram | None:
-        """Return a datagram of one that is served; its content is nobody's business here."""
+        """Return the datagram if it comes from an accepted address; its content is not checked."""
         flow = self._flows.get(source)
         if flow is None:
             self._foreign += 1
@@ -45,9 +45,9 @@ class RelayShell(CountingSocket[Datagram]):
         return Datagram(flow, data)
 
     def send(self, message: Datagram) -> None:
-        """Forward a datagram that survived."""
+        """Forward a surviving datagram."""
         self.put(message.data, self._back.get(message.flow))
 
     def report(self) -> dict[str, object]:
-        """Counters, for the run's summary."""
+        """Return the counters for the run's summary."""
         return super().report() | {"rejected": self.rejected({"source": self._foreign})}

@@ -1,4 +1,4 @@
-"""The tap that writes a capture, in a thread of its own: the packet path never waits for a disk."""
+"""The tap that writes a capture. It has its own thread: the packet path never waits for a disk."""
 
 import os
 import threading
@@ -25,19 +25,19 @@ class _Batch(NamedTuple):
     events: Events
     data: Bytes
     missing: NDArray[np.int64] | None
-    """Events that are missing before this batch, per interface."""
+    """(interfaces,) Number of missing events before this batch."""
 
 
 class CaptureWriter:
     """An open capture file.
 
-    Create it before the packet path applies its real-time settings: it may compile for some
-    seconds, and its thread would inherit them.
+    Create it before the packet path applies its real-time settings: the constructor may compile
+    for some seconds, and the new thread would inherit the settings.
 
     Args:
         path: the file, which is replaced; a FIFO; ``-`` for standard output.
         specs: the relay's links. Each has two interfaces: the clients' side, then the server's.
-        batches: maximum number of batches that wait to be written.
+        batches: maximum number of queued batches.
 
     Raises:
         CallerError: the file cannot be opened, or standard output is a terminal.
@@ -103,7 +103,7 @@ class CaptureWriter:
                 self._unreported = np.zeros_like(missing)
 
     def missing(self, events: int) -> None:
-        """Count events that the relay had no room for, on the first interface."""
+        """Count events for which the relay had no room; they count for the first interface."""
         missed = np.zeros_like(self._unreported)
         missed[0] = events
         self._miss(missed)
@@ -120,7 +120,7 @@ class CaptureWriter:
         """Write the queued batches and the statistics, and close the file.
 
         Args:
-            patience_s: how long to wait for a disk or a reader that accepts nothing.
+            patience_s: maximum time to wait for a disk or a reader that accepts nothing.
         """
         if not self._closed:
             self._closed = True
@@ -169,7 +169,7 @@ class CaptureWriter:
                 done += size
                 self._bytes += size
         except OSError:
-            with suppress(OSError):  # remove half a block; a pipe cannot be cut
+            with suppress(OSError):  # remove an incomplete block; a pipe cannot be truncated
                 os.ftruncate(self._file, os.lseek(self._file, 0, os.SEEK_CUR) - done)
             raise
 

@@ -1,9 +1,9 @@
-"""Events as enhanced packet blocks: the part of a capture that must be fast.
+"""Formats events as enhanced packet blocks: the part of a capture that must be fast.
 
 A block holds the datagram with an IP and a UDP header, and as options a comment, the direction, the
 packet id, and the number of missing events before it. The code is compiled (numba) and runs without
-the interpreter lock, so that the packet path in another thread does not wait. It is one file
-because numba's cache notices changes of this file only.
+the interpreter lock, so that the packet path in another thread does not wait. All of it is in one
+file, because numba's cache detects changes of the compiled file only.
 
 Sources: draft-ietf-opsawg-pcapng §4.3, RFC 791, RFC 8200, RFC 768, RFC 1071 (the checksum).
 """
@@ -23,15 +23,15 @@ Counts = NDArray[np.int64]
 Events = NDArray[np.void]
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 FOLDER = cache_folder("capture", [Path(__file__)])
-"""Folder of the compiled code; None if it is not kept."""
+"""Cache folder of the compiled code; None if there is no cache."""
 _compiled = cast(Callable[[_Function], _Function], compiler(FOLDER, nogil=True))
-_integer = cast(Callable[[Any], int], np.int64)  # unsigned and signed would make a float
+_integer = cast(Callable[[Any], int], np.int64)  # uint64 with int64 would give float64
 _part = cast(Callable[[_Function], _Function], numba.njit)
 
 MAX_HEADER_BYTES = 40 + 8
 """IPv6 and UDP."""
 
-_BLOCK_BYTES = 32 + MAX_HEADER_BYTES + 3 + 512  # 512: twice what the options can need
+_BLOCK_BYTES = 32 + MAX_HEADER_BYTES + 3 + 512  # 512: twice the maximum size of the options
 _MAX_IPV4_BYTES = 65_535 - 20
 _MAX_IPV6_BYTES = 65_535
 _UDP_BYTES = 8
@@ -46,7 +46,7 @@ def _text(words: str, width: int = 0) -> Bytes:
     return np.frombuffer(words.encode().ljust(width, b"\0"), np.uint8)
 
 
-# In the order of noack.protocol.record_tables.Fate, then one for any other number.
+# In the order of noack.protocol.record_tables.Fate; the last row is for any other number.
 _FATES = np.stack(
     [
         _text("delivered", 32),
@@ -80,7 +80,7 @@ _PACKET = _text(", packet ")
 
 @_compiled
 def blocks_bytes(events: Events, data_bytes: int, interfaces: int) -> int:
-    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is impossible.
+    """Return an upper bound on the bytes of the events' blocks, or −1 − i if event i is invalid.
 
     Args:
         events: shape (n,), of type :data:`netem.relay_events.EVENT`.
@@ -113,9 +113,9 @@ def put_blocks(events: Events, data: Bytes, missing: Counts, written: Counts, ou
     Args:
         events: shape (n,), checked by :func:`blocks_bytes`.
         data: the payloads.
-        missing: per interface, events missing before these; written in the next block, then 0.
-        written: per interface, number of written events; incremented.
-        out: of at least the size that :func:`blocks_bytes` returns.
+        missing: (interfaces,) missing events before these; written in the next block, then reset.
+        written: (interfaces,) number of written events; incremented.
+        out: output buffer, at least as large as :func:`blocks_bytes` returns.
     """
     at = 0
     for i in range(events.size):
@@ -205,7 +205,7 @@ def _udp_checksum(out: Bytes, packet: int, payload: int, size_bytes: int) -> int
     addresses = packet + 12 if udp - packet == 20 else packet + 8
     pseudo = _sum(out, addresses, udp - addresses) + 17 + size_bytes + _UDP_BYTES
     checksum = 0xFFFF - _folded(pseudo + _sum(out, udp, _UDP_BYTES + size_bytes))
-    return checksum if checksum else 0xFFFF  # 0 means: no checksum
+    return checksum if checksum else 0xFFFF  # 0 would mean "no checksum"
 
 
 @_part

@@ -9,9 +9,9 @@ An interface is one side of a link. ``inbound`` packets are datagrams that the e
     [, consecutive loss 2, cap 4] [, delayed 10.5 ms] [, held back 1.2 ms for the guarantee]
     ; forward, flow 3, packet 17
 
-The comment of an outbound packet has ``, after 10.613 ms`` instead, its actual delay, and where it
-applies ``copy, ...`` or ``delivered out of order (stale)``. A datagram has the same packet id at
-both interfaces.
+The comment of an outbound packet has its actual delay instead (``, after 10.613 ms``). Where they
+apply, it also has ``copy, ...`` and ``delivered out of order (stale)``. A datagram has the same
+packet id at both interfaces.
 
 Source: draft-ietf-opsawg-pcapng.
 """
@@ -38,7 +38,7 @@ from netem.relay_events import EVENT
 from noack.core.code_cache import is_kept
 
 _SNAP_BYTES = 262_144
-"""More than any datagram has: payloads are captured whole."""
+"""Larger than any datagram: payloads are captured completely."""
 
 _COMPILING_S = 10.0
 _LINKTYPE_RAW = 101
@@ -59,9 +59,9 @@ class PcapngInterface:
 
 
 class PcapngSection:
-    """The blocks of one capture file, in their order: header, packets, ..., statistics.
+    """The blocks of one capture file, in file order: header, packets, ..., statistics.
 
-    The first instance compiles the code that formats packets, which takes some seconds.
+    The first instance compiles the code that formats packets. This takes some seconds.
 
     Args:
         interfaces: the ``interface`` of an event is an index into them.
@@ -110,7 +110,7 @@ class PcapngSection:
             data: their payloads.
 
         Raises:
-            ValueError: an event is impossible: no such interface, too large, beyond the data.
+            ValueError: an event has an unknown interface, is too large, or points beyond the data.
         """
         events = np.require(events, EVENT, ["C", "W"])  # other types would be compiled separately
         data = np.require(data, np.uint8, ["C", "W"])
@@ -126,7 +126,7 @@ class PcapngSection:
         return self._out.data[:size]
 
     def miss(self, events: NDArray[np.int64]) -> None:
-        """Add events, per interface, that are missing at this place of the file."""
+        """Note (interfaces,) numbers of events that are missing at this place of the file."""
         self._missing += events
         self._all_missing += events
 

@@ -1,4 +1,4 @@
-"""The command line of an emulator on its own: its options, and the links that they describe."""
+"""The command line of a stand-alone emulator: its options, and the links that they describe."""
 
 import argparse
 import difflib
@@ -132,7 +132,7 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
     """Return the options of a command line.
 
     Raises:
-        CallerError: a word has dashes, or --session has other options beside it.
+        CallerError: a word begins with dashes, or --session is combined with other options.
     """
     require_no_dashes(arguments)
     options = parser.parse_intermixed_args(arguments)
@@ -148,7 +148,7 @@ def specs_of(options: argparse.Namespace) -> tuple[LinkSpec, ...]:
     """Return the links that the command line describes.
 
     Raises:
-        CallerError: it has a mistake.
+        CallerError: the command line has a mistake.
     """
     if options.links is not None:
         for name in ("listen", "to", "words", "reverse", "both", "one_way", "idle", "seed"):
@@ -201,7 +201,7 @@ def _idle_s(text: str) -> float:
 
 
 def directions(options: argparse.Namespace) -> tuple[LinkSettings, LinkSettings, int]:
-    """Return the settings forward and reverse, and the seed; files are not read yet.
+    """Return the forward and the reverse settings, and the seed; files are not read yet.
 
     Raises:
         CallerError: the words have a mistake.

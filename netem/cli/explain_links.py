@@ -1,4 +1,4 @@
-"""``netem --explain``: explains what links would do, and relays nothing."""
+"""``netem --explain``: explains the effect of links' settings, and relays nothing."""
 
 import json
 import textwrap
@@ -33,7 +33,7 @@ class DirectionExplanation(TypedDict):
     meaning: Sequence[str]
     predicted_loss: float | None
     predicted_loss_note: str
-    """Why there is no prediction, or what it does not count."""
+    """Why there is no prediction, or which losses it does not count."""
     predicted_loss_without_cap: float | None
     tc: str | None
     """The nearest command, after ``tc qdisc add dev DEVICE root netem``."""
@@ -60,7 +60,7 @@ class Explanation(TypedDict):
 
 
 def explain(specs: Sequence[LinkSpec], *, as_json: bool, as_file: bool) -> None:
-    """Print what links would do on standard output.
+    """Print the effect of links' settings on standard output.
 
     Args:
         specs: the links.

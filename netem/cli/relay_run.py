@@ -1,4 +1,4 @@
-"""Runs a relay, with live control, statistics, captures and fate traces beside it."""
+"""Runs a relay, optionally with live control, statistics, captures and fate traces."""
 
 import argparse
 import json
@@ -26,7 +26,7 @@ from noack.runtime.signals import Signals
 
 _FIFO_PRIORITY = 50
 _SPIN_NS = 50_000
-"""A sleeping thread is nearly always less late than this; longer spins would block the core."""
+"""Nearly all sleeping threads wake within this time; longer spinning would block the core."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -115,7 +115,7 @@ def relay(specs: Sequence[LinkSpec], options: argparse.Namespace) -> Statistics:
 
 
 def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
-    """Return links that replay a trace, with its cap unless they have one of their own."""
+    """Return links that replay a trace; a link without a cap gets the cap of the trace."""
     fates = read_fates(path, [spec.name for spec in specs])
 
     def settings(spec: LinkSpec, direction: Direction) -> LinkSettings:
@@ -133,7 +133,7 @@ def _replaying(specs: Sequence[LinkSpec], path: Path) -> Sequence[LinkSpec]:
 
 
 def _check_files(options: argparse.Namespace) -> None:
-    """Refuse one file for two options."""
+    """Check that no file is given for two options."""
     files = {
         f"--{name.replace('_', '-')}": Path(given).resolve()
         for name in ("links", "replay_fates", "record_fates", "capture", "stats_file")
@@ -183,7 +183,7 @@ def _say_ready(opened: Relay) -> None:
 
 
 def _print_ready(opened: Relay, *, as_json: bool) -> None:
-    """Print the line on standard output that programs wait for."""
+    """Print a line on standard output that other programs can wait for."""
     addresses = opened.addresses()
     line = f"ready: listening on {', '.join(map(text_of, addresses.values()))}"
     if as_json:

@@ -30,7 +30,7 @@ _COUNTS: dict[str, Callable[[DirectionStatistics], int]] = {
     "duplicated": lambda side: side["duplicated"],
     "in flight at the end": lambda side: side["in_flight"],
 }
-"""Rows that are shown if they are not 0."""
+"""Rows that are shown if their value is not 0."""
 
 
 class _Row(NamedTuple):

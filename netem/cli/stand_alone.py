@@ -1,4 +1,4 @@
-"""The emulator on its own: from a command line to its totals."""
+"""Runs a stand-alone emulator: reads the command line, relays, prints the totals."""
 
 import json
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from noack.core.errors import ExitStatus
 
 
 def alone(arguments: Sequence[str]) -> ExitStatus:
-    """Run the emulator on its own until Ctrl-C, or explain its settings.
+    """Run a stand-alone emulator until Ctrl-C, or explain its settings.
 
     Returns:
-        UNINTENDED_LOSSES if there were any: the guarantee does not hold then.
+        UNINTENDED_LOSSES if there were any; the guarantee is void then.
 
     Raises:
         CallerError: the command line has a mistake.

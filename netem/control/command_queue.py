@@ -1,6 +1,6 @@
-"""Commands that other threads submit and the relay's thread runs between two batches of datagrams.
+"""Commands of other threads, which the relay's thread runs between two batches of datagrams.
 
-The packet path never waits: statistics, live control and the live screen have threads of their own,
+The packet path never waits: statistics, live control and the live screen have their own threads,
 and each command takes microseconds.
 """
 

@@ -26,7 +26,7 @@ class Client:
         session: its address and secret, from :func:`netem.control.emulator_session.find`.
 
     Raises:
-        PeerError: it does not accept the connection.
+        PeerError: the emulator does not accept the connection.
     """
 
     def __init__(self, session: Session) -> None:

@@ -9,14 +9,14 @@ A running emulator listens on a free TCP port of the loopback interface. Its ses
 * publishes ``statistics`` once a second.
 
 A query is a JSON object. It must hold ``token``, the secret of the session file. ``change`` takes
-``link`` (optional if there is one), ``direction`` (``forward``, the default, ``reverse`` or
+``link`` (optional if there is only one), ``direction`` (``forward``, the default, ``reverse`` or
 ``both``) and either ``words`` (of ``tc netem``) or ``settings`` (a
 :class:`~noack.impairments.link_settings.LinkSettings`). The new settings replace the old ones, as
-with ``tc qdisc change``. The client reads files that words name, and sends their content. A query
-with a mistake is answered with one line, and changes nothing.
+with ``tc qdisc change``. If words name files, the client reads them and sends their content. A
+query with a mistake is answered with one line, and changes nothing.
 
-zenoh asks each connection for the secret as a password, by challenge and response, so that the
-secret itself is never sent. Each query is checked for it again.
+zenoh authenticates each connection with the secret as its password, by challenge and response: this
+never sends the secret itself. In addition, each query must contain the secret.
 
 All of this runs in a thread of its own; see :mod:`netem.control.command_queue`.
 """

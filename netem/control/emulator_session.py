@@ -1,6 +1,6 @@
 """Session files: the address of a running emulator, and its secret.
 
-A file lies in the user's runtime directory, readable by its owner only, while the emulator runs
+While the emulator runs, its file is in the user's runtime directory, readable by its owner only
 (:mod:`noack.runtime.lock_file`).
 """
 
@@ -59,7 +59,10 @@ def published(session: Session) -> Iterator[Path]:
 
 @contextmanager
 def starting(name: str | None) -> Iterator[None]:
-    """Publish that an emulator starts, which may take long; None: it has no name.
+    """Publish within the context that an emulator starts; the start may take long.
+
+    Args:
+        name: the emulator's name; None: nothing is published.
 
     Raises:
         CallerError: the name is not allowed or in use, or the folder is not the user's own.
@@ -77,16 +80,16 @@ def running() -> list[str]:
     """Return the names of this user's emulators that accept commands.
 
     Raises:
-        CallerError: the folder is open to others.
+        CallerError: other users have access to the folder.
     """
     return list(_files())
 
 
 def find(name: str | None) -> Session:
-    """Return the session of the named emulator, or of the only one that runs.
+    """Return the session of the named emulator; if ``name`` is None, of the only running one.
 
     Raises:
-        CallerError: there is no such emulator, or there are several to choose from.
+        CallerError: there is no such emulator, or several run and none is named.
         PeerError: it is still starting, or its session file cannot be read.
     """
     files = _files()

@@ -1,7 +1,7 @@
-"""A relay's statistics as a JSON document: its keys, and how reports become a document.
+"""A relay's statistics as a JSON document: its keys, and its construction from reports.
 
-Keys are only ever added. Counts are totals since the relay started; ``recent`` covers the time
-since the previous document.
+Later versions may add keys, but remove none. Counts are totals since the relay started; ``recent``
+covers the time since the previous document.
 """
 
 from datetime import UTC, datetime
@@ -38,14 +38,14 @@ class DelayQuantiles(TypedDict):
 
 
 class LossStatistics(TypedDict):
-    """Shares of the datagrams since the present settings apply; null if unknown."""
+    """Shares of the datagrams that arrived under the present settings; null if unknown."""
 
     realised: float | None
-    """Not effectively delivered: lost, or delivered out of order (stale)."""
+    """Share not effectively delivered: lost, or delivered out of order (stale)."""
     lost: float | None
-    """No intact copy was forwarded."""
+    """Share without an intact forwarded copy."""
     drawn: float | None
-    """Dropped or corrupted by the settings' random draws, not by a full queue or a blackout."""
+    """Share dropped or corrupted by a random draw, not by a full queue or a blackout."""
     predicted: float | None
     """Expected value of ``drawn``; see :mod:`netem.loss_prediction`."""
 
@@ -106,7 +106,7 @@ class DirectionStatistics(TypedDict):
     """Datagrams that are delayed or wait for a bottleneck now."""
     most_in_flight: int
     flows: list[FlowStatistics]
-    """The present clients that sent most, at most 16."""
+    """At most 16: the present clients that sent most."""
     delay_ns: DelayQuantiles
     """From arrival to departure."""
     lateness_ns: DelayQuantiles
@@ -131,8 +131,8 @@ class LinkStatistics(TypedDict):
     discarded: int
     """Answers to a link without a reverse direction; 0 if the system does not count them."""
     port_unreachable: int
-    """ICMP messages that no program listens at the server's port; a lower bound on the datagrams
-    lost there."""
+    """ICMP port-unreachable messages from the server's host; a lower bound on the datagrams lost
+    there."""
     forward: DirectionStatistics
     reverse: DirectionStatistics
 
@@ -248,8 +248,8 @@ def unintended(totals: Statistics) -> int:
 def loss_share(after: Counters, before: Counters) -> float | None:
     """Return the share of the arrived datagrams that was not effectively delivered.
 
-    None if no datagram arrived. A stale datagram counts when it is forwarded, so that more may be
-    lost than arrived in a short time; the share is at most 1.
+    None if no datagram arrived. A stale datagram counts when it is forwarded; in a short interval,
+    more datagrams may therefore be lost than arrived. The share is limited to 1.
     """
     arrived = after.arrived - before.arrived
     if arrived == 0:

@@ -1,4 +1,4 @@
-"""The live screen: a full picture on a terminal, lines of text or JSON on any other output."""
+"""The live screen: a full-screen view on a terminal, lines of text or JSON on other outputs."""
 
 import contextlib
 import io

@@ -41,7 +41,7 @@ def elapsed_text(elapsed_s: float) -> str:
 
 
 def sparkline(values: Sequence[float | None], top: float) -> str:
-    """Return one block per value: of full height at ``top``, blank where there is no value."""
+    """Return one block per value: full height at ``top``, a blank for None."""
     last = len(_BLOCKS) - 1
     return "".join(
         " " if value is None else _BLOCKS[min(max(round(value / (top or 1.0) * last), 0), last)]

@@ -1,4 +1,4 @@
-"""What watches and changes a relay while it runs: live control, statistics lines, live screen."""
+"""Live control, statistics lines and the live screen of a running relay."""
 
 import argparse
 import math
@@ -19,11 +19,11 @@ from noack.core.errors import CallerError
 _VIEW_S = 1.0
 _POLL_S = 0.05
 _SWITCH_S = 0.0002
-"""Longest time for which another thread keeps the interpreter while the relay's thread waits."""
+"""Maximum time for which another thread holds the interpreter lock before the relay's thread."""
 
 
 class Options(NamedTuple):
-    """How a relay is watched and changed."""
+    """Options for watching and changing a relay."""
 
     name: str | None = None
     """Name for live control; None: no live control."""
@@ -58,7 +58,7 @@ def options_of(parsed: argparse.Namespace) -> Options:
     """Return the options of :func:`add_options`.
 
     Raises:
-        CallerError: they contradict each other.
+        CallerError: two options contradict each other.
     """
     stats_s, file = parsed.stats, parsed.stats_file
     if stats_s is not None and not (math.isfinite(stats_s) and stats_s >= 0.01):
@@ -71,10 +71,10 @@ def options_of(parsed: argparse.Namespace) -> Options:
 
 
 class AttachedRelay:
-    """What the relay's thread needs of the threads that watch it.
+    """The relay thread's access to the threads that watch the relay.
 
     Args:
-        commands: run in the relay's thread, at least every 50 ms.
+        commands: to be run in the relay's thread, at least every 50 ms.
         screen: the live screen, if there is one.
     """
 
@@ -90,7 +90,7 @@ class AttachedRelay:
 
 @contextmanager
 def attached(relay: Relay, options: Options) -> Iterator[AttachedRelay]:
-    """Watch a relay that runs within the context and is closed after it.
+    """Watch a relay within the context; the relay runs within it and is closed after it.
 
     Enter the context before the relay's thread applies real-time settings: new threads would
     inherit them.

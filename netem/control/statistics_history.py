@@ -36,7 +36,7 @@ class History:
     ) -> Sequence[float | None]:
         """Return the last minute of a value of :class:`RecentRates`, (points,); None: unknown.
 
-        A sample is valid from the sample before it on. A point is the mean of its samples.
+        A sample covers the time since the previous sample. A point is the mean of its samples.
         """
         if self.latest is None:
             return [None] * points

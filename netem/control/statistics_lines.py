@@ -17,7 +17,7 @@ from noack.core.errors import CallerError
 
 @contextmanager
 def statistics_lines(commands: CommandQueue, period_s: float, path: Path | None) -> Iterator[None]:
-    """Write a line at once, every ``period_s``, and at the end of the context.
+    """Write a line at the start of the context, every ``period_s``, and at its end.
 
     If a line cannot be written, a message on standard error reports it, and the relay continues.
 
@@ -61,7 +61,7 @@ class _LineWriter:
                 f"statistics cannot be written to {self._name} ({error.strerror}); "
                 "the relay continues"
             )
-            # Closing the file writes the buffer once more, which must not fail.
+            # Closing the file writes the buffer once more; this must not fail.
             nothing = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nothing, self._file.fileno())
             os.close(nothing)

@@ -1,4 +1,4 @@
-"""A thread that takes an emulator's statistics at intervals and hands them to a consumer."""
+"""A thread that reads an emulator's statistics at intervals and passes them to a consumer."""
 
 import threading
 import time
@@ -22,8 +22,8 @@ class StatisticsThread:
         period_s: time between two calls of ``show``.
         show: takes the statistics.
         poll: called every ``poll_s``.
-        at_end: whether ``show`` gets final statistics at the end of the context. The relay must
-            have ended by then.
+        at_end: whether ``show`` is called with the final statistics at the end of the context. The
+            relay must have ended by then.
     """
 
     def __init__(

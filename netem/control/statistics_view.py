@@ -1,4 +1,4 @@
-"""An emulator's statistics as a picture in the terminal, and as lines of text.
+"""An emulator's statistics as a full-screen view in the terminal, and as lines of text.
 
 Each link has a panel with its two directions side by side. If the terminal has no room for all
 panels, a table has one row per direction.
@@ -41,7 +41,7 @@ _LOST = ("dropped", "corrupted", "overflowed", "blacked_out")
 
 
 def render(history: History, title: str, width: int, height: int | None) -> RenderableType:
-    """Return the picture of the latest statistics.
+    """Return the full-screen view of the latest statistics.
 
     Args:
         history: the statistics.

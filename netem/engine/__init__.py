@@ -1,1 +1,1 @@
-"""The relay: sockets around the link, compiled where that is to be had, plain elsewhere."""
+"""The relay's engines: sockets and the rules of links, compiled if possible, else plain Python."""

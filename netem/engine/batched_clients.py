@@ -1,4 +1,4 @@
-"""Clients of the Linux engine: rows in the pump's memory, and a return path each."""
+"""Clients of the Linux engine: a row in the pump's memory and a return path for each."""
 
 import errno
 from collections.abc import Iterator, Sequence
@@ -30,10 +30,10 @@ class ClientTable:
 
     Args:
         links: the links.
-        ways: the directions, two of each link in turn.
-        memory: the pump's.
-        functions: the pump's, compiled.
-        epoll: what the pump waits with.
+        ways: (2 · links,) forward and reverse direction of each link.
+        memory: the pump's memory.
+        functions: the compiled functions of the pump.
+        epoll: the epoll object with which the pump waits.
     """
 
     def __init__(
@@ -54,17 +54,17 @@ class ClientTable:
         self._paths: dict[int, Endpoint] = {}
         self._drops: dict[int, int] = {}
         self.drops = [0] * len(links)
-        """What the kernel has dropped at the return paths of a link, as far as it was asked."""
+        """(links,) Datagrams dropped by the kernel at the return paths, when last queried."""
         self._unasked: Iterator[int] = iter(())
         self._idle_ns = np.array([round(link.spec.idle_s * 1e9) for link in links], np.int64)
         self._refusals = [RefusedClients(link.spec) for link in links]
         self._expired_ns = 0
 
     def add(self, link: int, name: bytes) -> None:
-        """Take a new client, or let the link be full.
+        """Add a client; if that is impossible, mark the link as full.
 
         Args:
-            link: the client's.
+            link: number of the client's link.
             name: its socket address, NAME_BYTES long.
         """
         refusals, path, error = self._refusals[link], None, 0
@@ -80,10 +80,10 @@ class ClientTable:
             self._memory.memory.directions["full"][2 * link] = 1
 
     def expire(self, now_ns: int) -> None:
-        """Forget the clients that have been idle, and of which nothing is under way."""
+        """Remove the clients that have been idle and have no datagram in flight."""
         clients = self._memory.memory.clients
         if now_ns - self._expired_ns > STOPPED_NS:
-            # It was stopped itself: what clients sent meanwhile has not been read yet.
+            # The engine was stopped: datagrams that arrived meanwhile have not been read yet.
             clients["last_ns"] = now_ns
         self._expired_ns = now_ns
         since_ns = now_ns - self._idle_ns[clients["link"]]
@@ -94,7 +94,7 @@ class ClientTable:
                 self._forget(row)
 
     def reconnect(self) -> None:
-        """Try again where there was no way to the server."""
+        """Open the return paths again that could not be opened before."""
         sockets, first = self._memory.memory.sockets, self._memory.first_path
         clients = self._memory.memory.clients
         for row in np.flatnonzero(sockets["error"][first:]).tolist():
@@ -106,7 +106,7 @@ class ClientTable:
                 self._set_path(row, path)
 
     def ask_some(self) -> None:
-        """Ask some return paths what the kernel has dropped; all in turn."""
+        """Query the kernel's drop counters of some return paths; successive calls cover all."""
         for _ in range(_LOOKED_AT):
             row = next(self._unasked, None)
             if row is None:
@@ -116,21 +116,21 @@ class ClientTable:
                 self._ask(row)
 
     def ask_all(self) -> None:
-        """Ask all return paths what the kernel has dropped."""
+        """Query the kernel's drop counters of all return paths."""
         for row in self._paths:
             self._ask(row)
 
     def rows_of(self, link: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        """Rows of the clients of a link."""
+        """Return the rows of a link's clients."""
         clients = self._memory.memory.clients
         return np.flatnonzero((clients["number"] >= 0) & (clients["link"] == link))
 
     def address(self, row: int) -> Address:
-        """A client's address."""
+        """Return a client's address."""
         return address_of_name(self._memory.memory.clients["name"][row].tobytes())
 
     def stamp_arrivals(self, link: int) -> None:
-        """Let the kernel say when the answers to a link's clients come."""
+        """Enable kernel timestamps for the answers to a link's clients."""
         for row in self.rows_of(link).tolist():
             if row in self._paths:
                 stamp_arrivals(self._paths[row])
@@ -211,7 +211,7 @@ class ClientTable:
 
     def _insert(self, row: int) -> None:
         memory = self._memory.memory
-        # A copy may be written to, and so is of the type that the function was loaded for.
+        # A writable copy has the array type for which the function was compiled.
         name = np.frombuffer(memory.clients["name"][row].tobytes(), np.int64).copy()
         self._functions.insert(memory.table, memory.clients, row, name)
 

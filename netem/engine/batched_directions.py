@@ -1,4 +1,4 @@
-"""The two directions of each link in the pump's memory: programs, and states that grow."""
+"""The directions of links in the pump's memory: programs, and states that grow with the flows."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ _ROWS = 16
 
 
 class Grown(NamedTuple):
-    """What grows with the number of flows."""
+    """The arrays whose length is the number of flows."""
 
     flows: NDArray[Any]
     memory: NDArray[Any]
@@ -28,10 +28,10 @@ class BatchedDirection:
     """One direction of a link.
 
     Args:
-        settings: what it does.
-        seed: of its random streams.
-        name: of the link and the direction.
-        decisions: recorded ones, of each flow.
+        settings: the settings.
+        seed: seed of the random streams.
+        name: names of the link and the direction.
+        decisions: recorded decisions per flow.
         row: its row of :data:`netem.engine.pump.pump_layout.DIRECTION`, (1,).
         link_state: its row of :class:`noack.impairments.link_records.LinkState`, (1,).
         counters: its row of :class:`noack.impairments.link_records.Counters`, (1,).
@@ -58,25 +58,25 @@ class BatchedDirection:
 
     @property
     def rows(self) -> int:
-        """How many flows there is room for."""
+        """Maximum number of flows without growing."""
         return len(self.state.flows)
 
     def start_flow(self, row: int, number: int) -> None:
-        """Make room for a flow, in a row that is free."""
+        """Initialise a free row for a new flow; grow if necessary."""
         while row >= self.rows:
             self._grow()
         set_flow(self.state, row, number, self.settings.first_delivered)
 
     def change(self, settings: LinkSettings, latest_ns: NDArray[np.int64]) -> None:
-        """Go on with other settings.
+        """Apply other settings.
 
         Args:
-            settings: what it does from now on.
-            latest_ns: (rows,) when the last that is under way leaves; −1 none.
+            settings: the new settings.
+            latest_ns: (rows,) last departure time of the packets in flight of each flow; −1: none.
         """
         old = self.program
         plain = program_of(settings, self._seed, *self._name, tracks=old.tracks)
-        # There may be millions, and the relay is waiting.
+        # Reuse the arrays: there may be millions of recorded decisions, and the relay waits.
         program = compiled_program(plain)._replace(
             decisions=old.decisions, decisions_begin=old.decisions_begin
         )
@@ -98,7 +98,7 @@ class BatchedDirection:
         self._show()
 
     def _show(self) -> None:
-        """Write down where everything lies."""
+        """Store the addresses and lengths of all arrays in the direction's row."""
         row = self._row
         for name in TABLES:
             table: Any = getattr(self.program, name)

@@ -1,4 +1,4 @@
-"""The Linux engine: one thread, which returns to Python only for what is rare."""
+"""The Linux engine: one thread, which runs compiled code and returns to Python for rare events."""
 
 import ctypes
 import time
@@ -57,12 +57,12 @@ class BatchedRelay:
 
     Args:
         specs: the links.
-        segment: let runs of datagrams of equal size leave as one message that the kernel cuts.
-        taps: what sees everything.
-        spin_ns: do not sleep for so long before a delayed datagram is due.
+        segment: send successive datagrams of equal size as one message, which the kernel segments.
+        taps: receivers of all events.
+        spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due.
 
     Raises:
-        CallerError: a socket cannot be bound, or a link makes no sense.
+        CallerError: a socket cannot be bound, or a link is invalid.
     """
 
     engine = "batched"
@@ -113,10 +113,10 @@ class BatchedRelay:
         self._verdicts = np.zeros(1, dtype_of(PacketDecision))
         self._rarely_ns = 0
         self.began_unix_ns: int | None = None
-        """Unix time at which the relay began to run, to which its times refer."""
+        """Unix time at which the relay started to run; the origin of its times."""
 
     def addresses(self) -> Mapping[str, Address]:
-        """Where each link listens."""
+        """Return the address at which each link listens."""
         return {link.spec.name: link.address for link in self._links}
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
@@ -155,7 +155,7 @@ class BatchedRelay:
         raise CallerError(f"link {link}: there is none of this name, but {names}")
 
     def report(self) -> Sequence[LinkReport]:
-        """What has happened so far."""
+        """Return the counts so far."""
         self._look_at_losses()
         reports = []
         for number, link in enumerate(self._links):
@@ -199,7 +199,7 @@ class BatchedRelay:
         memory.directions["sends"][2 * number + 1] = CLIENT_NAME
 
     def _stamp_arrivals(self, place: int) -> None:
-        """Where something is delayed, count from when it came, not from when it was read."""
+        """Enable arrival timestamps where datagrams are delayed: delays count from the arrival."""
         if self._ways[place].program.tracks:
             self._memory.pump["stamps"] = 1
             self._memory.read_controls()
@@ -209,7 +209,7 @@ class BatchedRelay:
                 self._clients.stamp_arrivals(place // 2)
 
     def call_all(self) -> None:
-        """Call every compiled function once, which loads it."""
+        """Call every compiled function once, to load it."""
         self._run_pump(_LONG_AGO_NS)
         memory, way = self._memory.memory, self._ways[0]
         self._functions.insert(memory.table, memory.clients, 0, memory.in_names[0])
@@ -224,7 +224,7 @@ class BatchedRelay:
         )
 
     def _serve(self, reason: int) -> None:
-        """Do what the pump cannot do by itself."""
+        """Handle the reason why the pump returned."""
         if reason == NEW_CLIENT:
             pump = self._memory.pump
             name = self._memory.memory.in_names[pump["batch_next"]].tobytes()
@@ -243,7 +243,7 @@ class BatchedRelay:
             pump["events"] = pump["data"] = 0
 
     def _keep_house(self, now_ns: int) -> None:
-        self._memory.pump["no_memory"] = 0  # ask again
+        self._memory.pump["no_memory"] = 0  # check again
         self._look_at_losses()
         self._clients.ask_some()
         if now_ns >= self._rarely_ns:
@@ -296,7 +296,7 @@ class BatchedRelay:
 
 @contextmanager
 def _shortest_timer_slack() -> Iterator[None]:
-    """Let this thread's timers fire as soon as they can, which needs no privilege."""
+    """Set this thread's timer slack to the minimum; this needs no privilege."""
     libc = ctypes.CDLL(None)
     slack_ns = 0
     with suppress(AttributeError):
@@ -311,7 +311,7 @@ def _shortest_timer_slack() -> Iterator[None]:
 
 @cache
 def load() -> None:
-    """Load or compile all that is compiled, once; what came to an open port would wait for it."""
+    """Load or compile the code once, before ports are open: else datagrams would wait for it."""
     nothing = LinkSettings()
     spec = LinkSpec("none", (LOOPBACK, 0), (LOOPBACK, 9), nothing, nothing)
     told = nullcontext() if are_kept() else announced("the relay", folder(), _COMPILING_S)

@@ -13,7 +13,7 @@ _SOURCES: Any = (run_pump, insert, remove, carry)
 
 
 class Functions(NamedTuple):
-    """What Python calls."""
+    """The functions that Python calls."""
 
     run_pump: Callable[..., int]
     insert: Callable[..., None]
@@ -23,10 +23,10 @@ class Functions(NamedTuple):
 
 @cache
 def functions() -> Functions:
-    """Return them; each is compiled, or loaded, when it is first called."""
+    """Return the functions; each is compiled or loaded at its first call."""
     return Functions(*map(compile_rule, _SOURCES))
 
 
 def are_kept() -> bool:
-    """Whether all have been compiled before, for this machine."""
+    """Whether compiled code of all functions is in the cache, for this machine."""
     return all(map(is_kept, _SOURCES))

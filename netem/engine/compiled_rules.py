@@ -1,6 +1,6 @@
-"""Compiles the rules of a link with numba: the very functions that :mod:`netem.link_machine` runs.
+"""Compiles the rules of a link with numba: the same functions that :mod:`netem.link_machine` runs.
 
-What is compiled is kept in the user's cache; see :mod:`noack.core.code_cache`.
+The compiled code is kept in the user's cache; see :mod:`noack.core.code_cache`.
 """
 
 import importlib
@@ -41,7 +41,7 @@ from noack.impairments.stage_dispatch import (
 
 
 def compiled_program(program: LinkProgram) -> LinkProgram:
-    """Return a program as arrays, for compiled rules; a row of ``stages`` has the fields of all."""
+    """Return a program as arrays, for compiled rules; ``stages`` rows have all stages' fields."""
     tables: dict[str, Any] = {
         "stages": array_of(union_dtype(STAGE_RECORDS), program.stages),
         "decisions": array_of(dtype_of(link_records.RecordedDecision), program.decisions),
@@ -58,7 +58,7 @@ def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: in
     Args:
         program: the link's program.
         state: its state without flows, from :func:`netem.rule_program.empty_state`.
-        rows: how many.
+        rows: maximum number of flows.
         width: length of the rings of release times.
     """
     arrays: dict[str, Any] = {
@@ -74,7 +74,7 @@ def compiled_state(program: LinkProgram, state: LinkMemory, rows: int, width: in
 
 
 def set_flow(state: LinkMemory, row: int, number: int, first_delivered: bool) -> None:
-    """Let a row of a state of arrays be that of a new flow."""
+    """Initialise a row of a state of arrays for a new flow."""
     flows, memory, recent_ns = _arrays(state)
     flows[row] = array_of(flows.dtype, [new_flow(number, first_delivered)])[0]
     memory[row] = np.zeros(1, memory.dtype)
@@ -85,35 +85,35 @@ def _arrays(state: LinkMemory) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]
     return state.flows, state.memory, state.recent_ns  # type: ignore[return-value]
 
 
-# Without reference counts: nothing is allocated, and counting the twenty arrays of program and
-# state at each call would take twenty times as long as the decision.
+# No reference counting: nothing is allocated, and counting references to the twenty arrays of
+# program and state at each call would take twenty times as long as the decision.
 _OPTIONS = {"_nrt": False, "forceinline": True}
 
 
 @cache
 def compile_rule(function: Callable[..., Any]) -> Any:
-    """Compile a function that calls rules; without the global lock, and cached on disk.
+    """Compile a function that calls rules; it runs without the interpreter lock, cached on disk.
 
-    It must not allocate: no new arrays, lists or strings.
+    The function must not allocate: no new arrays, lists or strings.
     """
     return compiler(_prepare(), nogil=True, _nrt=False)(function)
 
 
 def compile_kept(function: Callable[..., Any], folder: Path | None) -> Any:
-    """Compile a function, and keep it in a folder of :func:`prepare`, if there is one."""
+    """Compile a function; cache it in a folder of :func:`prepare`, if there is one."""
     return compiler(folder, nogil=True, _nrt=False)(function)
 
 
 @cache
 def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
-    """Let compiled code call the functions of modules that call rules.
+    """Prepare the compilation of modules that call rules.
 
     Args:
-        name: of what is compiled.
-        modules: all whose functions are compiled, or that these depend on.
+        name: name of the compiled code.
+        modules: the modules with compiled functions, and those on which these depend.
 
     Returns:
-        Where it is kept; None if it is not.
+        The cache folder of the compiled code; None if there is no cache.
     """
     _prepare()
     _register(modules)
@@ -122,18 +122,18 @@ def prepare(name: str, modules: tuple[ModuleType, ...]) -> Path | None:
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Whether a function has been compiled before, for this machine."""
+    """Whether compiled code of a function is in the cache, for this machine."""
     return code_cache.is_kept(_prepare(), function)
 
 
 def folder() -> Path | None:
-    """Where what is compiled is kept for the next run, if it is."""
+    """Return the cache folder of the compiled code; None if there is no cache."""
     return _prepare()
 
 
 @cache
 def _prepare() -> Path | None:
-    """Let compiled code call the rules; return where it is kept, if it is."""
+    """Prepare the compilation of the rules; return the cache folder, None if there is none."""
     modules = list(_compiled_modules())
     _register(modules)
     sources = (*modules, relay_events)
@@ -157,7 +157,7 @@ def compiled_dispatch(
 ) -> Callable[..., None]:
     """Return :func:`noack.impairments.stage_dispatch.apply_stage` for compiled code.
 
-    It compares a stage's kind with each behaviour's number in turn: ``if kind == 0: ... else: if
+    It compares a stage's kind with each behaviour's number in order: ``if kind == 0: ... else: if
     kind == 1: ...``; the compiler makes a jump table of it.
     """
     return _comparisons()

@@ -1,4 +1,4 @@
-"""Opens a relay with the fastest engine that there is."""
+"""Opens a relay with the fastest available engine."""
 
 import importlib.util
 import platform
@@ -24,17 +24,17 @@ def open_relay(
 
     Args:
         specs: the links, at least one.
-        engine: ``batched`` is the fast one, for Linux; ``plain`` runs everywhere; ``auto`` takes
-            the fast one where it is to be had.
-        segment: let runs of datagrams of equal size leave as one message that the kernel cuts,
-            where it does. The plain engine does not.
-        taps: what sees everything that the relay does.
-        spin_ns: do not sleep for so long before a delayed datagram is due; it then leaves sooner
-            than a sleeper wakes. The plain engine sleeps.
+        engine: ``batched`` is the fast engine, for Linux; ``plain`` runs everywhere; ``auto`` uses
+            the fast engine if it is available.
+        segment: send successive datagrams of equal size as one message, which the kernel segments,
+            if the kernel supports it. The plain engine ignores this.
+        taps: receivers of all events.
+        spin_ns: busy-wait instead of sleeping for this time before a delayed datagram is due, to
+            avoid the delay of a wake-up. The plain engine ignores this.
 
     Raises:
-        CallerError: a socket cannot be bound, a link makes no sense, or the engine is not to be had
-            here.
+        CallerError: a socket cannot be bound, a link is invalid, or the engine is not available on
+            this machine.
     """
     missing = compiled_engine_is_missing()
     if engine == "batched" and missing:
@@ -48,7 +48,7 @@ def open_relay(
 
 
 def compiled_engine_is_missing() -> str:
-    """Why there is no fast engine; empty if there is."""
+    """Return why the fast engine is not available; empty if it is available."""
     if (
         sys.platform != "linux"
         or sys.byteorder != "little"

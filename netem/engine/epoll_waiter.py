@@ -1,4 +1,4 @@
-"""What the pump waits with: epoll, which tells the number of a socket that is ready."""
+"""The pump's epoll object, which returns the numbers of the sockets that are ready."""
 
 import ctypes
 import os
@@ -13,22 +13,22 @@ _FORMAT = "=IQ" if READY_WORDS == 3 else "=IIQ"
 
 
 class Epoll:
-    """An epoll."""
+    """An epoll object."""
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
         self._libc = ctypes.CDLL(None, use_errno=True)
 
     def fileno(self) -> int:
-        """Its file descriptor."""
+        """Return the file descriptor."""
         return self._epoll.fileno()
 
     def add(self, fd: int, number: int) -> None:
-        """Wait for datagrams at a socket too; closing the socket ends that.
+        """Add a socket to wait for; closing the socket removes it.
 
         Args:
-            fd: the socket's.
-            number: what is told when it is ready.
+            fd: file descriptor of the socket.
+            number: returned when the socket is ready.
         """
         pad = [0] * (READY_WORDS - 3)
         event = struct.pack(_FORMAT, select.EPOLLIN, *pad, number)
@@ -47,5 +47,5 @@ class Epoll:
         return bool(found >= 0)
 
     def close(self) -> None:
-        """Close it."""
+        """Close the epoll object."""
         self._epoll.close()

@@ -1,6 +1,6 @@
 """A histogram of times: 32 buckets for each doubling, so that a bucket is at most 3 % wide.
 
-It is an array of counts, (BUCKETS,); bucket k holds the times t with lower_ns(k) ≤ t <
+It is an array of counts, (BUCKETS,); bucket k counts the times t with lower_ns(k) ≤ t <
 lower_ns(k + 1).
 """
 
@@ -14,11 +14,11 @@ _STEPS = 1 << _STEP_BITS
 _MOST_BITS = 44
 _JOINED = 8
 BUCKETS = (_MOST_BITS - _STEP_BITS + 1) * _STEPS
-"""The last one also holds all that is longer: 4.8 hours and more."""
+"""Number of buckets. The last one also counts all longer times: 4.8 hours and more."""
 
 
 def bucket_of(t_ns: int) -> int:
-    """Bucket of a time; times below 0 count as 0."""
+    """Return the bucket of a time; times below 0 count as 0."""
     if t_ns < _STEPS:
         return max(t_ns, 0)
     if t_ns >> _MOST_BITS != 0:
@@ -41,7 +41,7 @@ def bucket_of(t_ns: int) -> int:
 
 
 def lower_ns(bucket: int) -> int:
-    """Shortest time of a bucket."""
+    """Return the shortest time of a bucket."""
     if bucket < _STEPS:
         return bucket
     shift = (bucket >> _STEP_BITS) - 1
@@ -49,29 +49,29 @@ def lower_ns(bucket: int) -> int:
 
 
 def coarse(counts: NDArray[np.int64]) -> list[list[int]]:
-    """Return what a person or a plot needs of a histogram: four buckets for each doubling.
+    """Return a coarser histogram for people and plots: four buckets for each doubling.
 
     Args:
-        counts: (BUCKETS,) of a histogram.
+        counts: (BUCKETS,) a histogram.
 
     Returns:
-        Of each that is not empty: its shortest time in ns, and how many there are.
+        (shortest time in ns, count) of each bucket that is not empty.
     """
     joined = counts.reshape(-1, _JOINED).sum(axis=1)
     return [[lower_ns(_JOINED * k), int(joined[k])] for k in np.flatnonzero(joined).tolist()]
 
 
 def empty() -> NDArray[np.int64]:
-    """Return a histogram of nothing, (BUCKETS,)."""
+    """Return an empty histogram, (BUCKETS,)."""
     return np.zeros(BUCKETS, dtype=np.int64)
 
 
 def quantile_ns(counts: Sequence[int] | NDArray[np.int64], share: float) -> float:
-    """Return the time that ``share`` of all times do not exceed, to 3 %; nan of an empty one.
+    """Return a quantile in ns, accurate to 3 %; nan if the histogram is empty.
 
     Args:
-        counts: (BUCKETS,) of a histogram.
-        share: 0.5 for the median.
+        counts: (BUCKETS,) a histogram.
+        share: level of the quantile, 0.5 for the median.
     """
     reached = np.cumsum(counts)
     if reached[-1] == 0:

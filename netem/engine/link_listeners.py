@@ -1,4 +1,4 @@
-"""Links with their listening sockets, as every engine begins."""
+"""Links with their listening sockets; used by both engines."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -21,48 +21,49 @@ from noack.runtime.udp_sockets import drops_of
 
 @dataclass(frozen=True)
 class OpenLink:
-    """A link that listens."""
+    """A link with its listening socket."""
 
     spec: LinkSpec
     endpoint: Endpoint
-    """Where clients send to."""
+    """The socket to which clients send."""
     server: ListenAddress
     path: Endpoint | None
-    """Where it sends from, if it takes no answers; else each client has a path of its own."""
+    """The socket that sends to the server, if there is no reverse direction; else None: each client
+    has its own return path."""
 
     @property
     def here(self) -> ListenAddress:
-        """Where it listens."""
+        """The address at which the link listens, for its socket."""
         return ListenAddress(int(self.endpoint.family), self.endpoint.getsockname())
 
     @property
     def local(self) -> ListenAddress:
-        """Where it sends to the server from, unless each client has a path of its own."""
+        """The address that sends to the server, unless each client has its own return path."""
         endpoint = self.path or self.endpoint
         return ListenAddress(int(endpoint.family), endpoint.getsockname())
 
     @property
     def address(self) -> Address:
-        """Where it listens."""
+        """The address at which the link listens."""
         return address_of(self.endpoint.getsockname())
 
     @property
     def discarded(self) -> int:
-        """Answers that it did not take, as far as the kernel says."""
+        """Number of answers that the kernel discarded; 0 if the kernel does not count them."""
         return 0 if self.path is None else drops_of(self.path) or 0
 
     def close(self) -> None:
-        """Close its sockets."""
+        """Close the sockets."""
         self.endpoint.close()
         if self.path is not None:
             self.path.close()
 
 
 def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
-    """Bind all links' sockets, or none.
+    """Bind the sockets of all links; if one fails, close them all.
 
     Raises:
-        CallerError: one cannot be bound, or a link makes no sense.
+        CallerError: a socket cannot be bound, or a link is invalid.
     """
     names = [spec.name for spec in specs]
     for name in names:
@@ -87,7 +88,7 @@ def open_links(specs: Sequence[LinkSpec]) -> Sequence[OpenLink]:
 
 
 def _refuse_loops(links: Sequence[OpenLink]) -> None:
-    """A datagram that comes back would be a new client's each time, and never end."""
+    """Refuse links that form a loop: each returning datagram would count as a new client's."""
     by_port: dict[int, list[tuple[OpenLink, ListenAddress]]] = {}
     for link in links:
         by_port.setdefault(link.address[1], []).append((link, link.here))

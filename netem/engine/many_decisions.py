@@ -14,7 +14,7 @@ def admit_many(
     arrivals_ns: Sequence[int],
     decisions: Sequence[PacketDecision],
 ) -> None:
-    """Decide for k packets, in the order of their arrival; see :func:`admit`."""
+    """Decide for k packets, in order of arrival; see :func:`admit`."""
     for number in range(len(flows)):
         admit(
             program, state, flows[number], sizes_bytes[number], arrivals_ns[number],

@@ -1,4 +1,4 @@
-"""One direction of a link in the portable engine: the machine, and what is counted of it."""
+"""One direction of a link in the portable engine: the machine and its counters."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,7 +16,7 @@ from noack.protocol.record_tables import NETEM_RELEASE
 
 
 class ScheduledDeparture(NamedTuple):
-    """A datagram, or a copy, that is to be sent."""
+    """A datagram or a copy to be sent."""
 
     flow: int
     data: bytes
@@ -31,14 +31,14 @@ class ScheduledDeparture(NamedTuple):
 
 
 class _Kept(NamedTuple):
-    """What is known of a datagram of which something is under way."""
+    """A datagram that is in flight, or whose copy is."""
 
     arrival_ns: int
     fate: int
     bits: tuple[int, int]
-    """Of the datagram and of its copy."""
+    """Flipped bits of the datagram and of its copy."""
     left: int
-    """How many are under way."""
+    """Number of these two that are still in flight."""
 
 
 class PlainDirection:
@@ -46,8 +46,8 @@ class PlainDirection:
 
     Args:
         spec: the link.
-        direction: which.
-        settings: what it does.
+        direction: forward or reverse.
+        settings: the settings.
     """
 
     def __init__(self, spec: LinkSpec, direction: Direction, settings: LinkSettings) -> None:
@@ -56,14 +56,14 @@ class PlainDirection:
         self.link = Link(settings, spec.seed, spec.name, direction, decisions=decisions)
         self.losses = UnintendedLosses(spec.name, direction)
         self.errors: Counter[int] = Counter()
-        """Datagrams that could not be sent, or kept until then, by errno."""
+        """Number of datagrams that could not be sent or stored, by errno."""
         self._delays, self._lateness = empty(), empty()
         self._kept: dict[tuple[int, int], _Kept] = {}
 
     def admit(
         self, flow: int, data: bytes, now_ns: int
     ) -> tuple[PacketDecision, Sequence[ScheduledDeparture]]:
-        """Decide what becomes of a datagram; return what leaves at once."""
+        """Decide for a datagram; return the departures that are due at once."""
         outputs = self.link.handle(Datagram(flow, data), now_ns)
         decision = self.link.decision
         times_ns = (decision.release_ns, decision.copy_ns)
@@ -82,23 +82,23 @@ class PlainDirection:
         ]  # fmt: skip
 
     def due(self, now_ns: int) -> Iterator[ScheduledDeparture]:
-        """Let out what is due, one by one."""
+        """Yield the departures that are due, one by one."""
         while (deadline_ns := self.link.next_deadline_ns()) is not None and deadline_ns <= now_ns:
             yield self._departure(self.link.on_timer(now_ns))
 
     def sent(self, departure: ScheduledDeparture, now_ns: int) -> None:
-        """Take note that a datagram was sent."""
+        """Record that a datagram was sent."""
         self._delays[bucket_of(now_ns - departure.arrival_ns)] += 1
         if departure.delayed:
             self._lateness[bucket_of(now_ns - departure.release_ns)] += 1
 
     def change(self, settings: LinkSettings) -> None:
-        """Go on with other settings."""
+        """Apply other settings."""
         self.settings = settings
         self.link.change(settings)
 
     def report(self, flows: Sequence[FlowReport]) -> DirectionReport:
-        """What has happened so far."""
+        """Return the counts so far."""
         for error, datagrams in self.errors.items():
             self.losses.not_sent(error, datagrams)
         return DirectionReport(

@@ -49,12 +49,12 @@ _REPORTED_FLOWS = 16
 class _Client:
     number: int
     place: Any
-    """Its address as sockets want it."""
+    """The client's address in the form that sockets use."""
     path: Endpoint | None
     error: int
-    """Why there is no return path."""
+    """errno: why there is no return path; 0 if there is one."""
     local: Address
-    """Where its return path is."""
+    """Local address of the return path."""
     last_ns: int
     in_flight: int = 0
     drops: int = 0
@@ -80,19 +80,19 @@ class _PlainLink:
         self.unreachable = UnreachableServers(spec)
 
     def take_errors(self, endpoint: Endpoint) -> bool:
-        """Whether there are ICMP errors of earlier datagrams; no more are there then."""
+        """Empty a socket's error queue; return whether there were ICMP errors."""
         found = icmp_errors(endpoint)
         if endpoint is not self.link.endpoint:
             self.port_unreachable += found.count(errno.ECONNREFUSED)
         return bool(found)
 
     def way(self, back: bool) -> TapDirection:
-        """A direction, as taps are told."""
+        """Return a direction as reported to taps."""
         mansd = self.ways[back].settings.mansd
         return TapDirection(self.number, back, -1 if mansd is None else mansd)
 
     def ends(self, client: _Client) -> TapEndpoints:
-        """Where a client's datagrams go from and to."""
+        """Return the addresses between which a client's datagrams are sent."""
         spec = self.link.spec
         return TapEndpoints(address_of(client.place), self.link.address, client.local, spec.to)
 
@@ -102,10 +102,10 @@ class PlainRelay:
 
     Args:
         specs: the links.
-        taps: what sees everything.
+        taps: receivers of all events.
 
     Raises:
-        CallerError: a socket cannot be bound, or a link makes no sense.
+        CallerError: a socket cannot be bound, or a link is invalid.
     """
 
     engine = "plain"
@@ -113,7 +113,7 @@ class PlainRelay:
     def __init__(self, specs: Sequence[LinkSpec], taps: Sequence[Tap] = ()) -> None:
         self.specs: Sequence[LinkSpec] = tuple(specs)
         raise_file_limit()
-        # Before any link: select takes low file descriptors only.
+        # Opened before any link: select supports low file descriptors only.
         self._selector = selectors.DefaultSelector()
         self._links = [_PlainLink(*one) for one in enumerate(open_links(self.specs))]
         self._taps = PlainTaps(taps)
@@ -123,10 +123,10 @@ class PlainRelay:
         self._rarely_ns = 0
         self._no_memory = False
         self.began_unix_ns: int | None = None
-        """Unix time at which the relay began to run, to which its times refer."""
+        """Unix time at which the relay started to run; the origin of its times."""
 
     def addresses(self) -> Mapping[str, Address]:
-        """Where each link listens."""
+        """Return the address at which each link listens."""
         return {link.link.spec.name: link.link.address for link in self._links}
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
@@ -137,7 +137,7 @@ class PlainRelay:
             self._taps.unix_ns = self.began_unix_ns
         while not stop():
             housekeeping()
-            # Until the next time, datagrams take less than the headroom.
+            # Until the next check, new datagrams use less memory than the headroom.
             self._no_memory = not has_headroom()
             self._keep_house()
             until_ns = self._now_ns() + _PERIOD_NS
@@ -165,7 +165,7 @@ class PlainRelay:
         raise CallerError(f"link {link}: there is none of this name, but {names}")
 
     def report(self) -> Sequence[LinkReport]:
-        """What has happened so far."""
+        """Return the counts so far."""
         self._look_at_losses()
         return [
             LinkReport(
@@ -196,12 +196,12 @@ class PlainRelay:
         return time.monotonic_ns() - self._epoch_ns
 
     def _wait(self, until_ns: int) -> Iterable[tuple[_PlainLink, _Client | None]]:
-        """Wait for datagrams, or until something is due; return what is ready."""
+        """Wait for datagrams or the next departure; return the sockets that are ready."""
         deadlines_ns = [way.link.next_deadline_ns() for link in self._links for way in link.ways]
         wake_ns = min([until_ns, *(t_ns for t_ns in deadlines_ns if t_ns is not None)])
         wait_s = max(wake_ns - self._now_ns(), 0) / _NS
         if isinstance(self._selector, selectors.EpollSelector):
-            # epoll by itself counts in milliseconds.
+            # The timeout of epoll has a resolution of 1 ms only.
             ready, _, _ = select.select([self._selector.fileno()], [], [], wait_s)
             wait_s = 0
             if not ready:
@@ -209,7 +209,7 @@ class PlainRelay:
         return [key.data for key, _ in self._selector.select(wait_s)]
 
     def _take(self, link: _PlainLink, client: _Client | None) -> None:
-        """Take what there is at a socket: a client's return path, or where the link listens."""
+        """Receive the datagrams at a socket: a client's return path, or the listening socket."""
         back = client is not None
         endpoint = client.path if client is not None else link.link.endpoint
         if endpoint is None:
@@ -220,7 +220,7 @@ class PlainRelay:
                 data, source = endpoint.recvfrom(MAX_UDP_BYTES)
             except OSError as failure:
                 nothing = isinstance(failure, BlockingIOError)
-                if not (nothing and number):  # then it was ready for an ICMP error
+                if not (nothing and number):  # else the socket was ready because of an ICMP error
                     link.take_errors(endpoint)
                 if nothing:
                     return
@@ -245,7 +245,7 @@ class PlainRelay:
                 self._send(link, back, sender, departure)
 
     def _let_out(self, now_ns: int) -> None:
-        """Send all that is due, in the order of its time."""
+        """Send all datagrams that are due, in order of release time."""
         due: list[tuple[int, int, _PlainLink, int]] = []
         while True:
             due = [
@@ -283,7 +283,7 @@ class PlainRelay:
             self._taps.departure(link.way(back), link.ends(client), departure, now_ns)
 
     def _add(self, link: _PlainLink, place: Any, now_ns: int) -> _Client | None:
-        """Take a new client; None if there are too many."""
+        """Add a client; return None if there are too many."""
         path, error = None, 0
         if not link.refusals.accepts(len(link.clients)):
             return None
@@ -318,7 +318,7 @@ class PlainRelay:
         for link in self._links:
             idle_ns = round(link.link.spec.idle_s * _NS)
             for client in list(link.clients.values()):
-                if stopped:  # what it sent meanwhile has not been read yet
+                if stopped:  # datagrams that arrived meanwhile have not been read
                     client.last_ns = now_ns
                 if client.last_ns < now_ns - idle_ns and not client.in_flight:
                     self._forget(link, client)
@@ -364,7 +364,7 @@ def _flows(link: _PlainLink, way: PlainDirection) -> Sequence[FlowReport]:
 
 
 def _transmit(link: _PlainLink, endpoint: Endpoint, data: bytes, place: Any) -> int:
-    """Send a datagram; return 0, or the errno of what cannot be helped."""
+    """Send a datagram; return 0, or the errno of a permanent failure."""
     tries, give_up_s = 0, time.monotonic() + _PATIENCE_S
     while True:
         try:

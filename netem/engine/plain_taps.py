@@ -1,4 +1,4 @@
-"""What the portable engine tells its taps."""
+"""The events that the portable engine reports to taps."""
 
 import ipaddress
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ _MOST = 512
 
 
 class TapEndpoints(NamedTuple):
-    """Where a client's datagrams go from and to."""
+    """The addresses between which a client's datagrams are sent."""
 
     client: Address
     listen: Address
@@ -33,7 +33,7 @@ class TapDirection(NamedTuple):
 
 
 class PlainTaps:
-    """Taps, and what they have not been told yet.
+    """Taps, and the events that have not been passed to them yet.
 
     Args:
         taps: the taps.
@@ -46,7 +46,7 @@ class PlainTaps:
         self._events = np.zeros(_MOST, EVENT)
         self._count = 0
         self.unix_ns = 0
-        """Unix time at which the relay began to run."""
+        """Unix time at which the relay started to run."""
 
     def __bool__(self) -> bool:
         return bool(self._taps)
@@ -60,7 +60,7 @@ class PlainTaps:
         verdict: PacketDecision,
         now_ns: int,
     ) -> None:
-        """Tell that a datagram has come, and what was decided."""
+        """Report the arrival of a datagram and the decision."""
         event = self._add(way, ends, way.back, data, now_ns)
         event["flow"], event["packet"], event["fate"] = flow, verdict.packet, verdict.fate
         event["consecutive_losses"] = verdict.consecutive_losses
@@ -73,7 +73,7 @@ class PlainTaps:
     def departure(
         self, way: TapDirection, ends: TapEndpoints, departure: ScheduledDeparture, now_ns: int
     ) -> None:
-        """Tell that a datagram, or a copy, has left."""
+        """Report the departure of a datagram or a copy."""
         event = self._add(way, ends, not way.back, departure.data, now_ns)
         event["flow"], event["packet"] = departure.flow, departure.packet
         event["fate"] = departure.fate
@@ -85,7 +85,7 @@ class PlainTaps:
         event["copy"], event["stale"] = departure.copy, departure.stale
 
     def tell(self) -> None:
-        """Let the taps take what there is."""
+        """Pass the collected events to the taps."""
         if self._count:
             data = np.frombuffer(bytes(self._data), np.uint8)
             for tap in self._taps:

@@ -1,4 +1,4 @@
-"""Makes the pump's memory, and lets it grow between two of its calls."""
+"""Allocates the pump's memory, and enlarges it between two calls of the pump."""
 
 from typing import Any
 
@@ -17,22 +17,22 @@ _READY = 64
 _LEAVING = 128
 _ERRORS = 16
 _VECTORS = 1024
-"""As many as one message may have."""
+"""Maximum number of vectors in one message."""
 _CLIENTS = 64
 _SLOTS = 256
 _EVENTS = 8192
 _DATA_BYTES = 16 * 1024 * 1024
 _TABLE_SHARE = 4
-"""The hash table has so many places per client."""
+"""Places of the hash table per client."""
 
 
 class PumpMemory:
     """The pump's memory.
 
     Args:
-        links: how many.
-        segment: whether datagrams of equal size leave as one message.
-        taps: 0 none, 1 some, 2 some that want data.
+        links: number of links.
+        segment: whether datagrams of equal size are sent as one message.
+        taps: 0: none, 1: taps without data, 2: taps with data.
     """
 
     def __init__(self, links: int, segment: bool, taps: int) -> None:
@@ -102,10 +102,10 @@ class PumpMemory:
         headers["control_bytes"] = pump_layout.CONTROL_BYTES
 
     def add_room(self) -> bool:
-        """Make room for more that is delayed: for one datagram of any size, and its copy.
+        """Make room for one more delayed datagram of any size, and its copy.
 
         Returns:
-            Whether there is memory for it.
+            Whether there is enough memory.
         """
         old = self.memory
         if not has_headroom(2 * (old.heap.nbytes + old.slots.nbytes)):
@@ -114,7 +114,7 @@ class PumpMemory:
             count = len(old.slots)
             self.memory = old._replace(heap=_doubled(old.heap), slots=_doubled(old.slots))
             self._free_slots(count)
-        # Any two datagrams fit into a chunk.
+        # Any two datagrams fit into one chunk.
         if self.pump["free_blocks"] < pump_layout.CHUNK_BLOCKS // 2:
             self.add_chunk()
         return True
@@ -135,7 +135,7 @@ class PumpMemory:
         )
 
     def add_clients(self) -> None:
-        """Make room for twice as many clients; the table is empty then."""
+        """Double the maximum number of clients; the new hash table is empty."""
         old = self.memory
         count = len(old.clients)
         clients = _doubled(old.clients)
@@ -147,7 +147,7 @@ class PumpMemory:
         self.memory = old._replace(clients=clients, sockets=sockets, table=table)
 
     def latest_ns(self, way: int, rows: int) -> NDArray[np.int64]:
-        """When the last that is under way leaves, for each row of a direction's flows."""
+        """Return the last departure time (rows,) of each flow's packets in flight; −1: none."""
         memory = self.memory
         heap = memory.heap[: self.pump["heap"]]
         slots = memory.slots[heap["slot"]]

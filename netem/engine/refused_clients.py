@@ -1,4 +1,4 @@
-"""Clients that are not taken, and why."""
+"""Refused clients, and the reasons."""
 
 import errno
 
@@ -8,11 +8,11 @@ from netem.standard_error import say
 _OUT_OF_FILES = (errno.EMFILE, errno.ENFILE)
 
 STOPPED_NS = 1_000_000_000
-"""An engine that has not looked for idle clients for so long was stopped, or starved."""
+"""An engine that has not checked for idle clients for this time was stopped, or got no CPU time."""
 
 
 class RefusedClients:
-    """Those of one link; each reason is said once, on standard error.
+    """Refused clients of one link; each reason is reported once on standard error.
 
     Args:
         spec: the link.
@@ -24,13 +24,13 @@ class RefusedClients:
         self._told: set[str] = set()
 
     def accepts(self, clients: int) -> bool:
-        """Whether one more than ``clients`` is taken."""
+        """Whether a client is accepted in addition to ``clients`` present ones."""
         if clients >= self._spec.most_clients:
             self._fill(f"no more than {self._spec.most_clients} clients at once are served")
         return not self._full
 
     def is_exhausted(self, error: int, clients: int) -> bool:
-        """Whether a socket could not be made as there are too many; none is taken then."""
+        """Whether an errno means that no file descriptor is left; if so, refuse further clients."""
         if error in _OUT_OF_FILES:
             self._fill(
                 f"no file descriptors are left for more than {clients} clients; raise the limit "
@@ -39,7 +39,7 @@ class RefusedClients:
         return error in _OUT_OF_FILES
 
     def end(self) -> None:
-        """A client has gone: take others again."""
+        """Accept clients again, after one has been removed."""
         self._full = False
 
     def _fill(self, why: str) -> None:

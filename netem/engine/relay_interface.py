@@ -1,8 +1,8 @@
-"""What a relay is: several links, each with two directions, and what can be asked of it.
+"""The interface of a relay: several links, each with two directions, and their reports.
 
-A link listens on one address. Each client that sends to it gets a number, which is its flow's in
-both directions, and a return path: a socket of its own towards the server, through which the
-server's answers come back.
+A link listens on one address. Each client that sends to it gets a number, which is the number of
+its flow in both directions, and a return path: its own socket towards the server, at which the
+server's answers arrive.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +16,7 @@ from noack.impairments.link_records import Counters, RecordedDecision
 from noack.impairments.link_settings import LinkSettings
 
 Address = tuple[str, int]
-"""Host as a number (IPv4 or IPv6) and port."""
+"""Numeric host (IPv4 or IPv6) and port."""
 
 Direction = Literal["forward", "reverse"]
 DIRECTIONS: tuple[Direction, Direction] = ("forward", "reverse")
@@ -28,24 +28,24 @@ class LinkSpec:
     """One link of a relay."""
 
     name: str
-    """Part of the names of its random streams."""
+    """Name of the link; part of the names of its random streams."""
     listen: Address
-    """Where clients send to; port 0 takes a free one."""
+    """The address to which clients send; port 0 selects a free port."""
     to: Address
     """The server."""
     forward: LinkSettings
     reverse: LinkSettings
     seed: int = 0
     return_path: bool = True
-    """False: one way only; all that survives leaves from one socket, and answers are discarded."""
+    """False: forward only; all datagrams leave from one socket, and answers are discarded."""
     idle_s: float = 60.0
-    """A client's return path is closed after so long without a datagram in either direction."""
+    """A client without a datagram in either direction for this time is removed."""
     most_clients: int = 65_536
-    """Datagrams of more clients than that are refused, and counted."""
+    """Maximum number of clients; datagrams of further clients are refused and counted."""
     decisions: Mapping[Direction, Sequence[Sequence[RecordedDecision]]] = field(
         default_factory=dict
     )
-    """Recorded decisions of each flow, taken again before the settings apply."""
+    """Recorded decisions per flow; each flow repeats them before the settings apply."""
 
 
 @dataclass(frozen=True)
@@ -56,27 +56,27 @@ class FlowReport:
     client: Address
     packets: int
     longest_loss_burst: int
-    """Most successive datagrams that were not effectively delivered, of those that came since the
-    settings are in force."""
+    """Maximum number of consecutive datagrams that were not effectively delivered under the present
+    settings."""
 
 
 @dataclass(frozen=True)
 class DirectionReport:
-    """What has happened in one direction of a link since the relay began."""
+    """Counts of one direction of a link since the relay started."""
 
     settings: LinkSettings
     counters: Counters
     unintended: Mapping[str, int]
-    """Unintended losses: ``lost_in_kernel`` (the receive buffer overflowed), and by the system's
-    message what could not be sent, or kept until then. Any breaks the guarantee."""
+    """Unintended losses by cause: ``lost_in_kernel`` (the receive buffer overflowed), or the error
+    message for datagrams that could not be sent or stored. Any of them voids the guarantee."""
     in_flight: int
     """Datagrams that are delayed now."""
     flows: Sequence[FlowReport]
-    """Of the clients that are there now: those that sent most, at most 16."""
+    """At most 16: the present clients that sent most."""
     delays: NDArray[np.int64]
     """(k,) Histogram of the time from arrival to departure; see :mod:`netem.engine.histogram`."""
     lateness: NDArray[np.int64]
-    """(k,) Histogram of the time from when a delayed datagram should have left until it did."""
+    """(k,) Histogram of the time from a delayed datagram's release time to its departure."""
 
 
 @dataclass(frozen=True)
@@ -87,34 +87,34 @@ class LinkReport:
     listen: Address
     to: Address
     clients: int
-    """Clients that are there now."""
+    """Number of present clients."""
     clients_ever: int
     refused: int
-    """Datagrams of more clients than ``most_clients``."""
+    """Datagrams of clients beyond ``most_clients``."""
     discarded: int
-    """Answers to a link that takes none; 0 if the system does not count them."""
+    """Answers to a link without a reverse direction; 0 if the system does not count them."""
     port_unreachable: int
-    """How often ICMP said that nobody listens where the server should be; at least so often did a
-    datagram come to nobody."""
+    """ICMP port-unreachable messages from the server's host; a lower bound on the datagrams lost
+    there."""
     forward: DirectionReport
     reverse: DirectionReport
 
 
 class Tap(Protocol):
-    """Sees what a relay does, in batches, in the relay's thread; must not take long."""
+    """Receives the events of a relay in batches, in the relay's thread; must return quickly."""
 
     wants_data: bool
-    """Whether it looks at payloads."""
+    """Whether it needs payloads."""
 
     def take(self, events: NDArray[Any], data: NDArray[np.uint8]) -> None:
-        """Take k events (:data:`netem.relay_events.EVENT`) and the payloads that they point into.
+        """Receive events, (k,) of :data:`netem.relay_events.EVENT`, and their payloads.
 
-        Both are overwritten after the call.
+        Both arrays are overwritten after the call.
         """
         ...
 
     def missing(self, events: int) -> None:
-        """So many events were lost, as there was no room for them."""
+        """Count events that were lost because there was no room for them."""
         ...
 
 
@@ -125,10 +125,10 @@ class Relay(Protocol):
     """``batched`` or ``plain``."""
     specs: Sequence[LinkSpec]
     began_unix_ns: int | None
-    """Unix time at which it began to run; its times, those of blackouts too, count from there."""
+    """Unix time at which it started to run; the origin of its times, including blackouts."""
 
     def addresses(self) -> Mapping[str, Address]:
-        """Where each link listens."""
+        """Return the address at which each link listens."""
         ...
 
     def run(self, stop: Callable[[], bool], housekeeping: Callable[[], None]) -> None:
@@ -138,13 +138,13 @@ class Relay(Protocol):
     def change(self, link: str, direction: Direction, settings: LinkSettings) -> None:
         """Change a direction's impairments between two datagrams.
 
-        Flows go on: their numbers, their random streams' places, their counters. What is under way
-        leaves when it was to leave.
+        Flows keep their numbers, the positions in their random streams, and their counters. Packets
+        in flight leave at their planned times.
         """
         ...
 
     def report(self) -> Sequence[LinkReport]:
-        """What has happened so far."""
+        """Return the counts so far."""
         ...
 
     def close(self) -> None:

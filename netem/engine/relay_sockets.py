@@ -22,7 +22,7 @@ _BPF_RETURN = 6
 _SO_TIMESTAMPNS = 35
 _MSG_ERRQUEUE = 0x2000
 _EXTENDED_ERROR = struct.Struct("=IB")
-"""Begin of struct sock_extended_err: errno and origin."""
+"""Start of struct sock_extended_err: errno and origin."""
 _ICMP_ORIGINS = (2, 3)
 _RECVERR = ((socket.IPPROTO_IP, 11), (socket.IPPROTO_IPV6, 25))
 """Levels and options: IP_RECVERR, IPV6_RECVERR."""
@@ -32,17 +32,17 @@ Endpoint = socket.socket
 
 
 class ListenAddress(NamedTuple):
-    """Where a datagram can be sent: a family and what its sockets call an address."""
+    """An address to which datagrams can be sent: a family, and the address in its sockets' form."""
 
     family: int
     address: Any
 
 
 def place_of(address: Address, what: str) -> ListenAddress:
-    """Return an address as sockets want it.
+    """Return an address in the form that sockets use.
 
     Raises:
-        CallerError: the host is not a number.
+        CallerError: the host is not numeric.
     """
     host, port = address
     try:
@@ -60,7 +60,7 @@ def listen(spec: LinkSpec, place: ListenAddress) -> Endpoint:
     """Return the socket that a link listens on.
 
     Raises:
-        CallerError: it cannot be bound.
+        CallerError: the address cannot be bound.
     """
     endpoint = socket.socket(place.family, socket.SOCK_DGRAM)
     try:
@@ -81,10 +81,10 @@ def listen(spec: LinkSpec, place: ListenAddress) -> Endpoint:
 
 
 def return_path(server: ListenAddress) -> Endpoint:
-    """Return a socket towards the server, from which only the server's answers are taken.
+    """Return a socket connected to the server; it receives the server's answers only.
 
     Raises:
-        OSError: there is no way to the server, or no file descriptor left.
+        OSError: there is no route to the server, or no file descriptor left.
     """
     endpoint = socket.socket(server.family, socket.SOCK_DGRAM)
     try:
@@ -97,9 +97,9 @@ def return_path(server: ListenAddress) -> Endpoint:
 
 
 def one_way_path(server: ListenAddress) -> Endpoint:
-    """Return a socket from which a link that takes no answers sends to its server.
+    """Return the sending socket of a link without a reverse direction.
 
-    It lets nothing in: answers are dropped at once, and counted by
+    It receives nothing: the kernel drops answers at once; they are counted by
     :func:`noack.runtime.udp_sockets.drops_of`.
 
     Raises:
@@ -108,7 +108,7 @@ def one_way_path(server: ListenAddress) -> Endpoint:
     endpoint = socket.socket(server.family, socket.SOCK_DGRAM)
     try:
         _take_nothing(endpoint)
-        # Where it sends from is to be known before it does; without a way, it is to be seen.
+        # Bind to the address that it will send from, if there is a route to the server.
         with suppress(OSError), socket.socket(server.family, socket.SOCK_DGRAM) as scout:
             scout.connect(server.address)
             endpoint.bind((scout.getsockname()[0], 0, *scout.getsockname()[2:]))
@@ -123,10 +123,10 @@ def one_way_path(server: ListenAddress) -> Endpoint:
 
 
 def leads_to(server: ListenAddress, here: ListenAddress) -> bool:
-    """Whether what is sent to ``server`` comes to a socket that listens ``here``, on its port.
+    """Whether datagrams to the host of ``server`` reach a socket bound to ``here`` (any port).
 
-    The system says where from and where to it would go, so that an address of this machine is known
-    as such, and "any" as the loopback.
+    The system resolves source and destination, so that this machine's addresses are recognised,
+    and the unspecified address is the loopback address.
     """
     try:
         with socket.socket(server.family, socket.SOCK_DGRAM) as probe:
@@ -141,15 +141,15 @@ def leads_to(server: ListenAddress, here: ListenAddress) -> bool:
 
 
 def stamp_arrivals(endpoint: Endpoint) -> None:
-    """Let the kernel say when datagrams came, where it does."""
+    """Enable kernel timestamps of arrival, if the system supports them."""
     with suppress(OSError):
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
 
 def icmp_errors(endpoint: Endpoint) -> list[int]:
-    """Empty a socket's error queue; return the errno of each error that came by ICMP.
+    """Empty a socket's error queue; return the errno of each ICMP error.
 
-    The compiled engine does the same by itself (:mod:`netem.engine.pump.error_queue`).
+    The compiled engine has its own version (:mod:`netem.engine.pump.error_queue`).
     """
     found: list[int] = []
     with suppress(OSError):
@@ -163,7 +163,7 @@ def icmp_errors(endpoint: Endpoint) -> list[int]:
 
 
 def has_data(endpoint: Endpoint) -> bool:
-    """Whether something has come that nobody has taken."""
+    """Whether a received datagram waits at the socket."""
     try:
         endpoint.recv(1, socket.MSG_PEEK)
     except OSError:
@@ -172,7 +172,7 @@ def has_data(endpoint: Endpoint) -> bool:
 
 
 def raise_file_limit() -> None:
-    """Allow this process as many open files as it may allow itself."""
+    """Raise this process's limit of open files to the hard limit."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -181,7 +181,7 @@ def raise_file_limit() -> None:
 
 
 def address_of(name: Sequence[Any]) -> Address:
-    """Return what ``getsockname`` says as an address; a scope follows the host after ``%``."""
+    """Return a name from ``getsockname`` as an address; a scope follows the host after ``%``."""
     host, scope = str(name[0]).partition("%")[0], name[3] if len(name) > 3 else 0
     return (f"{host}%{scope}" if scope else host), int(name[1])
 
@@ -198,14 +198,14 @@ def _prepare(endpoint: Endpoint) -> None:
 
 
 def _prepare_to_send(endpoint: Endpoint) -> None:
-    """Take a large buffer, and let a full queue on the way out fail a send (ENOBUFS), where it can.
+    """Enlarge the send buffer; on Linux, make a send to a full device queue fail (ENOBUFS).
 
-    Linux else drops there without a word. What it then reports beside, in the socket's error queue,
-    has to be taken.
+    Without IP_RECVERR, Linux drops such datagrams silently. With it, the socket's error queue must
+    be emptied.
     """
     if sys.platform == "linux":
         for level, option in _RECVERR:
-            with suppress(OSError):  # the socket is not of IPv6
+            with suppress(OSError):  # not an IPv6 socket
                 endpoint.setsockopt(level, option, 1)
     try:
         endpoint.setsockopt(socket.SOL_SOCKET, _SO_SNDBUFFORCE, _BUFFER_BYTES)
@@ -215,7 +215,7 @@ def _prepare_to_send(endpoint: Endpoint) -> None:
 
 
 def _take_nothing(endpoint: Endpoint) -> None:
-    """Let the kernel drop what comes: by a filter where it has them, or for want of room."""
+    """Make the kernel drop received datagrams: by a filter, or else by a minimal buffer."""
     instruction = ctypes.create_string_buffer(struct.pack("=HBBI", _BPF_RETURN, 0, 0, 0))
     program = struct.pack("@HP", 1, ctypes.addressof(instruction))
     with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Socket addresses as the kernel writes them (struct sockaddr_in and sockaddr_in6)."""
+"""Socket addresses in the kernel's format (struct sockaddr_in and sockaddr_in6)."""
 
 import socket
 import struct
@@ -9,7 +9,7 @@ from netem.engine.relay_sockets import ListenAddress
 
 
 def name_of(place: ListenAddress) -> tuple[bytes, int]:
-    """Return a place as a socket address, padded to NAME_BYTES, and its length."""
+    """Return an address as a socket address, padded to NAME_BYTES, and its length."""
     host, port = place.address[:2]
     head = struct.pack("=H", place.family) + struct.pack("!H", port)
     if place.family == socket.AF_INET:

@@ -1,4 +1,4 @@
-"""Unintended losses: no setting caused them, they break the guarantee, and are never silent."""
+"""Unintended losses: no setting caused them. They void the guarantee and are always reported."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ _HOW = {
 
 
 class UnintendedLosses:
-    """Those of one direction of a link.
+    """Unintended losses of one direction of a link.
 
     Args:
         link: the link's name.
@@ -30,19 +30,19 @@ class UnintendedLosses:
         self._told: Counter[str] = Counter()
 
     def lost_in_kernel(self, datagrams: int) -> None:
-        """Say how many the kernel has dropped so far."""
+        """Set the total number of datagrams that the kernel has dropped."""
         self._set(KERNEL, datagrams)
 
     def not_sent(self, error: int, datagrams: int) -> None:
-        """Say how many could not be sent, or kept until then, for a reason by its errno."""
+        """Set the total number of datagrams that could not be sent or stored, for one errno."""
         self._set(os.strerror(error), datagrams)
 
     def counts(self) -> Mapping[str, int]:
-        """How many were lost, by cause."""
+        """Return the number of losses by cause."""
         return dict(self._counts)
 
     def tell(self) -> None:
-        """Say the totals on standard error, as far as they have changed since."""
+        """Report the totals that have changed since the last call on standard error."""
         for what, datagrams in self._counts.items():
             if datagrams > self._told[what]:
                 self._told[what] = datagrams

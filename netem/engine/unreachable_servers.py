@@ -1,4 +1,4 @@
-"""Servers that are not there, as far as ICMP says so."""
+"""Servers whose port is unreachable according to ICMP."""
 
 from netem.engine.relay_interface import LinkSpec
 from netem.standard_error import say
@@ -6,7 +6,7 @@ from noack.runtime.address import text_of
 
 
 class UnreachableServers:
-    """What a link knows of its server's absence; said once, on standard error.
+    """Reports once, on standard error, that the server of a link is unreachable.
 
     Args:
         spec: the link.
@@ -17,7 +17,7 @@ class UnreachableServers:
         self._told = False
 
     def seen(self, answers: int) -> None:
-        """Say how often the server's machine has answered so far that nobody listens."""
+        """Set the total number of ICMP port-unreachable messages from the server's host."""
         if answers and not self._told:
             self._told = True
             say(

@@ -1,1 +1,1 @@
-"""Fate traces: what became of each datagram, recorded as Parquet and taken again in a replay."""
+"""Fate traces: the fate of each datagram, recorded as Parquet and repeated in a replay."""

@@ -1,4 +1,4 @@
-"""The tap that records a fate trace, in a thread of its own."""
+"""The tap that records a fate trace; it has its own thread."""
 
 import threading
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from noack.core.errors import CallerError
 _FIELDS = {"arrival_ns": "t_ns"}
 """Fields of an event whose columns have another name."""
 _RAW = np.dtype((np.void, EVENT.itemsize))
-"""Events without their fields, which numpy copies ten times as fast."""
+"""Events as raw bytes; numpy copies these ten times as fast as records with fields."""
 _GROUP_ROWS = 65_536
 _MAGIC = b"PAR1"
 _MAX_WAITING = 1_000_000
@@ -31,12 +31,12 @@ class FateRecorder:
     """Writes a trace within the context.
 
     The relay never waits: an event that cannot be queued is counted as missing. A trace with
-    missing events cannot be replayed, so that a line on standard error reports the first at once.
+    missing events cannot be replayed; a line on standard error reports the first one immediately.
 
     Args:
-        path: the file, which is replaced, and complete when the context has ended.
+        path: the file; it is replaced, and is complete when the context has ended.
         specs: the relay's links, in its order.
-        max_waiting: maximum number of rows that wait to be written.
+        max_waiting: maximum number of queued rows.
 
     Raises:
         CallerError: the file cannot be written, or is not a Parquet file.
@@ -81,7 +81,7 @@ class FateRecorder:
 
     @property
     def rows(self) -> int:
-        """Number of rows in the file, after the context."""
+        """Number of rows in the file; valid after the context."""
         return self._done - self._unwritten
 
     @property
@@ -103,7 +103,7 @@ class FateRecorder:
             self._queue.put(rows)
 
     def missing(self, events: int) -> None:
-        """Count events that the relay had no room for; called in its thread."""
+        """Count events for which the relay had no room; called in its thread."""
         if self._missed == 0 and events:
             self._queue.put("events are missing: they arrive faster than they can be written")
         self._missed += events

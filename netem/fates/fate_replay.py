@@ -28,15 +28,15 @@ class Fates(NamedTuple):
     decisions: Mapping[tuple[str, Direction], Sequence[Sequence[RecordedDecision]]]
     """Decisions of each flow, in packet order."""
     caps: Mapping[tuple[str, Direction], int | None]
-    """The cap (M − 1), if the recorded fates keep it."""
+    """The cap (M − 1); None if there was none or the recorded fates exceed it."""
 
 
 def read_fates(path: Path, links: Sequence[str] | None = None) -> Fates:
     """Read a trace, for :func:`netem.rule_program.program_of` and :class:`netem.link_machine.Link`.
 
     A replaying link repeats the decisions of each flow, packet by packet: the same fate, the same
-    flipped bits, and the same delay from arrival. It keeps its cap even if the datagrams arrive at
-    other times. Flows and packets beyond the trace meet the link's own settings.
+    flipped bits, and the same delay from arrival. Its cap holds even if the datagrams arrive at
+    other times. For flows and packets beyond the trace, the link's own settings apply.
 
     Args:
         path: the file.
@@ -148,7 +148,7 @@ def _flows(
 
 
 def _check(rows: Mapping[str, NDArray[Any]], most_flows: int, place: str) -> None:
-    """Check that an emulator can have made these decisions."""
+    """Check that an emulator could have made these decisions."""
     delay, copy = rows["delay_ns"], rows["copy_delay_ns"]
     lost = np.isin(rows["fate"], _LOST)
     possible = (

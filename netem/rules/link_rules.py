@@ -1,4 +1,4 @@
-"""One direction of a link: what is decided for a packet, and what has left."""
+"""One direction of a link: decisions for arriving packets, and accounting of departures."""
 
 from netem.rules.mansd import make_stale, must_pass, needed_until_ns
 from noack.impairments.link_records import (
@@ -28,15 +28,15 @@ def admit(
 ) -> None:
     """Decide for a packet that arrives at ``now_ns``.
 
-    Every stage sees every packet of a flow, so that what one of them does depends on no other. A
-    packet that must pass is exempt from what would undo its delivery.
+    Every stage is applied to every packet of a flow, so that a stage's random draws do not depend
+    on other stages. A packet that must pass is exempt from everything that would lose it.
 
     Args:
         program: the link's settings.
-        state: what it remembers.
-        row: of the packet's flow.
-        size_bytes: of the payload.
-        now_ns: when it arrived.
+        state: the link's state.
+        row: row of the packet's flow.
+        size_bytes: size of the payload.
+        now_ns: arrival time.
         decision: receives the decision.
     """
     flow, memories, counters = state.flows[row], state.memory[row], state.counters
@@ -66,7 +66,7 @@ def admit(
 
 
 def keep_limit(free: int, decision: PacketDecision) -> None:
-    """Drop a delayed packet or its copy, if only so many more may be in flight."""
+    """Drop a delayed packet or its copy if fewer than needed (``free``) may still be in flight."""
     now_ns = decision.arrival_ns
     if decision.release_ns > now_ns and free <= 0:
         refuse(decision, OVERFLOWED)
@@ -81,11 +81,11 @@ def keep_limit(free: int, decision: PacketDecision) -> None:
 
 
 def repeat(recorded: RecordedDecision, decision: PacketDecision) -> None:
-    """Decide as was decided before, and keep the guarantee all the same.
+    """Repeat a recorded decision; the guarantee holds nevertheless.
 
-    A record keeps the guarantee by itself when packets arrive at the times of the record; at other
-    times, a packet that was held back then may be early now. A packet shorter than the recorded
-    one is corrupted in another bit, and an empty one in none.
+    If packets arrive at other times than in the record, other packets may have to pass or to be
+    held back: a packet that must pass is delivered here, and :func:`settle` holds packets back.
+    A packet shorter than the recorded one is corrupted in another bit, an empty one in none.
     """
     fate, now_ns, size_bytes = recorded.fate, decision.arrival_ns, decision.size_bytes
     decision.bit = within(recorded.bit, size_bytes)
@@ -104,14 +104,14 @@ def repeat(recorded: RecordedDecision, decision: PacketDecision) -> None:
 
 
 def within(bit: int, size_bytes: int) -> int:
-    """Return a bit that a payload has, for one of a payload of another size; −1 is none."""
+    """Map a bit number to one within a payload of ``size_bytes``; −1 (no bit) stays −1."""
     if bit < 0 or size_bytes == 0:
         return -1
     return bit % (size_bytes * 8)
 
 
 def settle(program: LinkProgram, state: LinkMemory, row: int, decision: PacketDecision) -> None:
-    """Keep the guarantee for a packet with known times, count it, and complete the decision."""
+    """Enforce the guarantee for a packet with known times, count it, complete the decision."""
     flow, recent_ns, counters = state.flows[row], state.recent_ns[row], state.counters
     packet, now_ns = decision.packet, decision.arrival_ns
     effective_ns = NEVER_NS
@@ -160,8 +160,8 @@ def hold_back(decision: PacketDecision, effective_ns: int, needed_ns: int) -> No
 
     Args:
         decision: for the packet.
-        effective_ns: when the first intact one of the two would leave.
-        needed_ns: when the packet leaves that it must not precede.
+        effective_ns: planned departure of the first intact one of the two.
+        needed_ns: departure time of the earlier packet that it must not precede.
     """
     decision.hold_back_ns = needed_ns - effective_ns
     if decision.bit < 0:
@@ -191,15 +191,15 @@ def leave(
 ) -> bool:
     """Note that a packet, or a copy, leaves; return whether it is stale.
 
-    This looks at what really leaves, and does not use what was decided.
+    This uses the actual departure, not the decision.
 
     Args:
-        state: what the link remembers.
-        row: of its flow.
-        packet: its number in the flow.
-        size_bytes: of the payload.
+        state: the link's state.
+        row: row of the packet's flow.
+        packet: number of the packet in its flow.
+        size_bytes: size of the payload.
         delayed: whether it was in flight.
-        counts: whether it is the first intact copy.
+        counts: whether it is the packet's first intact copy.
     """
     flow, counters = state.flows[row], state.counters
     counters.forwarded += 1

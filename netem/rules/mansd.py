@@ -7,9 +7,9 @@ receiver that wants the newest) is not. Hence two rules:
 
 * After M − 1 consecutive losses, the next packet must pass (:func:`must_pass`).
 * A packet may leave before earlier ones, but must not make more than M − 1 consecutive packets
-  stale: it is held back until one that is needed has left (:func:`needed_until_ns`). The releases
-  of the packets that count as delivered therefore ascend, so that a packet that is held back
-  behind one of them is behind all before it.
+  stale: it is held back until the needed earlier packet has left (:func:`needed_until_ns`).
+  Therefore the release times of the packets that count as delivered ascend, and a packet held back
+  behind one of them leaves after all earlier ones of them, too.
 """
 
 from collections.abc import MutableSequence, Sequence
@@ -21,20 +21,22 @@ def must_pass(flow: FlowState, mansd: int) -> bool:
     """Whether the next packet has to be delivered.
 
     Args:
-        flow: its state.
+        flow: state of the flow.
         mansd: M − 1, or −1 for no cap.
     """
     return flow.forced_first != 0 or (mansd >= 0 and flow.consecutive_losses >= mansd)
 
 
 def needed_until_ns(flow: FlowState, recent_ns: Sequence[int], mansd: int, packet: int) -> int:
-    """When the packet leaves that ``packet`` must not precede; −1 if there is none.
+    """Return the time before which ``packet`` must not leave; −1 if there is none.
+
+    It is the release time of the earlier packet that ``packet`` must not precede.
 
     Args:
-        flow: its state.
-        recent_ns: ring of mansd + 1 release times of the packets before, −1 for those that are
+        flow: state of the flow.
+        recent_ns: ring of the mansd + 1 previous packets' release times; −1 for packets that are
             not effectively delivered.
-        mansd: M − 1, or −1 for no cap: then only the first packet of a flow may be needed.
+        mansd: M − 1, or −1 for no cap; without a cap, only the first packet can be needed.
         packet: number of the packet in its flow.
     """
     needed_ns = flow.first_release_ns

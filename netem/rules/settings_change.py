@@ -1,4 +1,4 @@
-"""A change of settings: what a link remembers goes on under the new program."""
+"""A change of settings: transfers a link's state to the new program."""
 
 from collections.abc import MutableSequence, Sequence
 
@@ -19,18 +19,18 @@ def carry(
     after: LinkMemory,
     latest_ns: Sequence[int],
 ) -> None:
-    """Fill what ``new`` remembers from what ``old`` remembered.
+    """Transfer the state under the program ``old`` to the program ``new``.
 
-    A stage goes on if the new program has one of its kind and name; a queue goes on under another
-    discipline, too. Flows, counters and packets in flight are the link's own and stay as they are;
-    but the longest loss burst is counted anew, as another cap may apply to it.
+    A stage keeps its state if the new program has a stage of the same kind and name; a queue keeps
+    its state under another discipline, too. Flows, counters and packets in flight do not change,
+    except that the count of the longest loss burst starts again, since another cap may apply.
 
     Args:
         old: the program so far.
-        before: what is remembered.
+        before: its state.
         new: the program from now on.
-        after: a fresh state with as many rows, which shares ``before.flows``.
-        latest_ns: (rows,) when the last packet in flight leaves, of each row's flow; −1 if none is.
+        after: a new state with as many rows, which shares ``before.flows``; it is filled.
+        latest_ns: (rows,) last departure time of the packets in flight of each flow; −1 if none is.
     """
     for place in range(len(new.stages)):
         stage = new.stages[place]
@@ -61,7 +61,7 @@ def carry(
 
 
 def _place_of(program: LinkProgram, stage: RuleStage) -> int:
-    """Place of the stage with the same name, and of the same kind or with a queue; −1: none."""
+    """Return the place of the stage with this name and the same kind, or with a queue; −1: none."""
     for place in range(len(program.stages)):
         other = program.stages[place]
         alike = other.kind == stage.kind or (other.queue_places > 0 and stage.queue_places > 0)
@@ -78,7 +78,7 @@ def _carry_queue(
     new_queue: QueueState,
     new_departures_ns: MutableSequence[int],
 ) -> None:
-    """Keep the queue; a shorter one forgets the packets that leave first, and so counts as full."""
+    """Transfer a queue; a shorter one drops the earliest departure times, and is full then."""
     kept = min(queue.count, new.queue_places)
     first = queue.head + queue.count - kept
     for k in range(kept):
@@ -99,10 +99,10 @@ def _carry_releases(
     new_ns: MutableSequence[int],
     latest_ns: int,
 ) -> None:
-    """Keep what the guarantee needs to know of the packets before the change.
+    """Transfer the release times that the guarantee needs.
 
-    With another cap, or where none was kept, no packet leaves before those that are in flight at
-    the change.
+    If the cap differs, or no release times were stored, later packets leave only after the packets
+    that are in flight at the change.
     """
     width = new.mansd + 1
     if old.tracks:

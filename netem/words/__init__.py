@@ -1,1 +1,1 @@
-"""A link in words: the syntax of ``tc netem``, files with several links, and what they mean."""
+"""Links described by words: the syntax of ``tc netem``, links files, and explanations."""

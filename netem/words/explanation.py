@@ -1,10 +1,10 @@
-"""The cap and the other settings of a link in plain words; each impairment has its own."""
+"""Explains the cap and the other settings of a link; each impairment explains itself."""
 
 from noack.impairments.link_settings import LinkSettings
 
 
 def settings_meaning(settings: LinkSettings) -> list[tuple[str, str]]:
-    """Say what the cap and the other settings do: their words, and their meaning."""
+    """Return (words, meaning) of the cap and the other settings."""
     found = []
     if settings.mansd is not None:
         found.append((

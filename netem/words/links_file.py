@@ -1,4 +1,4 @@
-"""Files with several links: TOML in, what a relay takes out.
+"""Files with several links: reads TOML, returns the relay's links.
 
 [[link]]
 name = "uplink"
@@ -26,7 +26,7 @@ def _settings(value: Any) -> Any:
     if isinstance(value, LinkSettings):
         return value
     if not isinstance(value, str):
-        # Strict validation takes lists for tuples only in JSON, and what is behind this is none.
+        # Strict validation accepts lists for tuples only in JSON, so that this goes through JSON.
         return LinkSettings.model_validate_json(json.dumps(value))
     try:
         return settings_of(value)
@@ -40,7 +40,7 @@ Side = Annotated[
 
 
 class LinkTable(ScenarioSection):
-    """One link of a relay: where it listens, where it sends to, what it does in each direction."""
+    """One link of a relay: its addresses, and its settings in each direction."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
     """Names the link in reports, and its random streams: letters, digits, _ and -."""
@@ -51,17 +51,17 @@ class LinkTable(ScenarioSection):
     forward: Side = LinkSettings()
     """From clients to the server: words, e.g. "delay 10ms loss 5%", or a table."""
     reverse: Side = LinkSettings()
-    """From the server back to the clients, likewise."""
+    """From the server to the clients: words or a table, as for forward."""
     words: Side | None = None
-    """Short for forward."""
+    """Another name for forward."""
     seed: Seed = 0
     """Seed of the link's random streams."""
     return_path: bool = True
-    """false: one way only; answers are not taken."""
+    """false: forward direction only; the server's answers are discarded."""
     idle_s: Annotated[FiniteFloat, Field(gt=0, le=1e6)] = LinkSpec.idle_s
-    """A client is forgotten after so long without a datagram in either direction."""
+    """A client without a datagram in either direction for this time, in seconds, is removed."""
     most_clients: Annotated[int, Field(ge=1, le=1_000_000)] = LinkSpec.most_clients
-    """Datagrams of more clients than that are refused, and counted."""
+    """Maximum number of clients; datagrams of further clients are refused and counted."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -70,14 +70,14 @@ class LinkTable(ScenarioSection):
         return self
 
     def spec(self, folder: Path, place: str) -> LinkSpec:
-        """Return the link for a relay, with its addresses looked up and its files read.
+        """Return the link for a relay; resolves its addresses and reads its files.
 
         Args:
-            folder: where relative names of files begin.
-            place: where the table stands, for messages.
+            folder: folder to which relative file names refer.
+            place: position of the table, for messages.
 
         Raises:
-            CallerError: one line.
+            CallerError: the table has a mistake; one line.
         """
         listen = parse_address(self.listen, f"{place}.listen")
         return LinkSpec(

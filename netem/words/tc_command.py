@@ -1,4 +1,4 @@
-"""The command of ``tc`` that comes nearest to settings, and what it leaves out."""
+"""The nearest ``tc`` command to a link's settings, and the settings that it leaves out."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,22 +10,22 @@ from noack.impairments.quantities import percent_text
 _FIXED_ORDER = ("duplicate", "loss", "corrupt", "delay", "reorder", "rate")
 """tc applies its impairments in this order, whatever the order of the words."""
 _LONGEST = 60
-"""Characters of the words that are named as lacking."""
+"""Words that are left out are cut to this number of characters."""
 
 
 class TcCommand(NamedTuple):
-    """Settings as ``tc`` can have them."""
+    """The nearest settings that ``tc`` supports."""
 
     words: str | None
-    """After ``tc qdisc add dev DEVICE root netem``; None if it can do nothing of them."""
+    """After ``tc qdisc add dev DEVICE root netem``; None if tc supports none of the settings."""
     lacks: tuple[str, ...]
-    """The words that are left out, each with what tc lacks for it."""
+    """The words that are left out, each with the missing tc feature."""
     notes: tuple[str, ...]
-    """What it does differently."""
+    """Differences in behaviour."""
 
 
 def tc_command(settings: LinkSettings) -> TcCommand:
-    """Return the words of tc's own netem that come nearest, and what they leave out."""
+    """Return the nearest words of tc's own netem, and the settings that they leave out."""
     kept: list[Impairment] = []
     lacks: list[str] = []
     wanted = [one for one in settings.impairments if one.tc_text()]

@@ -1,9 +1,9 @@
-"""From words to settings and back: the words of ``tc netem``, and further ones.
+"""Converts words to settings and back: the words of ``tc netem``, and additional ones.
 
     delay 10ms 2ms distribution normal loss gemodel 1% 10% mansd 4
 
-The order of the words is the order of the impairments; ``mansd``, ``first``, ``limit`` and ``seed``
-are settings, wherever they stand. Words are not shortened.
+The order of the words is the order of the impairments; the position of ``mansd``, ``first``,
+``limit`` and ``seed`` does not matter. Words cannot be abbreviated.
 """
 
 import json
@@ -30,7 +30,7 @@ _SETTINGS = {"mansd": "mansd", "first": "first_delivered", "limit": "limit"}
 KEYWORDS = (*_FEATURES, *_SETTINGS, "seed")
 """Words that begin a clause."""
 _AFTER: dict[str, str] = {}
-"""Where the words stand that begin no clause."""
+"""For each word that begins no clause: the words after which it is allowed."""
 for _kind in IMPAIRMENTS:
     for _word in _kind.words:
         if _word.name not in _FEATURES:
@@ -42,7 +42,7 @@ EXAMPLES: Mapping[str, str] = {
     "first": "first",
     "limit": "limit 1000",
 }
-"""By the word; ``seed`` is an option, too, and so not here."""
+"""By word; ``seed`` is missing because it is also an option."""
 _IMPAIRMENT: TypeAdapter[Any] = TypeAdapter(AnyImpairment)
 _LIMIT = LinkSettings.model_fields["limit"].default
 _SEED: TypeAdapter[int] = TypeAdapter(Seed)
@@ -53,18 +53,17 @@ class LinkWords(NamedTuple):
 
     settings: LinkSettings
     seed: int | None
-    """Of the random streams, if the words give one."""
+    """Seed of the random streams, if the words contain one."""
 
 
 def parse(words: str | Sequence[str]) -> LinkWords:
     """Read the settings of one direction of a link from words.
 
     Args:
-        words: one string of words, as on a shell's line, or the words; of these one may be a string
-            of several again.
+        words: one string of words, as on a shell's command line, or a sequence of such strings.
 
     Raises:
-        CallerError: one line; which word, what was expected there, the nearest known word.
+        CallerError: one line with the wrong word, the expected words, and the nearest known word.
     """
     reader = WordReader(words)
     impairments: list[Impairment] = []
@@ -90,10 +89,10 @@ def parse(words: str | Sequence[str]) -> LinkWords:
 
 
 def settings_of(words: str | Sequence[str]) -> LinkSettings:
-    """Read the settings of one direction of a link from words that name no seed.
+    """Read the settings of one direction of a link from words without a seed.
 
     Raises:
-        CallerError: as :func:`parse`.
+        CallerError: as :func:`parse`, or the words contain a seed.
     """
     settings, seed = parse(words)
     if seed is not None:
@@ -116,10 +115,10 @@ def text_of(settings: LinkSettings, seed: int | None = None) -> str:
 
 
 def require_no_dashes(arguments: Sequence[str]) -> None:
-    """Require that no word is written as an option.
+    """Require that no word begins with dashes.
 
     Raises:
-        CallerError: one is.
+        CallerError: a word does.
     """
     for argument in arguments:
         word = argument.lstrip("-").partition("=")[0]
@@ -144,7 +143,7 @@ def _settings(impairments: list[Impairment], settings: Mapping[str, Any]) -> Lin
     try:
         return LinkSettings(impairments=tuple(impairments), **given)
     except ValidationError as error:
-        # Of single settings all are checked; what remains is what goes together.
+        # Each setting is valid by itself; the error is a combination of settings.
         raise CallerError(f"lossrel: {_message(error).partition(': ')[2]}") from None
 
 
@@ -160,7 +159,7 @@ def _check_setting(reader: WordReader, word: str, value: Any) -> None:
 
 def _validated(kind: TypeAdapter[Any], table: Table, reader: WordReader) -> Any:
     try:
-        return kind.validate_json(json.dumps(table))  # strict takes lists for tuples only in JSON
+        return kind.validate_json(json.dumps(table))  # strict mode: lists for tuples only in JSON
     except ValidationError as error:
         reader.wrong(_message(error))
 

@@ -1,8 +1,7 @@
 """A bottleneck: packets leave one after the other, at a rate, from a finite queue.
 
-The queue serves in the order of arrival. Its state follows from arrival times alone, so that it
-does not depend on how late the emulator itself is: when a packet arrives, the time at which its
-service begins and ends is known.
+The queue serves in the order of arrival. Its state depends on arrival times only, not on the
+emulator's own lateness: the begin and the end of a packet's service are known on its arrival.
 """
 
 from collections.abc import MutableSequence
@@ -12,12 +11,12 @@ from noack.impairments.link_records import QueueState, RuleStage
 
 _NS = 1_000_000_000
 _LATEST_NS = 2**61
-"""73 years. More packets may have to pass than the queue takes, and integers have an end."""
+"""73 years: limit against overflow, since packets that must pass may exceed the queue's size."""
 
 
 @dataclass(slots=True, kw_only=True)
 class BottleneckStage(RuleStage):
-    """A rate limit as numbers; the queue's places are those of the stage."""
+    """A rate limit as numbers; ``queue_places`` of the stage is the size of the queue."""
 
     rate_bps: int
     overhead_bytes: int
@@ -28,13 +27,13 @@ class BottleneckStage(RuleStage):
 def enters(
     stage: BottleneckStage, queue: QueueState, departures_ns: MutableSequence[int], now_ns: int
 ) -> bool:
-    """Whether the queue has a free place at ``now_ns``; removes what has left until then.
+    """Whether the queue has a free place at ``now_ns``; removes packets that have left until then.
 
     Args:
         stage: the bottleneck's settings.
         queue: its state.
         departures_ns: the rings of departure times.
-        now_ns: when the packet comes to the queue.
+        now_ns: time at which the packet reaches the queue.
     """
     queue.entry_ns = max(queue.entry_ns, now_ns)
     while queue.count > 0 and departures_ns[stage.queue_begin + queue.head] <= queue.entry_ns:
@@ -49,7 +48,7 @@ def serve(
     departures_ns: MutableSequence[int],
     size_bytes: int,
 ) -> int:
-    """Put a packet into the queue, after :func:`enters`; return when it leaves, in ns."""
+    """Put a packet into the queue, after :func:`enters`; return its departure time in ns."""
     line_bytes = max(size_bytes + stage.overhead_bytes, 0)
     if stage.cell_bytes > 0:
         cells = (line_bytes + stage.cell_bytes - 1) // stage.cell_bytes
@@ -70,7 +69,7 @@ def occupy(
     departures_ns: MutableSequence[int],
     until_ns: int,
 ) -> None:
-    """Take a place in the queue until a time; a packet that must pass needs none in a full one."""
+    """Occupy a place in the queue until a time; a packet that must pass may exceed the size."""
     place = (queue.head + queue.count) % stage.queue_places
     if queue.count == stage.queue_places:
         place = (queue.head + queue.count - 1) % stage.queue_places

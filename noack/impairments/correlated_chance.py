@@ -1,7 +1,8 @@
-"""Something that happens to a packet with a probability, and more alike to successive packets.
+"""Random events with a given probability and a correlation between successive packets.
 
-The latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian process, and something
-happens when z_i exceeds the normal quantile of 1 − p: with probability p exactly, for every ρ.
+The latent variable z_i = ρ z_{i−1} + √(1 − ρ²) g_i is a stationary Gaussian process. The event
+happens to packet i if z_i exceeds the normal quantile of 1 − p, hence with probability p exactly,
+for every ρ.
 """
 
 import math
@@ -25,9 +26,9 @@ class ChanceStage(RuleStage):
     innovation: float
     """√(1 − correlation²)."""
     gap: int = 1
-    """Only one in so many packets can be affected."""
+    """Only every ``gap``-th packet can be affected."""
     scored: int = 0
-    """1: a later delay is correlated with what happens here."""
+    """1: a later delay is correlated with this event."""
 
 
 class Chance(Protocol):
@@ -48,7 +49,7 @@ def latent(correlation: float, innovation: float, memory: StageMemory, u: float)
     Args:
         correlation: ρ.
         innovation: √(1 − ρ²).
-        memory: of the flow.
+        memory: the stage's memory of the flow.
         u: a uniform number.
     """
     z = -score(u)
@@ -61,7 +62,7 @@ def latent(correlation: float, innovation: float, memory: StageMemory, u: float)
 
 
 def happens(stage: ChanceStage, memory: StageMemory, u: float) -> bool:
-    """Whether it happens to the next packet; ``u`` is a uniform number."""
+    """Whether the event happens to the next packet; ``u`` is a uniform number."""
     if stage.correlation == 0.0:
         return u < stage.probability
     return latent(stage.correlation, stage.innovation, memory, u) > stage.threshold
@@ -95,7 +96,7 @@ def chance_text(chance: Chance) -> str:
 
 
 def correlation_meaning(correlation: float) -> str:
-    """Say that successive packets fare alike."""
+    """Return the explanation of a correlation."""
     return f", correlation {brief_percent(correlation)}" if correlation else ""
 
 

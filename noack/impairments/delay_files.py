@@ -8,9 +8,9 @@ from noack.settings.named_file import NamedFile
 
 MAX_SAMPLES = 1_000_000
 TABLE_SUFFIX = ".dist"
-"""Of distribution tables of tc."""
+"""Suffix of tc's distribution tables."""
 _TABLE_SCALE = 8192
-"""The number that stands for 1 in a table of tc."""
+"""The number that represents 1 in a table of tc."""
 _UNITS_S = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _DELAY = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([a-z]*)")
 
@@ -21,14 +21,14 @@ def read_samples(
     """Return the delays in a file, in seconds.
 
     Args:
-        name: of the file.
-        jitter_s: scales a distribution table.
-        most_s: the longest delay that is allowed.
-        folder: where relative names begin.
-        place: where the file is named, for messages.
+        name: name of the file.
+        jitter_s: scale of a distribution table.
+        most_s: maximum delay.
+        folder: folder to which relative names refer.
+        place: position of the file name in the settings, for messages.
 
     Raises:
-        CallerError: one line; it cannot be read, or does not contain what it should.
+        CallerError: one line; the file cannot be read, or has wrong content.
     """
     file = NamedFile(name, folder, place)
     if Path(name).suffix == TABLE_SUFFIX:
@@ -50,7 +50,7 @@ def read_samples(
 
 
 def _lines(file: NamedFile) -> Iterator[tuple[int, str]]:
-    """Numbered lines that are neither empty nor comments."""
+    """Yield the numbered lines that are neither empty nor comments."""
     text = file.content().decode("utf-8", errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.startswith("#"):

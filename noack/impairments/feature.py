@@ -1,7 +1,7 @@
-"""What a feature of a link has to say: settings, behaviour, words, description, prediction.
+"""Base classes of a link's features: settings, behaviour, words, description, prediction.
 
-A feature is a loss model, a kind of impairment, or a discipline of a queue: one class, in a file of
-its own, derived from one of the three classes at the end.
+A feature is a loss model, a kind of impairment, or a queue discipline: one class in its own file,
+derived from one of the three classes at the end.
 """
 
 import importlib
@@ -25,9 +25,9 @@ class Word(NamedTuple):
     name: str
     example: str
     read: Callable[[WordReader], Table] | None = None
-    """Reads what follows it; None: it stands within the words of its feature."""
+    """Reads the words that follow it; None: it is not the first word of its feature."""
     after: str = ""
-    """Behind what it stands, if it stands within."""
+    """The words that precede it, if it is not the first word."""
 
 
 class Behaviour(NamedTuple):
@@ -37,17 +37,17 @@ class Behaviour(NamedTuple):
     """Its settings as numbers."""
     apply: Callable[..., None]
     """``apply(program, state, stage, memory, flow, decision)`` changes the decision for a packet.
-    It is called for every packet of a flow, lost or not, so that what a stage draws depends on no
-    other stage. ``memory`` is the stage's, of the packet's flow."""
+    It is called for every packet of a flow, lost or not, so that a stage's random draws do not
+    depend on other stages. ``memory`` is the stage's memory of the packet's flow."""
     queue: type[QueueState] = QueueState
-    """What it remembers of all flows together."""
+    """Its state that all flows share."""
 
 
 class StageTables:
     """Tables of numbers that the stages of a program read.
 
     Args:
-        scored: a delay is correlated with loss, and so wants to know how bad the link's state is.
+        scored: a delay is correlated with loss, and needs a score of the link's state.
     """
 
     def __init__(self, *, scored: bool = False) -> None:
@@ -56,40 +56,40 @@ class StageTables:
         self.reals: list[float] = []
 
     def add_integers(self, numbers: Iterable[int]) -> tuple[int, int]:
-        """Add whole numbers; return where they begin and end."""
+        """Add integers; return the range [begin, end) of their places."""
         begin = len(self.integers)
         self.integers.extend(map(int, numbers))
         return begin, len(self.integers)
 
     def add_reals(self, numbers: Iterable[float]) -> tuple[int, int]:
-        """Add numbers; return where they begin and end."""
+        """Add numbers; return the range [begin, end) of their places."""
         begin = len(self.reals)
         self.reals.extend(numbers)
         return begin, len(self.reals)
 
 
 class Feature(ScenarioSection):
-    """What all features have in common."""
+    """Base class of all features."""
 
     words: ClassVar[Sequence[Word]] = ()
     behaviour: ClassVar[Behaviour | None] = None
-    """None: it does nothing by itself."""
+    """None: it has no effect by itself."""
 
     @classmethod
     def examples(cls) -> Sequence[Self]:
-        """Settings for tests, harsh ones above all; together they use every key."""
+        """Return settings for tests, mainly extreme ones; together they use every key."""
         raise NotImplementedError
 
     def text(self) -> str:
-        """Return words that are read back to the same settings."""
+        """Return words that are read as the same settings."""
         raise NotImplementedError
 
     def meaning(self) -> str:
-        """Say what it does, in plain words."""
+        """Return the effect in plain words."""
         raise NotImplementedError
 
     def stage(self, tables: StageTables) -> RuleStage | None:
-        """Return its settings as numbers; None if it never does anything.
+        """Return its settings as numbers; None if they never have an effect.
 
         Raises:
             ValueError: it names a file that has not been read.
@@ -97,7 +97,7 @@ class Feature(ScenarioSection):
         raise NotImplementedError
 
     def chains(self) -> Sequence[Chain | Pattern]:
-        """Return what it does to packets as Markov chains, to predict the loss rate.
+        """Return its effect on packets as Markov chains, to predict the loss rate.
 
         Raises:
             NotPredictableError: the loss rate cannot be predicted.
@@ -106,35 +106,35 @@ class Feature(ScenarioSection):
 
     @property
     def prediction_note(self) -> str:
-        """Under which condition the prediction holds."""
+        """Return the condition under which the prediction holds."""
         return ""
 
     def without_files(self, folder: Path, place: str) -> "Feature":
-        """Return settings that name no file: what the files say stands in them.
+        """Return settings with the files' contents instead of their names.
 
         Args:
-            folder: where relative names begin.
-            place: where the settings stand, for messages; empty: only the file is named.
+            folder: folder to which relative names refer.
+            place: position of the settings, for messages; empty: messages name only the file.
 
         Raises:
-            CallerError: a file cannot be read, or does not contain what it should.
+            CallerError: a file cannot be read, or has wrong content.
         """
         return self
 
     def tc_text(self) -> str:
-        """Return the words of ``tc netem`` for it; empty if it does nothing."""
+        """Return the words of ``tc netem`` for it; empty if it has no effect."""
         return self.text()
 
     def tc_lacks(self, before: Sequence["Impairment"]) -> str:
-        """Return what ``tc netem`` lacks for it; empty if it lacks nothing.
+        """Return the missing feature of ``tc netem``; empty if none is missing.
 
         Args:
-            before: the impairments that tc does before it.
+            before: the impairments that tc applies before it.
         """
         return ""
 
     def tc_notes(self) -> Sequence[str]:
-        """Return what ``tc netem`` does differently."""
+        """Return the differences of ``tc netem`` in behaviour."""
         return ()
 
 
@@ -147,7 +147,7 @@ class LossModel(Feature):
 
 
 class QueueDiscipline(Feature):
-    """Base class of disciplines of the ``rate`` bottleneck; their words end those of ``rate``."""
+    """Base class of queue disciplines of ``rate``; their words follow those of ``rate``."""
 
     kind: str
 
@@ -161,7 +161,7 @@ class QueueDiscipline(Feature):
 
 
 class Impairment(Feature):
-    """Base class of impairments; their words begin with one of their own."""
+    """Base class of impairments; each has its own first word."""
 
     kind: str
     flips_bits: ClassVar[bool] = False
@@ -171,25 +171,25 @@ class Impairment(Feature):
 
     @property
     def rule(self) -> Behaviour | None:
-        """What it does to packets."""
+        """Return its behaviour."""
         return type(self).behaviour
 
     @property
     def longest_s(self) -> float:
-        """Upper end of the delay, in seconds; of an unbounded one at four times the jitter."""
+        """Maximum delay in seconds; for an unbounded delay, its value at four times the jitter."""
         return 0.0
 
     @property
     def is_bounded(self) -> bool:
-        """Whether it never delays a packet for longer."""
+        """Whether no packet is delayed for longer than :meth:`longest_s`."""
         return True
 
     def reorders(self, delayed: bool, reordered: bool) -> tuple[bool, bool]:
         """Return whether packets may be delayed, and reordered, after it.
 
         Args:
-            delayed: whether they may be delayed before it.
-            reordered: whether they may be reordered before it.
+            delayed: whether packets may be delayed before it.
+            reordered: whether packets may be reordered before it.
         """
         return delayed, reordered
 

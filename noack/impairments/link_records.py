@@ -1,4 +1,4 @@
-"""Records that the rules of a link work on: slotted dataclasses, or rows of an array.
+"""Records that the rules of a link use: slotted dataclasses, or rows of an array.
 
 The same definition serves both: :func:`dtype_of` gives the row type for compiled code.
 """
@@ -55,7 +55,7 @@ def array_of(dtype: np.dtype[np.void], rows: Sequence[Any]) -> NDArray[np.void]:
 
 @dataclass(slots=True, kw_only=True)
 class RuleStage:
-    """One impairment of a link; its own settings are the fields of a class derived from this."""
+    """One impairment of a link; derived classes add its settings as fields."""
 
     kind: int = -1
     """Number of its behaviour; see :mod:`noack.impairments.stage_dispatch`."""
@@ -65,18 +65,18 @@ class RuleStage:
     """Key of its random stream."""
     key1: int = 0
     queue_places: int = 0
-    """How many packets its queue takes; 0: it has no queue."""
+    """Maximum number of packets in its queue; 0: no queue."""
     queue_begin: int = 0
     """Place of its ring of departure times."""
 
 
 @dataclass(slots=True)
 class RecordedDecision:
-    """What was once decided for a packet."""
+    """A recorded decision for a packet."""
 
     fate: int
     delay_ns: int
-    """From its arrival until it left; −1 never."""
+    """Time from arrival to departure; −1: it never left."""
     copy_delay_ns: int
     bit: int
     copy_bit: int
@@ -84,7 +84,7 @@ class RecordedDecision:
 
 @dataclass(slots=True)
 class StageMemory:
-    """What a stage remembers of a flow."""
+    """A stage's memory of a flow."""
 
     phase: int = 0
     score: float = 0.0
@@ -92,26 +92,26 @@ class StageMemory:
 
 @dataclass(slots=True)
 class FlowState:
-    """What a link remembers of a flow."""
+    """A link's state of a flow."""
 
     number: int
-    """Chooses its random numbers; no other flow of the link ever has it."""
+    """Number of the flow, never used again on this link; selects its random numbers."""
     forced_first: int = 0
     """1: the first packet has not arrived yet, and must be delivered."""
     packets: int = 0
     """Packets that have arrived."""
     consecutive_losses: int = 0
-    """Packets, up to the last, that are not effectively delivered."""
+    """Number of consecutive packets, up to the last, that are not effectively delivered."""
     first_release_ns: int = NEVER_NS
-    """When the first packet leaves, if it had to be delivered."""
+    """Departure time of the first packet, if it had to be delivered."""
     score: float = 0.0
-    """How bad the link's state is for the last packet, as a normal score."""
+    """Normal score of the link's state for the last packet; larger is worse."""
     newest: int = -1
     """Greatest number among the packets that have left intact."""
     since: int = 0
-    """Number of the first packet under the settings that the link has now."""
+    """Number of the first packet under the present settings."""
     longest_loss_burst: int = 0
-    """Most consecutive losses since then, as far as they are certain."""
+    """Maximum number of consecutive losses since then; counts final losses only."""
 
 
 @dataclass(slots=True)
@@ -123,51 +123,51 @@ class QueueState:
     entry_ns: int = 0
     busy_until_ns: int = 0
     carry: int = 0
-    """Of a nanosecond, in units of 1/rate_bps."""
+    """Fraction of a nanosecond, in units of 1/rate_bps."""
 
 
 @dataclass(slots=True)
 class LinkState:
-    """What a link remembers besides."""
+    """A link's state that all flows share."""
 
     in_flight: int = 0
-    """Packets, and copies, that are delayed."""
+    """Number of delayed packets and copies."""
 
 
 @dataclass(slots=True)
 class PacketDecision:
-    """What is decided for a packet; the stages of a link change it one after the other."""
+    """The decision for a packet; the stages of a link modify it one after the other."""
 
     fate: int = DELIVERED
     """:class:`noack.protocol.record_tables.Fate`."""
     packet: int = 0
     """Its number in its flow."""
     consecutive_losses: int = 0
-    """Up to this packet."""
+    """Number of consecutive losses up to this packet."""
     release_ns: int = NEVER_NS
-    """When it leaves; −1 never."""
+    """Departure time; −1: never."""
     copy_ns: int = NEVER_NS
-    """When its copy leaves; −1 never."""
+    """Departure time of its copy; −1: never."""
     bit: int = -1
     """The bit that is flipped; −1 none."""
     copy_bit: int = -1
     """The bit that is flipped in the copy; −1 none."""
     hold_back_ns: int = 0
-    """How long it is held back for the guarantee."""
+    """Time for which it is held back for the guarantee."""
     makes_stale: int = 0
-    """How many packets it makes stale."""
+    """Number of packets that it makes stale."""
     arrival_ns: int = 0
     size_bytes: int = 0
     """Of the payload."""
     must_pass: int = 0
-    """1: the guarantee wants it delivered."""
+    """1: the guarantee requires its delivery."""
     spared: int = 0
-    """1: a stage would have lost it."""
+    """1: it must pass, and a stage would have lost it."""
 
 
 @dataclass(slots=True)
 class Counters:
-    """What has happened on a link, in one direction."""
+    """Counts of one direction of a link."""
 
     arrived: int = 0
     arrived_bytes: int = 0
@@ -185,9 +185,9 @@ class Counters:
     """Packets and copies that have left."""
     forwarded_bytes: int = 0
     delivered_out_of_order: int = 0
-    """Left after a later one of their flow: stale at the receiver."""
+    """Packets that left after a later one of their flow: stale at the receiver."""
     longest_loss_burst: int = 0
-    """Most consecutive losses of a flow, of packets under the settings that the link has now."""
+    """Maximum number of consecutive losses of a flow under the present settings."""
     most_in_flight: int = 0
 
 
@@ -195,34 +195,34 @@ class LinkProgram(NamedTuple):
     """The settings of a link, as its rules read them: k stages, and their tables."""
 
     stages: Sequence[Any]
-    """(k,) In the order in which they apply; each of a class derived from :class:`RuleStage`."""
+    """(k,) In order of application; each of a class derived from :class:`RuleStage`."""
     integers: Sequence[int]
     """Tables of the stages."""
     reals: Sequence[float]
     """Tables of the stages."""
     decisions: Sequence[RecordedDecision]
-    """Recorded decisions that are taken again, flow by flow."""
+    """Recorded decisions to be repeated, flow by flow."""
     decisions_begin: Sequence[int]
-    """(flows + 1,) Where those of each recorded flow begin, and the last ends; or empty."""
+    """(flows + 1,) Begin of each recorded flow's decisions, and the end of the last; or empty."""
     mansd: int
     """M − 1; −1 for no cap."""
     limit: int
-    """At most so many packets are delayed at once."""
+    """Maximum number of packets delayed at once."""
     tracks: bool
     """Whether packets can be delivered out of order."""
 
 
 class LinkMemory(NamedTuple):
-    """What a link remembers."""
+    """The state of a link."""
 
     flows: Sequence[FlowState]
-    """(rows,) A row may be used again for another flow when a flow has ended."""
+    """(rows,) After the end of a flow, its row may be used for another flow."""
     memory: Sequence[Sequence[StageMemory]]
     """(rows, k)"""
     recent_ns: Sequence[MutableSequence[int]]
     """(rows, mansd + 1) Release times; see :mod:`netem.rules.mansd`."""
     queues: Sequence[Any]
-    """(k,) Of each stage; of :class:`QueueState` or of a class derived from it."""
+    """(k,) One per stage, of :class:`QueueState` or a class derived from it."""
     departures_ns: MutableSequence[int]
     """The rings of the queues."""
     link: LinkState
@@ -234,7 +234,7 @@ def refuse(decision: PacketDecision, fate: int) -> None:
 
     Args:
         decision: for the packet.
-        fate: what it is called: DROPPED, OVERFLOWED or BLACKED_OUT.
+        fate: DROPPED, OVERFLOWED or BLACKED_OUT.
     """
     if decision.fate == DELIVERED:
         if decision.must_pass != 0:

@@ -1,7 +1,7 @@
-"""What one direction of a link does: its impairments, the cap, and the limit.
+"""The settings of one direction of a link: impairments, the cap, and the limit.
 
-A probability's ``correlation`` is that of a latent Gaussian process of order one between successive
-packets of a flow, so that the probability itself stays exact (which it does not in ``tc netem``).
+The ``correlation`` of a probability is the correlation of a latent first-order Gaussian process
+between successive packets of a flow. The probability itself stays exact, unlike in ``tc netem``.
 """
 
 from collections.abc import Iterable
@@ -19,28 +19,28 @@ Mansd = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 class LinkSettings(ScenarioSection):
-    """What one direction of a link does, in this order, to the packets of each flow."""
+    """Settings of one direction of a link; they apply to the packets of each flow."""
 
     impairments: tuple[AnyImpairment, ...] = ()
-    """Applied in this order."""
+    """The impairments, applied in this order."""
     mansd: Mansd | None = None
-    """M − 1: at most so many consecutive packets of a flow are not effectively delivered."""
+    """M − 1: maximum number of consecutive packets of a flow not effectively delivered."""
     first_delivered: bool = False
-    """The first packet of each flow is delivered, whatever the impairments say."""
+    """Deliver the first packet of each flow, regardless of the impairments."""
     limit: Annotated[int, Field(ge=1, le=1_000_000)] = 16_384
-    """At most so many packets are delayed at once; more are dropped."""
+    """Maximum number of packets delayed at once; further packets are dropped."""
 
     @property
     def longest_delay_s(self) -> float:
-        """Sum of the delays' upper ends, in seconds; of unbounded ones at four times the jitter.
+        """Sum of the maximum delays, in seconds; unbounded delays count at four times the jitter.
 
-        A rate limit counts with a full queue of packets of 1,500 bytes.
+        A rate limit counts as the transmission time of a full queue of packets of 1,500 bytes.
         """
         return sum(one.longest_s for one in self.impairments)
 
     @property
     def delay_is_bounded(self) -> bool:
-        """Whether no packet takes longer; at a rate limit, packets that must pass may."""
+        """Whether that is a true bound; packets that must pass a rate limit may take longer."""
         return all(one.is_bounded for one in self.impairments)
 
     @model_validator(mode="after")
@@ -50,14 +50,14 @@ class LinkSettings(ScenarioSection):
 
 
 def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None = None) -> None:
-    """Check that before each delay that is correlated with loss there is a loss that says how bad.
+    """Check that each delay correlated with loss follows a loss model that gives a score.
 
     Args:
-        impairments: in their order.
+        impairments: the impairments in their order.
         loss: the loss model before them, if there is one.
 
     Raises:
-        ValueError: there is none; the message begins with the key.
+        ValueError: there is no such loss model; the message begins with the key.
     """
     for number, impairment in enumerate(impairments):
         if isinstance(impairment, LossOf):
@@ -70,16 +70,16 @@ def require_scores(impairments: Iterable[AnyImpairment], loss: LossModel | None 
 
 
 def read_files(settings: LinkSettings, folder: Path, place: str = "") -> LinkSettings:
-    """Return settings that name no files: what the files say stands in them.
+    """Return settings with the files' contents instead of their names.
 
     Args:
-        settings: of one direction of a link.
-        folder: where relative names begin.
-        place: where the settings stand, for messages, e.g. ``links.toml: link.0.forward``; without
-            it only the file is named.
+        settings: settings of one direction of a link.
+        folder: folder to which relative names refer.
+        place: position of the settings, for messages, e.g. ``links.toml: link.0.forward``; empty:
+            messages name only the file.
 
     Raises:
-        CallerError: one line; a file cannot be read, or does not contain what it should.
+        CallerError: one line; a file cannot be read, or has wrong content.
     """
     impairments = tuple(
         one.without_files(folder, f"{place}.impairments.{number}" if place else "")

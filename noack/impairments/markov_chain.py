@@ -1,4 +1,4 @@
-"""A feature as a Markov chain that moves with every packet, to predict loss rates."""
+"""A feature as a Markov chain that advances with every packet, to predict loss rates."""
 
 import math
 from collections.abc import Iterable
@@ -16,33 +16,33 @@ LONGEST_PATTERN = 10_000_000
 
 
 class NotPredictableError(Exception):
-    """The loss rate cannot be predicted; says why."""
+    """The loss rate cannot be predicted; the message is the reason."""
 
 
 class Chain(NamedTuple):
-    """A Markov chain with n states: it moves, then acts on the packet, or not."""
+    """A Markov chain with n states: for each packet it advances, then may act on the packet."""
 
     start: Array
     """(n,) Distribution before the first packet."""
     moves: Array
     """(n, n) Transition matrix."""
     acts: Array
-    """(n,) Probability that it acts."""
+    """(n,) Probability in each state that it acts on the packet."""
     what: str = "lose"
-    """What it does then: ``lose``, ``corrupt`` or ``duplicate``."""
+    """The action: ``lose``, ``corrupt`` or ``duplicate``."""
     probability: float = 0.0
     """Probability that it acts on a copy."""
 
 
 class Pattern(NamedTuple):
-    """A loss with a pattern that repeats."""
+    """A periodic loss pattern."""
 
     lost: NDArray[np.bool_]
     """(period,)"""
 
     @property
     def chain(self) -> Chain:
-        """The same as a chain."""
+        """Return the pattern as a Markov chain."""
         period = len(self.lost)
         return Chain(
             np.eye(period)[-1], np.roll(np.eye(period), 1, axis=1), self.lost.astype(float)
@@ -50,7 +50,7 @@ class Pattern(NamedTuple):
 
 
 def pattern(period: int, lost: Iterable[int]) -> Pattern:
-    """Return the pattern that loses these numbers of every ``period`` packets.
+    """Return the pattern in which these packet numbers of every ``period`` packets are lost.
 
     Raises:
         NotPredictableError: the period is too long.
@@ -79,7 +79,7 @@ def chance_chain(probability: float, correlation: float) -> Chain:
 
 
 def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]:
-    """Gauss nodes on both sides of the threshold that the latent process crosses."""
+    """Return Gauss nodes and weights on both sides of the latent process's threshold."""
     threshold, edge = -score(probability), 8.3  # no uniform number has a score beyond
     innovation = math.sqrt(1 - correlation**2)
     sides = ((-edge, min(threshold, edge), 0.0), (max(threshold, -edge), edge, 1.0))
@@ -96,7 +96,7 @@ def _nodes(probability: float, correlation: float) -> tuple[Array, Array, Array]
 
 
 def stochastic(matrix: Array) -> Array:
-    """Let rows add up to 1, as rounding errors would grow; tiny entries, slow to compute, are 0."""
+    """Normalise rows to sum 1, since rounding errors would grow; set tiny, slow entries to 0."""
     kept: Array = np.where(matrix < 1e-100, 0.0, matrix)
     kept /= kept.sum(axis=1, keepdims=True)
     return kept

@@ -4,7 +4,7 @@ import math
 
 _SQRT_HALF = 0.7071067811865476
 _TINY = 5.551115123125783e-17
-"""Half a step of a uniform number, so that 0 has a finite score."""
+"""Half the resolution of a uniform number: gives 0 a finite score."""
 
 
 def cdf(z: float) -> float:
@@ -15,7 +15,7 @@ def cdf(z: float) -> float:
 def score(u: float) -> float:
     """Return the z with Φ(z) = u, for u in [0, 1] (Wichura 1988, algorithm AS 241, PPND16).
 
-    The relative error is below 1e-15; the ends count as 2⁻⁵⁴ from 0 and 1.
+    The relative error is below 1e-15; u is limited to a distance of 2⁻⁵⁴ from 0 and 1.
     """
     q = u - 0.5
     if abs(q) <= 0.425:

@@ -1,8 +1,7 @@
 """Counter-based random numbers: Philox4x32-10 (Salmon, Moraes, Dror & Shaw, SC 2011).
 
-The numbers drawn for a datagram are a function of the stream's key and of the datagram's place, so
-that they depend neither on time, nor on other flows, nor on how datagrams are batched; ten thousand
-flows have ten thousand streams and no state.
+The numbers drawn for a datagram are a function of the stream's key and of the numbers of flow and
+datagram. They do not depend on time, on other flows, or on batches; no generator state is needed.
 """
 
 _WORD = 0xFFFFFFFF
@@ -13,7 +12,7 @@ _UNIT = 1.0 / 9007199254740992.0
 def philox(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
     """Return four random 32-bit words for a counter of four words and a key of two.
 
-    The products may wrap in 64 bits with sign; what is cut out of them is the same either way.
+    The products may overflow 64 signed bits; the bits that are used are the same in either case.
     """
     for _ in range(10):
         p0 = 0xD2511F53 * c0
@@ -37,7 +36,7 @@ def uniforms(key0: int, key1: int, flow: int, packet: int, block: int) -> tuple[
         key1: high word.
         flow: number of the flow, below 2³².
         packet: number of the datagram in its flow, below 2⁶³.
-        block: which pair of the datagram.
+        block: number of the pair for this datagram.
     """
     a, b, c, d = philox(packet & _WORD, packet >> 32, flow, block, key0, key1)
     return (

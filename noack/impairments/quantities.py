@@ -1,7 +1,7 @@
-"""Quantities as ``tc`` writes them, read exactly and written back: percentages, times, rates.
+"""Quantities in the syntax of ``tc``: percentages, times, rates.
 
-A number is read as a decimal and rounded to a float once, so that what is written is read back to
-the same bits.
+A number is read as a decimal and rounded to a float once, so that a written number is read as the
+same float again.
 """
 
 import re
@@ -40,9 +40,9 @@ class Quantity(Generic[T]):
     """A kind of quantity."""
 
     expected: str
-    """What a word of it is, with an example: ``a time, e.g. 10ms``."""
+    """Description of a word, with an example: ``a time, e.g. 10ms``."""
     read: Callable[[str], T]
-    """Reads a word; raises ValueError if the word is no such quantity."""
+    """Reads a word; raises ValueError if the word is not such a quantity."""
 
 
 def _split(text: str) -> tuple[Decimal, str]:
@@ -125,9 +125,9 @@ CORRELATION = Quantity(
 )
 SIGNED_PERCENT = Quantity("a correlation from -100% to 100%, e.g. 80%", _percent(-100, 100))
 TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms (a bare number is in us)", _time_s)
-"""A time of tc: a bare number counts microseconds."""
+"""A time of tc: a number without a unit is in microseconds."""
 OWN_TIME_S = Quantity("a time in s, ms, us or ns, e.g. 10ms", _own_time_s)
-"""A time in a word that tc does not have: it needs its unit, and may be negative."""
+"""A time of a word that tc does not have: requires a unit, may be negative."""
 RATE_BPS = Quantity("a rate in bit, kbit, mbit, gbit, kbps (bytes!), ..., e.g. 1mbit", _rate_bps)
 COUNT = Quantity("a whole number, e.g. 5", _integer("[0-9]{1,20}"))
 SIGNED_COUNT = Quantity("a whole number, e.g. 28 or -14", _integer("-?[0-9]{1,20}"))
@@ -144,7 +144,7 @@ NUMBER = Quantity("a number, e.g. 2.5", _exact(_read_number))
 
 
 def _digits(number: Decimal) -> str:
-    """A decimal in full, without an exponent or needless zeros."""
+    """Return a decimal without an exponent or trailing zeros."""
     text = format(number, "f")
     text = text.rstrip("0").rstrip(".") if "." in text else text
     return "0" if text in ("-0", "") else text
@@ -178,7 +178,7 @@ def time_text(time_s: float) -> str:
 
 
 def _ease(text: str) -> tuple[int, bool]:
-    """Shorter numbers first, then whole ones."""
+    """Sort key: shorter numbers first, then whole numbers."""
     return len(text), "." in text
 
 
@@ -191,7 +191,7 @@ def rate_text(rate_bps: int) -> str:
 
 
 def number_text(number: float) -> str:
-    """A number in full."""
+    """Return a number with all digits."""
     return _digits(Decimal(repr(number)))
 
 

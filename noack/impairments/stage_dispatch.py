@@ -1,4 +1,4 @@
-"""Every behaviour of the features, by number, and the function that applies the one of a stage."""
+"""The features' behaviours by number, and the function that applies a stage's behaviour."""
 
 from collections.abc import Sequence
 

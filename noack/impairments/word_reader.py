@@ -1,4 +1,4 @@
-"""Reads words one after the other; a message names the word that is wrong."""
+"""Reads words one after the other; error messages name the wrong word."""
 
 import difflib
 import shlex
@@ -18,8 +18,7 @@ class WordReader:
     """A sequence of words.
 
     Args:
-        words: one string of words, as on a shell's line, or the words; of these one may be a string
-            of several again.
+        words: one string of words, as on a shell's command line, or a sequence of such strings.
     """
 
     def __init__(self, words: str | Sequence[str]) -> None:
@@ -27,13 +26,13 @@ class WordReader:
         self._clause: list[str] = []
 
     def begin(self) -> str | None:
-        """Take the first word of a clause; None at the end."""
+        """Read the first word of a clause; None at the end."""
         self._clause = []
         return self._take()
 
     @property
     def clause(self) -> str:
-        """What has been taken of this clause, for messages."""
+        """The words of this clause that have been read, for messages."""
         return shortened(printable(shlex.join(self._clause)))
 
     def wrong(self, expected: str) -> NoReturn:
@@ -41,14 +40,14 @@ class WordReader:
         raise CallerError(f"{self.clause}: {expected}")
 
     def word(self, expected: str) -> str:
-        """Take a word."""
+        """Read a word."""
         word = self._take()
         if word is None:
             self.wrong(f"a value is missing: {expected}")
         return word
 
     def file(self, expected: str) -> str:
-        """Take the name of a file, which may contain spaces."""
+        """Read the name of a file, which may contain spaces."""
         if not self._words:
             self.wrong(f"a value is missing: {expected}")
         name = self._words.popleft()
@@ -58,38 +57,38 @@ class WordReader:
         return name
 
     def value(self, quantity: Quantity[T]) -> T:
-        """Take a quantity."""
+        """Read a quantity."""
         word = self.word(quantity.expected)
         return self.read(word, quantity)
 
     def values(self, quantity: Quantity[T], expected: str) -> list[T]:
-        """Take a list of quantities, divided by commas."""
+        """Read a list of quantities, separated by commas."""
         try:
             return [quantity.read(part) for part in self.word(expected).split(",")]
         except ValueError:
             self.wrong(f"expected {expected}")
 
     def read(self, word: str, quantity: Quantity[T]) -> T:
-        """Read a word, or a part of one, that has been taken."""
+        """Convert a word that has been read, or a part of it."""
         try:
             return quantity.read(word)
         except ValueError:
             self.wrong(f"expected {quantity.expected}")
 
     def number_follows(self, signs: str = "") -> bool:
-        """Whether the next word begins like a number."""
+        """Whether the next word starts like a number."""
         word = self._peek()
         return word is not None and word[0] in "0123456789." + signs
 
     def accept(self, *words: str) -> bool:
-        """Take the next word if it is one of these."""
+        """Read the next word if it is one of these; return whether it is."""
         if self._peek() not in words:
             return False
         self._take()
         return True
 
     def unknown(self, word: str, known: Collection[str]) -> NoReturn:
-        """Raise a CallerError: there is no such word; name the nearest."""
+        """Raise a CallerError for an unknown word; name the nearest known word."""
         longer = sorted(one for one in known if one.startswith(word))
         if longer:
             self.wrong(f"words are not shortened; did you mean {' or '.join(longer)}?")

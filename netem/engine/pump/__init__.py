@@ -1,1 +1,1 @@
-"""The pump: what the Linux engine does between two returns to Python, compiled by numba."""
+"""The pump: the compiled loop (numba) of the Linux engine, which runs between returns to Python."""

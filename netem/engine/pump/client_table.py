@@ -1,18 +1,18 @@
-"""Clients by their address: a hash table with open addressing and linear probing."""
+"""Clients by address: a hash table with open addressing and linear probing."""
 
 from netem.engine.pump.pump_layout import Array
 
 _AF_INET = 2
 _LOW_WORD = 0xFFFFFFFF
 _GOLDEN = -7046029254386353131
-"""2⁶⁴/φ as an integer with sign."""
+"""2⁶⁴/φ as a signed integer."""
 
 
 def key_of(name: Array, link: int) -> tuple[int, int, int, int]:
-    """Return what identifies a client: family, port, host, scope and link, in four words.
+    """Return a client's key: family, port, host, scope and link, in four words.
 
     Args:
-        name: (4,) int64, its socket address.
+        name: (4,) int64, socket address of the client.
         link: number of the link.
     """
     if name[0] & 0xFFFF == _AF_INET:
@@ -21,7 +21,7 @@ def key_of(name: Array, link: int) -> tuple[int, int, int, int]:
 
 
 def find(table: Array, clients: Array, key0: int, key1: int, key2: int, key3: int) -> int:
-    """Row of the client with a key; −1 if there is none."""
+    """Return the row of the client with a key; −1 if there is none."""
     mask = len(table) - 1
     place = _hash(key0, key1, key2, key3) & mask
     while table[place] >= 0:
@@ -38,13 +38,13 @@ def find(table: Array, clients: Array, key0: int, key1: int, key2: int, key3: in
 
 
 def insert(table: Array, clients: Array, row: int, name: Array) -> None:
-    """Put a client into the table, which has room.
+    """Insert a client into the table; the table must have room.
 
     Args:
         table: the table.
         clients: the clients.
-        row: the client's.
-        name: (4,) int64, its socket address.
+        row: row of the client.
+        name: (4,) int64, socket address of the client.
     """
     client = clients[row]
     key0, key1, key2, key3 = key_of(name, client.link)
@@ -60,7 +60,7 @@ def insert(table: Array, clients: Array, row: int, name: Array) -> None:
 
 
 def remove(table: Array, clients: Array, row: int) -> None:
-    """Take a client out of the table, and close the gap."""
+    """Remove a client from the table, and close the gap."""
     mask = len(table) - 1
     gap = _home(clients, row) & mask
     while table[gap] != row:
@@ -71,7 +71,7 @@ def remove(table: Array, clients: Array, row: int) -> None:
         if table[place] < 0:
             break
         home = _home(clients, table[place]) & mask
-        # It may move back unless its home lies after the gap, on the way round.
+        # An entry may move into the gap unless its home is cyclically after the gap.
         if ((place - home) & mask) >= ((place - gap) & mask):
             table[gap] = table[place]
             gap = place
@@ -84,7 +84,7 @@ def _home(clients: Array, row: int) -> int:
 
 
 def _hash(key0: int, key1: int, key2: int, key3: int) -> int:
-    """Mix four words; the product wraps."""
+    """Return a hash of four words; the product overflows on purpose."""
     mixed = 0
     for word in (key0, key1, key2, key3):
         mixed = (mixed ^ word) * _GOLDEN

@@ -1,8 +1,8 @@
-"""The errors of earlier datagrams, which the kernel queues at a socket (IP_RECVERR).
+"""Reads the errors of earlier datagrams from a socket's error queue (IP_RECVERR).
 
-A socket that asks for them learns of its own datagrams that a full queue refused (ENOBUFS), but of
-every ICMP error too, and fails its next call for it once; so the queue is emptied before it is
-decided whose an error is.
+With IP_RECVERR, a send to a full device queue fails (ENOBUFS). However, each ICMP error also makes
+the socket's next call fail once. Therefore the error queue is emptied after a failed call, to find
+out whether an ICMP error caused the failure.
 """
 
 from netem.engine.pump.libc_calls import ECONNREFUSED, MSG_DONTWAIT, address_of, recvmmsg
@@ -15,17 +15,17 @@ _RECVERR_6 = 41 | 25 << 32
 _LOW_WORD = 0xFFFFFFFF
 _ICMP = 2
 _ICMP_6 = 3
-"""Origins of an error; others are of the machine itself, and fail a call by themselves."""
+"""Origins of an error. Errors of other origins are local; they make the call itself fail."""
 _HEADER_BYTES = HEADER.itemsize
 
 
 def take_errors(memory: Memory, socket: int) -> int:
     """Empty a socket's error queue; return how many ICMP errors there were.
 
-    Those that say that nobody listens at the server's port are counted.
+    Port-unreachable errors of the server are counted.
 
     Args:
-        memory: the pump's.
+        memory: the pump's memory.
         socket: number of the socket.
     """
     pump, headers = memory.pump[0], memory.error_headers
@@ -48,7 +48,7 @@ def take_errors(memory: Memory, socket: int) -> int:
 
 
 def _icmp_error(memory: Memory, k: int) -> int:
-    """The errno of an entry that came by ICMP; 0 if it did not."""
+    """Return the errno of entry k if it comes from ICMP, else 0."""
     words, left_bytes, place = memory.error_controls[k], memory.error_headers[k].control_bytes, 0
     while left_bytes >= 32 and place + 3 < len(words):
         used_bytes = (words[place] + 7) & ~7

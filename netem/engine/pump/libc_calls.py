@@ -1,7 +1,7 @@
-"""The system's functions as compiled code calls them, and arrays over memory known by address.
+"""libc functions for compiled code, and arrays over memory at a given address.
 
-Everything is passed as integers: addresses too. Calls through symbols, unlike those through
-pointers from ctypes, can be kept in numba's cache.
+All arguments are integers, including addresses. numba can cache calls through symbols, but not
+calls through ctypes pointers.
 """
 
 from typing import Any
@@ -47,9 +47,9 @@ def _array_at(typing_context: Any, like: Any, address: Any, rows: Any, columns: 
     """Return an array of ``like``'s type over the memory at an address.
 
     Args:
-        typing_context: numba's.
+        typing_context: numba's typing context.
         like: an array of one or two dimensions, contiguous.
-        address: of the first element.
+        address: address of the first element.
         rows: length of the first dimension.
         columns: length of the second, if there is one.
     """
@@ -80,16 +80,16 @@ array_at: Any = intrinsic(_array_at)
 
 
 def address_of(array: Any) -> Any:
-    """Where an array begins, as an integer with sign."""
+    """Return the address of an array's first element, as a signed integer."""
     return np.int64(array.ctypes.data)
 
 
 def errno(integers: Any) -> Any:
-    """Why the last call failed; ``integers`` is any array of int32."""
+    """Return the errno of the last call; ``integers`` is any array of int32."""
     return array_at(integers, errno_location(), 1, 1)[0]
 
 
 def clock_ns(clock: Any, time: Any) -> Any:
-    """Read a clock; ``time`` is room for a struct timespec, (2,) int64."""
+    """Read a clock; ``time`` is a buffer for a struct timespec, (2,) int64."""
     clock_gettime(clock, address_of(time))
     return time[0] * 1_000_000_000 + time[1]

@@ -1,27 +1,30 @@
-"""What is kept until it leaves: payloads in chained blocks, and a heap by time of release."""
+"""Stores delayed datagrams: payloads in chained blocks, and a heap ordered by release time."""
 
 from netem.engine.pump.libc_calls import array_at, memcpy
 from netem.engine.pump.pump_layout import BLOCK_BYTES, CHUNK_BLOCKS, Array, Memory
 
 
 def blocks_for(size_bytes: int) -> int:
-    """How many blocks a payload takes."""
+    """Return the number of blocks for a payload."""
     return max((size_bytes + BLOCK_BYTES - 1) // BLOCK_BYTES, 1)
 
 
 def block_address(chunks: Array, block: int) -> int:
-    """Where a block lies."""
+    """Return the address of a block."""
     return chunks[block // CHUNK_BLOCKS] + (block % CHUNK_BLOCKS) * BLOCK_BYTES
 
 
 def keep(memory: Memory, address: int, size_bytes: int, bit: int) -> int:
-    """Copy a payload, flip the bit of the copy, and return its slot; there is room.
+    """Copy a payload into a slot and flip a bit of it; there must be room.
 
     Args:
-        memory: the pump's.
-        address: of the payload.
-        size_bytes: its size.
-        bit: which bit is flipped; −1 none.
+        memory: the pump's memory.
+        address: address of the payload.
+        size_bytes: size of the payload.
+        bit: number of the bit to be flipped; −1 none.
+
+    Returns:
+        The number of the slot.
     """
     pump = memory.pump[0]
     number = pump.free_slot
@@ -66,7 +69,7 @@ def drop(memory: Memory, number: int) -> None:
 
 
 def push(memory: Memory, release_ns: int, number: int, slot: int) -> None:
-    """Put a slot into the heap."""
+    """Push a slot onto the heap."""
     pump, heap = memory.pump[0], memory.heap
     place = pump.heap
     pump.heap += 1
@@ -81,7 +84,7 @@ def push(memory: Memory, release_ns: int, number: int, slot: int) -> None:
 
 
 def pop(memory: Memory) -> None:
-    """Take the first entry out of the heap."""
+    """Remove the first entry of the heap."""
     pump, heap = memory.pump[0], memory.heap
     pump.heap -= 1
     count = pump.heap

@@ -1,4 +1,4 @@
-"""Decides for the packets at hand, and lets those out that were delayed and are due."""
+"""Decides for received packets, and releases delayed packets that are due."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ from netem.rules.link_rules import admit, leave
 from noack.impairments.link_records import NEVER_NS, LinkMemory, LinkProgram, PacketDecision
 
 _HEAD_BYTES = 16
-"""Of a control message: its length, its level and its kind."""
+"""Header of a control message: length, level and kind."""
 _STAMP = 1 | 35 << 32
 """Level and kind: SOL_SOCKET, SCM_TIMESTAMPNS."""
 _NS = 1_000_000_000
@@ -30,12 +30,12 @@ _REFUSED = -2
 
 
 def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
-    """Line up what is due; return why this ends: CARRY_ON, or what is full.
+    """Queue the packets that are due for sending; return CARRY_ON, or which buffer is full.
 
     Args:
-        memory: the pump's.
-        state_like: a state; only its types count.
-        until_ns: packets are let out that are due by then.
+        memory: the pump's memory.
+        state_like: any state; only its types matter.
+        until_ns: packets with a release time up to this time are released.
     """
     pump = memory.pump[0]
     while pump.heap > 0 and memory.heap[0].release_ns <= until_ns:
@@ -69,12 +69,12 @@ def let_out_due(memory: Memory, state_like: LinkMemory, until_ns: int) -> int:
 def decide(
     memory: Memory, program_like: LinkProgram, state_like: LinkMemory, decision: PacketDecision
 ) -> int:
-    """Decide for the packets at hand, all from one socket; return why this ends.
+    """Decide for the packets received from one socket; return CARRY_ON, or why this ended.
 
     Args:
-        memory: the pump's.
-        program_like: a program; only its types count.
-        state_like: a state; likewise.
+        memory: the pump's memory.
+        program_like: any program; only its types matter.
+        state_like: any state; only its types matter.
         decision: a row that is overwritten.
     """
     pump = memory.pump[0]
@@ -84,7 +84,7 @@ def decide(
     number = 2 * link + reverse
     direction = memory.directions[number]
     program = _program_at(program_like, direction)
-    # Compiled code cannot return records, so that no function makes this.
+    # Not in a function: compiled code cannot return records.
     state = LinkMemory(
         array_at(state_like.flows, direction.flows, direction.rows, 0),
         array_at(state_like.memory, direction.memory, direction.rows, direction.stages_rows),
@@ -97,8 +97,8 @@ def decide(
     while pump.batch_next < pump.batch_end:
         header = memory.in_headers[pump.batch_next]
         _read_arrival(memory)
-        # Never before an earlier decision; so a packet that is due between two arrivals leaves
-        # there.
+        # Decision times ascend, so that a packet that is due between two arrivals leaves
+        # between them.
         now_ns = max(pump.now_ns, min(pump.arrival_ns, pump.read_ns))
         reason = let_out_due(memory, state_like, now_ns)
         if reason != CARRY_ON:
@@ -137,7 +137,7 @@ def decide(
 
 
 def _program_at(like: LinkProgram, direction: Any) -> LinkProgram:
-    """Return the program of a direction."""
+    """Return the program of a direction, with the types of ``like``."""
     return LinkProgram(
         array_at(like.stages, direction.stages, direction.stages_rows, 0),
         array_at(like.integers, direction.integers, direction.integers_rows, 0),
@@ -159,7 +159,7 @@ def _store_is_full(memory: Memory, size_bytes: int) -> bool:
 
 
 def _client_at_hand(memory: Memory, direction: Any, link: int) -> int:
-    """Return the row of the client that sent the packet at hand; a refused one is counted."""
+    """Return the row of the client that sent the current packet; count a refused packet."""
     key0, key1, key2, key3 = key_of(memory.in_names[memory.pump[0].batch_next], link)
     row = find(memory.table, memory.clients, key0, key1, key2, key3)
     if row < 0:
@@ -171,7 +171,7 @@ def _client_at_hand(memory: Memory, direction: Any, link: int) -> int:
 
 
 def _read_arrival(memory: Memory) -> None:
-    """Read when the packet at hand arrived."""
+    """Read the arrival time of the current packet."""
     pump = memory.pump[0]
     header, words = memory.in_headers[pump.batch_next], memory.in_controls[pump.batch_next]
     pump.arrival_ns = pump.read_ns
@@ -193,7 +193,7 @@ def _release(
     decision: PacketDecision,
     copy: int,
 ) -> None:
-    """Line up a packet, or its copy, that leaves now, or keep it until it is due."""
+    """Queue a packet or its copy for sending if it leaves now, else store it until it is due."""
     pump = memory.pump[0]
     release_ns, bit, counts = decision.release_ns, decision.bit, decision.bit < 0
     if copy != 0:
@@ -234,7 +234,7 @@ def _release(
 
 
 def _line_up(memory: Memory, state_like: LinkMemory) -> None:
-    """Line up the packet that has been filled in to be sent, and note that it leaves."""
+    """Queue the packet in the first free row of ``leaving`` for sending; record its departure."""
     pump = memory.pump[0]
     leaving = memory.leaving[pump.leaving]
     number = leaving.direction

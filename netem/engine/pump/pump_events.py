@@ -1,4 +1,4 @@
-"""What taps are told."""
+"""The events that the pump reports to taps."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ _AF_INET = 2
 
 
 def has_room(memory: Memory, size_bytes: int) -> bool:
-    """Whether the events of a datagram fit: it comes, it and its copy leave."""
+    """Whether three events fit: arrival of a datagram, its departure, its copy's departure."""
     pump = memory.pump[0]
     if pump.taps == 0:
         return True
@@ -33,14 +33,14 @@ def has_room(memory: Memory, size_bytes: int) -> bool:
 def tell_arrival(
     memory: Memory, way: int, client: int, address: int, decision: PacketDecision
 ) -> None:
-    """Tell that a datagram has come, and what was decided.
+    """Report the arrival of a datagram and the decision.
 
     Args:
-        memory: the pump's.
+        memory: the pump's memory.
         way: number of the direction.
         client: row of the client.
-        address: of the payload.
-        decision: what was decided.
+        address: address of the payload.
+        decision: the decision.
     """
     pump, size_bytes = memory.pump[0], decision.size_bytes
     event = memory.events[pump.events]
@@ -66,12 +66,12 @@ def tell_arrival(
 
 
 def tell_departure(memory: Memory, number: int, now_ns: int) -> None:
-    """Tell that a datagram has left.
+    """Report the departure of a datagram.
 
     Args:
-        memory: the pump's.
-        number: of the datagram among those that leave.
-        now_ns: when it left.
+        memory: the pump's memory.
+        number: its row in ``leaving``.
+        now_ns: time of departure.
     """
     pump, leaving = memory.pump[0], memory.leaving[number]
     event = memory.events[pump.events]
@@ -128,7 +128,7 @@ def _fill(
 
 
 def _tell_addresses(memory: Memory, event: Any, way: int, client: int, server_side: int) -> None:
-    """Tell from where to where a datagram went on one side of a link."""
+    """Write source and destination address of a datagram on one side of a link."""
     pump = memory.pump[0]
     here = address_of(memory.clients) + client * _CLIENT_BYTES
     link = address_of(memory.directions) + (way - (way & 1)) * _DIRECTION_BYTES
@@ -144,7 +144,7 @@ def _tell_addresses(memory: Memory, event: Any, way: int, client: int, server_si
 
 
 def _tell_host(memory: Memory, name: int, place: int) -> tuple[int, int]:
-    """Copy a socket address's host to ``place``; return the version of IP and the port."""
+    """Copy a socket address's host to ``place``; return the IP version and the port."""
     head = array_at(memory.data, name, 4, 1)
     port = (int(head[2]) << 8) | int(head[3])
     if head[0] == _AF_INET:

@@ -1,4 +1,4 @@
-"""The loop: wait, receive, decide, send, and let out what is due."""
+"""The pump's loop: wait, receive, decide, send, and release delayed datagrams."""
 
 from netem.engine.pump.error_queue import take_errors
 from netem.engine.pump.libc_calls import (
@@ -31,7 +31,7 @@ _EPOLLERR = 8
 _NS = 1_000_000_000
 _FEW_BUFFERS = 16
 _HOUSEKEEPING_NS = 500_000
-"""Python takes less, nearly always."""
+"""Housekeeping in Python nearly always takes less time."""
 _MOST_PUT_OFF_NS = 10_000_000
 
 
@@ -42,14 +42,14 @@ def run_pump(
     verdicts: list[PacketDecision],
     until_ns: int,
 ) -> int:
-    """Relay until Python is needed; return why it is.
+    """Relay until Python is needed; return the reason.
 
     Args:
-        memory: all that it works on.
-        program_like: a program, for its types.
-        state_like: a state, likewise.
-        verdicts: room for one.
-        until_ns: when to return at the latest, since the relay's start.
+        memory: the pump's memory.
+        program_like: any program; only its types matter.
+        state_like: any state; only its types matter.
+        verdicts: buffer for one decision.
+        until_ns: latest time to return, since the relay's start.
     """
     pump = memory.pump[0]
     while True:
@@ -84,7 +84,7 @@ def run_pump(
 
 
 def _is_soon_due(memory: Memory, until_ns: int) -> bool:
-    """Whether housekeeping had better wait, as it would make the next delayed datagram late."""
+    """Whether to postpone housekeeping because it would make the next delayed datagram late."""
     pump = memory.pump[0]
     return (
         pump.heap > 0
@@ -94,7 +94,7 @@ def _is_soon_due(memory: Memory, until_ns: int) -> bool:
 
 
 def _wait(memory: Memory, until_ns: int) -> bool:
-    """Wait for a datagram or for the next to be due; return whether it was not interrupted."""
+    """Wait for a datagram or the next release time; return False if a signal interrupted it."""
     pump = memory.pump[0]
     wait_ns = until_ns - pump.read_ns
     if pump.heap > 0:
@@ -121,7 +121,7 @@ def _wait(memory: Memory, until_ns: int) -> bool:
 
 
 def _receive(memory: Memory) -> None:
-    """Take what there is at the next socket that is ready, as far as there is room."""
+    """Receive datagrams from the next socket that is ready, as far as there are buffers."""
     pump = memory.pump[0]
     event = pump.ready_next * READY_WORDS
     socket = memory.ready[event + READY_WORDS - 2]

@@ -1,4 +1,4 @@
-"""Sends what is lined up: by one call for each socket, and each flow in its order."""
+"""Sends the queued datagrams: one call per socket, each flow in its order."""
 
 from netem.engine.histogram import bucket_of
 from netem.engine.pump.error_queue import take_errors
@@ -44,15 +44,15 @@ _MOST_SEGMENTS = 64
 _MOST_SEGMENTED_BYTES = 65_507
 _TRIES = 3
 _MOST_TRIES = 64
-"""An earlier datagram's ICMP error fails a send, once. What fails with none in the error queue, or
-so often, will fail again."""
+"""Maximum number of tries. An ICMP error of an earlier datagram makes one send fail. A send that
+fails without an ICMP error in the error queue, or this often, is expected to fail again."""
 _PATIENCE_NS = 50_000_000
-"""So long, at most, a socket may be full. A full queue of the device (ENOBUFS) is not waited for:
-other links would be late."""
+"""Maximum time to wait for a full socket. There is no wait for a full queue of the device
+(ENOBUFS), since it would delay other links."""
 
 
 def send(memory: Memory) -> None:
-    """Send all that is lined up."""
+    """Send all queued datagrams."""
     pump = memory.pump[0]
     pump.stamp += 1
     sockets = 0
@@ -90,7 +90,7 @@ def send(memory: Memory) -> None:
 
 
 def _fill(memory: Memory, number: int) -> tuple[int, int]:
-    """Fill headers from ``number`` on; return how many, and with which datagram to go on."""
+    """Fill headers from datagram ``number`` on; return their number and the next datagram."""
     pump = memory.pump[0]
     headers, vectors = 0, 0
     base = address_of(memory.out_vectors)
@@ -145,7 +145,7 @@ def _by_client(memory: Memory, number: int) -> bool:
 
 
 def _address(memory: Memory, header: int, way: int, client: int) -> None:
-    """Say where a message goes."""
+    """Write the destination of a message."""
     direction = memory.directions[way]
     name, name_bytes = 0, 0
     if direction.sends == CLIENT_NAME:
@@ -159,7 +159,7 @@ def _address(memory: Memory, header: int, way: int, client: int) -> None:
 
 
 def _add_vectors(memory: Memory, vectors: int, number: int) -> int:
-    """Say where a datagram's payload lies; return the next free vector."""
+    """Write the vectors of a datagram's payload; return the next free vector."""
     leaving = memory.leaving[number]
     if leaving.slot < 0:
         vector = memory.out_vectors[vectors]
@@ -177,15 +177,16 @@ def _add_vectors(memory: Memory, vectors: int, number: int) -> int:
 
 
 def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
-    """Send messages; return how many are done with.
+    """Send messages; return the number of messages that were sent or failed.
 
-    The others have to be filled in again, as the kernel does not segment the first of them.
+    If it is smaller than ``headers``, the kernel does not segment the next message: the headers of
+    the remaining datagrams must be filled again.
 
     Args:
-        memory: the pump's.
+        memory: the pump's memory.
         socket: number of the socket.
-        headers: how many messages there are.
-        following: the datagram after those in them; −1 none.
+        headers: number of messages.
+        following: the datagram after the last message; −1 none.
     """
     pump, fd = memory.pump[0], memory.sockets[socket].fd
     done, tries, waited_ns = 0, 0, 0
@@ -193,7 +194,7 @@ def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
     while done < headers:
         header = memory.out_headers[done]
         if headers - done == 1 and header.n_vectors == 1 and header.control_bytes == 0:
-            # The cheaper call for a single one.
+            # For a single datagram, sendto is cheaper.
             vector = memory.out_vectors[(header.vectors - vectors) // _VECTOR_BYTES]
             sent = sendto(
                 fd, vector.base, vector.size_bytes, MSG_DONTWAIT, header.name, header.name_bytes
@@ -230,7 +231,7 @@ def _transmit(memory: Memory, socket: int, headers: int, following: int) -> int:
 
 
 def _wait_for_room(memory: Memory, fd: int) -> int:
-    """Wait until a socket takes more, 1 ms at most; return how long, in ns."""
+    """Wait at most 1 ms until a socket is writable; return the waiting time in ns."""
     begun_ns = clock_ns(CLOCK_MONOTONIC, memory.time)
     memory.poll[0] = fd
     memory.poll[1] = POLLOUT
@@ -239,7 +240,7 @@ def _wait_for_room(memory: Memory, fd: int) -> int:
 
 
 def _account(memory: Memory, number: int, now_ns: int) -> None:
-    """Count a datagram that has been sent, or could not be, and let its payload go."""
+    """Count a datagram as sent or failed, and free its payload."""
     pump, leaving = memory.pump[0], memory.leaving[number]
     if leaving.error == 0:
         memory.delays[leaving.direction, bucket_of(now_ns - leaving.arrival_ns)] += 1

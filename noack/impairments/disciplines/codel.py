@@ -1,17 +1,18 @@
 """CoDel, controlled delay (RFC 8289): drops packets while the queue's delay stays above a target.
 
-CoDel decides when a packet's service would begin. The bottleneck is a queue of deterministic rate
-in the order of arrival, so that this time, and with it the packet's time in the queue, is known on
-arrival, and the law can be applied there: packets are taken in the same order, at the same times. A
-packet that the law drops keeps its place in the queue until then. An empty queue resets the law in
-the RFC; here the next packet does, as it does not wait.
+CoDel decides when a packet's service would begin. The bottleneck serves in the order of arrival, at
+a deterministic rate, so that this time, and hence the packet's time in the queue, is known on
+arrival. Therefore the control law is applied on arrival; it sees the same packets in the same order
+with the same times. A packet that it drops keeps its place in the queue until that time. In the
+RFC, an empty queue resets the law; here the next packet resets it, since it does not wait.
 
-One rule differs. The RFC spares a packet if at most one MTU waits behind it when it leaves the
-queue, which is not known on arrival. Here a packet is spared if at most one MTU is before it when
-it arrives. The two differ where a burst ends: the RFC spares its last packets, and this does not.
+One rule differs. The RFC does not drop a packet if at most one MTU waits behind it when it leaves
+the queue, which is not known on arrival. Here, a packet is not dropped if at most one MTU is before
+it when it arrives. The rules differ at the end of a burst: the RFC does not drop its last packets,
+this implementation may.
 
-A packet that must pass is served instead of dropped, and the law stays as it is: it drops the next
-packet that need not pass.
+If the law drops a packet that must pass, the packet is served, and the law's state does not change:
+it drops the next packet that need not pass.
 """
 
 import math
@@ -47,7 +48,7 @@ class CodelStage(BottleneckStage):
     target_ns: int
     interval_ns: int
     mtu_ns: int
-    """How long the line is busy with one MTU."""
+    """Transmission time of one MTU."""
 
 
 @dataclass(slots=True)
@@ -61,11 +62,11 @@ class CodelQueue(QueueState):
     last_drops: int = 0
     dropping: int = 0
     dropped_before: int = 0
-    """1: the law dropped the packet before, and ``drop_next_ns`` has not followed yet."""
+    """1: the law dropped the previous packet; ``drop_next_ns`` has not been updated yet."""
 
 
 def service_ns(queue: QueueState) -> int:
-    """When the service of a packet would begin that has just come to the queue."""
+    """Return the time at which the service of a newly arrived packet would begin."""
     return max(queue.entry_ns, queue.busy_until_ns)
 
 
@@ -75,7 +76,7 @@ def control_law(stage: CodelStage, t_ns: int, drops: int) -> int:
 
 
 def is_due(stage: CodelStage, queue: CodelQueue) -> bool:
-    """Whether the law wants to drop the packet that has just come to the queue."""
+    """Whether the law drops the newly arrived packet."""
     now_ns = service_ns(queue)
     sojourn_ns = now_ns - queue.entry_ns
     above_long_enough = False
@@ -96,7 +97,7 @@ def is_due(stage: CodelStage, queue: CodelQueue) -> bool:
 
 
 def note_drop(stage: CodelStage, queue: CodelQueue) -> None:
-    """Advance the law past a dropped packet."""
+    """Advance the law's state after a dropped packet."""
     now_ns = service_ns(queue)
     if queue.dropping != 0:
         queue.drops += 1
@@ -118,7 +119,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Put the packet into the queue, and its copy behind it; a packet lost before takes no part."""
+    """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
     if decision.fate != DELIVERED:
         return
     queue, ring_ns = state.queues[stage.place], state.departures_ns
@@ -168,11 +169,12 @@ class Codel(QueueDiscipline):
     interval_s: _TimeS = 0.1
     """The delay must be above the target for this long before the first packet is dropped."""
     mtu_bytes: Annotated[int, Field(ge=0, le=65_535)] = 1500
-    """A packet that finds no more bytes before it is not dropped."""
+    """A packet with at most this number of bytes before it in the queue is not dropped."""
 
     words: ClassVar = (
         Word("codel", _EXAMPLE, _read),
-        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval", "mtu")),
+        *(Word(name, _EXAMPLE, after="rate RATE codel") for name in ("target", "interval")),
+        Word("mtu", f"{_EXAMPLE} mtu 1200", after="rate RATE codel"),
     )
     behaviour: ClassVar = Behaviour(CodelStage, apply, CodelQueue)
 

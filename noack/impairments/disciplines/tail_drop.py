@@ -26,7 +26,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Put the packet into the queue, and its copy behind it; a packet lost before takes no part."""
+    """Put the packet and then its copy into the queue; ignore a packet that is lost already."""
     if decision.fate != DELIVERED:
         return
     queue, ring_ns = state.queues[stage.place], state.departures_ns

@@ -1,4 +1,4 @@
-"""Blackouts: intervals of time in which every packet is lost."""
+"""Blackouts: intervals of time in which all packets are lost."""
 
 import re
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class BlackoutStage(RuleStage):
     begin: int
     end: int
     period_ns: int
-    """0: once."""
+    """0: the intervals do not repeat."""
 
 
 def apply(
@@ -73,7 +73,7 @@ def _read(reader: WordReader) -> Table:
 
 
 class Blackout(Impairment):
-    """Every packet is lost that arrives during intervals of time."""
+    """All packets that arrive during given intervals of time are lost."""
 
     kind: Literal["blackout"] = "blackout"
     intervals_s: Annotated[tuple[tuple[_TimeS, _TimeS], ...], Field(min_length=1)]

@@ -35,7 +35,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Flip a bit of the packet, and one of its copy, or none; an empty payload has no bits."""
+    """Draw whether a bit of the packet, and of its copy, is flipped; not of an empty payload."""
     u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     corrupts = happens(stage, memory, u)
     bits = decision.size_bytes * 8

@@ -1,7 +1,7 @@
-"""Delay: a constant, and a random part drawn by the quantile of a uniform number.
+"""Delay: a constant, and a random part, drawn as the quantile of a uniform number.
 
 Random parts have mean 0: uniform within ± jitter; normal, Pareto (shape 3) and their mixture with
-the jitter as standard deviation; empirical ones are drawn between the observed values.
+the jitter as standard deviation. Empirical ones are interpolated between the observed values.
 """
 
 import math
@@ -45,17 +45,18 @@ SHAPES = tuple(shape for shape in get_args(Distribution) if shape != "empirical"
 """Names of distributions; any other word after ``distribution`` is a file's name."""
 UNIFORM, NORMAL, PARETO, PARETONORMAL, EMPIRICAL = range(5)
 MOST_DELAY_S = 3600.0
-"""So that a few delays together, drawn from a Pareto distribution, fit into 64 bits of ns."""
+"""Maximum of a setting: the sum of a few Pareto delays must fit into 64 bits of ns."""
 
 _PARETO_MEAN = 1.5
 _PARETO_DEVIATION = 0.8660254037844386
-"""Mean 3/2 and variance 3/4 of the Pareto distribution with shape 3 and scale 1."""
+"""√(3/4): the Pareto distribution with shape 3 and scale 1 has mean 3/2 and variance 3/4."""
 _MIXED_DEVIATION = 0.937753856873566
-"""Of N/4 + 3P/4 with quantiles N normal and P Pareto: √(5/8 + 3/8 E NP), E NP = 0.678352789549…"""
+"""Standard deviation of N/4 + 3P/4 with the quantiles N (normal) and P (Pareto) of one uniform
+number: √(5/8 + 3/8 E NP), E NP = 0.678352789549…"""
 _LONGEST_NS = 1e15
-"""11.6 days; the Pareto distribution has no end, and integers have."""
+"""11.6 days: limit of the unbounded Pareto distribution, against integer overflow."""
 _NOTEWORTHY = 1e-4
-"""Share of delays that are cut at 0. A normal distribution has no end, so that some always are."""
+"""Minimum share of delays cut at 0 that is reported; a normal distribution always has some."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -65,7 +66,7 @@ class DelayStage(RuleStage):
     constant_ns: float
     jitter_ns: float
     shape: int
-    """A place in ``Distribution``."""
+    """Place of the distribution in ``Distribution``."""
     begin: int
     """Place of an empirical quantile table, in ns, in the program's table of reals."""
     end: int
@@ -101,8 +102,9 @@ def drawn_ns(
 ) -> int:
     """Draw a delay, in whole ns; ``u`` is a uniform number.
 
-    A correlated delay goes through normal scores, which keeps its distribution: with ρ the
-    correlation with the loss model's score s, z = ρ s + √(1 − ρ²) z', and the quantile is Φ(z)'s.
+    A correlated delay is drawn from normal scores, which keeps its distribution: with ρ the
+    correlation with the loss model's score s, z = ρ s + √(1 − ρ²) z', and the delay is the quantile
+    at Φ(z).
     """
     if stage.correlation != 0.0 or stage.loss_correlation != 0.0:
         z = latent(stage.correlation, stage.innovation, memory, u)
@@ -120,11 +122,11 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Delay the packet, and its copy as if it were the next packet."""
+    """Delay the packet and its copy; the copy's delay is drawn as if it were the next packet."""
     u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     decision.release_ns += drawn_ns(stage, program.reals, memory, flow, u)
     if decision.copy_ns != NEVER_NS:
-        # The next packet's delay must not depend on whether there is a copy.
+        # The next packet's delay must not depend on the existence of a copy.
         phase, latest = memory.phase, memory.score
         decision.copy_ns += drawn_ns(stage, program.reals, memory, flow, v)
         memory.phase, memory.score = phase, latest
@@ -179,27 +181,27 @@ _Samples = Annotated[
 
 
 class Delay(Impairment):
-    """Delays a packet by a constant time and a random one; never by less than 0."""
+    """Delays a packet by a constant time plus a random time; negative sums count as 0."""
 
     kind: Literal["delay"] = "delay"
     delay_s: _DelayS = 0.0
-    """The constant part (and the mean, unless times below 0 are cut)."""
+    """The constant part; the mean delay, unless negative delays are cut."""
     jitter_s: _DelayS = 0.0
-    """Of the random part: the half-width if uniform, else the standard deviation."""
+    """Half-width of the random part if it is uniform, else its standard deviation."""
     distribution: Distribution = "uniform"
-    """Of the random part; paretonormal is a quarter normal, three quarters Pareto; empirical draws
-    from samples_s or file."""
+    """Distribution of the random part; paretonormal is a quarter normal, three quarters Pareto;
+    empirical draws from samples_s or file."""
     samples_s: _Samples | None = None
-    """Observed delays, which are added to delay_s and may be below 0: drawn between them by their
-    quantiles."""
+    """Observed delays, which are added to delay_s and may be negative; drawn values are
+    interpolated between their quantiles."""
     file: Annotated[str, Field(min_length=1)] | None = None
     """A text file of observed delays, one per line, in seconds unless it says ms or us; or a
     distribution table of tc (*.dist), which is scaled by jitter_s."""
     correlation: Correlation = 0.0
     """Between the random parts of successive packets of a flow."""
     loss_correlation: Annotated[FiniteFloat, Field(ge=-1, le=1)] = 0.0
-    """With the loss model before it: how far a packet is also late if the loss model's state is
-    bad."""
+    """Correlation with the preceding loss model: positive values delay packets in its bad state
+    more."""
 
     words: ClassVar = (
         Word("delay", "delay 10ms", _read),
@@ -291,7 +293,7 @@ class Delay(Impairment):
         return text
 
     def _share_below_zero(self) -> float:
-        """Share of the drawn delays that would be below 0."""
+        """Return the share of drawn delays that would be below 0."""
         if self.file is not None:
             return 0.0
         tables = StageTables()

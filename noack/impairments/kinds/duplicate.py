@@ -34,7 +34,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Copy the packet as it is, or not."""
+    """Draw whether the packet is duplicated."""
     u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     if happens(stage, memory, u):
         decision.copy_ns = decision.release_ns

@@ -14,7 +14,7 @@ _MODELS = {
     word.name: (model, word) for model in LOSS_MODELS for word in model.words if word.read
 }  # fmt: skip
 LOSS_WORDS = tuple(_MODELS)
-"""Words after ``loss`` that choose a model."""
+"""Words after ``loss`` that select a model."""
 
 
 def _read(reader: WordReader) -> Table:

@@ -13,7 +13,7 @@ from noack.impairments.quantities import COUNT, RATE_BPS, SIGNED_COUNT, rate_tex
 from noack.impairments.word_reader import WordReader
 
 _TC_HEADERS_BYTES = 42
-"""What tc counts beside the payload on an Ethernet device: the headers of Ethernet, IPv4, UDP."""
+"""Bytes that tc adds to a payload on an Ethernet device: headers of Ethernet, IPv4 and UDP."""
 
 
 def _read(reader: WordReader) -> Table:
@@ -34,17 +34,17 @@ def _read(reader: WordReader) -> Table:
 
 
 class Rate(Impairment):
-    """A bottleneck: one packet after the other, with a finite queue before it."""
+    """A bottleneck: sends one packet after the other, with a finite queue."""
 
     kind: Literal["rate"] = "rate"
     rate_bps: Annotated[int, Field(ge=1, le=10**12)]
     """Bits per second."""
     queue: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """At most so many packets wait or are being sent; more are dropped."""
+    """Maximum number of packets that wait or are being sent; further packets are dropped."""
     overhead_bytes: Annotated[int, Field(ge=-65_535, le=65_535)] = 28
-    """Added to each payload: 28 counts the headers of UDP and IPv4."""
+    """Bytes added to each payload; 28: the headers of UDP and IPv4."""
     cell_bytes: Annotated[int, Field(ge=0, le=65_535)] = 0
-    """Payload of a link-layer cell, e.g. 48; 0 has no cells."""
+    """Payload of a link-layer cell, e.g. 48; 0: no cells."""
     cell_overhead_bytes: Annotated[int, Field(ge=0, le=1000)] = 0
     """Header of a cell, e.g. 5."""
     discipline: Discipline = TailDrop()
@@ -66,7 +66,7 @@ class Rate(Impairment):
         if self.cell_bytes:
             cells = -(-line_bytes // self.cell_bytes)
             line_bytes = cells * (self.cell_bytes + self.cell_overhead_bytes)
-        # In 64 bits with a sign, the work on one packet and the time for a full queue.
+        # The work on one packet and the time for a full queue must fit into 64 signed bits.
         work = line_bytes * 8 * 10**9 + self.rate_bps
         if max(work, self.queue * work // self.rate_bps) > 2**62:
             raise ValueError(
@@ -81,7 +81,7 @@ class Rate(Impairment):
 
     @property
     def longest_s(self) -> float:
-        """How long a full queue of packets of 1,500 bytes takes, in seconds."""
+        """Transmission time of a full queue of packets of 1,500 bytes, in seconds."""
         return self.queue * 8 * 1500 / self.rate_bps
 
     @property

@@ -1,4 +1,4 @@
-"""Reordering: a packet leaves at once, however long it should be delayed."""
+"""Reordering: a packet leaves at once instead of being delayed."""
 
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, Self
@@ -36,7 +36,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Undo the delay of every gap-th packet, or not; every packet advances the chance."""
+    """Draw whether a gap-th packet's delay is undone; every packet advances the latent process."""
     u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     if happens(stage, memory, u) and (decision.packet + 1) % stage.gap == 0:
         decision.release_ns = decision.arrival_ns
@@ -60,7 +60,7 @@ class Reorder(Impairment):
 
     kind: Literal["reorder"] = "reorder"
     probability: Probability = 1.0
-    """Probability, for every ``gap``-th packet."""
+    """Probability of reordering, for every ``gap``-th packet."""
     correlation: Correlation = 0.0
     """Between successive packets."""
     gap: Annotated[int, Field(ge=1, le=2**40)] = 1

@@ -37,7 +37,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Lose the packet, or not; note how bad the link's state is, if a delay wants to know."""
+    """Draw whether the packet is lost; set the score if a delay is correlated with loss."""
     u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     if happens(stage, memory, u):
         refuse(decision, DROPPED)

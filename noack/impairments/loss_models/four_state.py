@@ -1,7 +1,7 @@
-"""Bursty losses with isolated ones: a Markov chain of four states (Salsano, Ludovici & Ordine).
+"""Bursty and isolated losses: a Markov chain of four states (Salsano, Ludovici & Ordine).
 
-1 gap: delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss in a gap.
-From 4 the chain returns to 1. It starts in 1 and moves before each packet.
+State 1: gap, delivered. 2: delivered within a burst. 3: lost within a burst. 4: a single loss in a
+gap. From state 4 the chain returns to 1. It starts in 1 and advances before each packet.
 """
 
 from collections.abc import Sequence
@@ -48,7 +48,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Move the chain, and lose the packet or not."""
+    """Advance the chain; the packet is lost in states 3 and 4."""
     u, _ = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     now = memory.phase + 1
     if now == 1:
@@ -91,15 +91,15 @@ class FourStateLoss(LossModel):
 
     model: Literal["four_state"] = "four_state"
     p13: Probability
-    """From a gap into a burst."""
+    """Probability of a transition from a gap into a burst."""
     p31: Probability
-    """From a burst back to a gap."""
+    """Probability of a transition from a burst back to a gap."""
     p32: Probability = 0.0
-    """Within a burst: from lost to delivered."""
+    """Probability of a transition from lost to delivered within a burst."""
     p23: Probability = 1.0
-    """Within a burst: from delivered to lost."""
+    """Probability of a transition from delivered to lost within a burst."""
     p14: Probability = 0.0
-    """A single loss within a gap."""
+    """Probability of a single loss within a gap."""
 
     words: ClassVar = (Word("state", "loss state 1% 10%", _read),)
     behaviour: ClassVar = Behaviour(FourStateStage, apply)

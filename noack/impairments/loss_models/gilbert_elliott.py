@@ -66,10 +66,10 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Move the chain, and lose the packet or not.
+    """Advance the chain, and draw whether the packet is lost.
 
-    If a delay wants to know how bad the link's state is: a packet in the bad state is among the
-    worst p/(p + r).
+    If a delay is correlated with loss, the packet gets a score: the scores in the bad state are the
+    highest share p/(p + r) of all scores.
     """
     u, v = uniforms(stage.key0, stage.key1, flow.number, decision.packet, 0)
     if memory.phase == BAD:
@@ -156,7 +156,7 @@ class GilbertElliottLoss(LossModel):
 
     @property
     def transitions(self) -> tuple[float, float]:
-        """Probabilities p and r. In a Gilbert chain bursts last 1/r, and p/(p + r) is lost."""
+        """The probabilities p, r. A Gilbert chain has mean burst 1/r and loss rate p/(p + r)."""
         if self.mean_loss is not None and self.mean_burst is not None:
             return self._shortest_burst() / self.mean_burst, 1 / self.mean_burst
         return self.good_to_bad or 0.0, self.bad_to_good or 0.0

@@ -24,7 +24,7 @@ class NoLoss(LossModel):
         return "loses nothing"
 
     def stage(self, tables: StageTables) -> None:
-        """There is nothing to do."""
+        """Return None: there is no effect."""
 
     def tc_text(self) -> str:
         return ""

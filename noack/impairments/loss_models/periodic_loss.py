@@ -1,4 +1,4 @@
-"""Periodic losses, by the packet's number in its flow."""
+"""Periodic losses, according to the packet's number in its flow."""
 
 import re
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ def apply(
     flow: FlowState,
     decision: PacketDecision,
 ) -> None:
-    """Lose the packet if its number says so."""
+    """Lose the packet if its number is one of the lost ones of its period."""
     number = decision.packet - stage.first
     if number >= 0 and number % stage.period < stage.burst:
         refuse(decision, DROPPED)

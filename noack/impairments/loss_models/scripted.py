@@ -1,4 +1,4 @@
-"""Losses that are written down, by the packet's number in its flow."""
+"""Losses given by a list of packet numbers within a flow."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,10 +28,10 @@ _EXPECTED = "the numbers of the lost packets, counted from 0, e.g. 3,4,17; or no
 
 @dataclass(slots=True, kw_only=True)
 class ScriptStage(RuleStage):
-    """A script as numbers: its place in the program's table of integers; they ascend."""
+    """A script as numbers: its range in the program's table of integers, which ascend there."""
 
     period: int
-    """0: played once."""
+    """0: the script does not repeat."""
     begin: int
     end: int
 
@@ -67,13 +67,13 @@ def _read(reader: WordReader) -> Table:
 
 
 class ScriptedLoss(LossModel):
-    """Exactly the named packets of each flow are lost, counted from 0."""
+    """Exactly the listed packets of each flow are lost, counted from 0."""
 
     model: Literal["scripted"] = "scripted"
     lost: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**40)], ...], Field(max_length=MAX_SCRIPT)]
     """Numbers of the lost packets."""
     repeat_every: Annotated[int, Field(ge=0, le=2**40)] = 0
-    """The script begins again after so many packets; 0 plays it once."""
+    """The script repeats after this number of packets; 0: it does not repeat."""
 
     words: ClassVar = (
         Word("script", "loss script 3,4,17", _read),

@@ -23,13 +23,13 @@ def _read(reader: WordReader) -> Table:
 
 
 class TraceLoss(LossModel):
-    """Losses from a text file: a 1 for each lost packet, a 0 for each that is not."""
+    """Losses from a text file: 1 for a lost packet, 0 for a delivered packet."""
 
     model: Literal["trace"] = "trace"
     file: Annotated[str, Field(min_length=1)]
-    """The file; other characters than 0 and 1 may only be white space."""
+    """The file; it contains only 0, 1 and white space."""
     repeat: bool = True
-    """Begin again at the end; false delivers what comes after."""
+    """true: repeat the trace; false: deliver all packets after its end."""
 
     words: ClassVar = (
         Word("trace", "loss trace FILE", _read),

@@ -1,4 +1,4 @@
-"""The worst case under the cap."""
+"""The worst case: as many losses as the cap allows."""
 
 from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
@@ -32,7 +32,7 @@ def apply(
 
 
 class WorstCaseLoss(LossModel):
-    """Every packet is lost that the MANSD allows to be lost."""
+    """Every packet is lost, except those that the MANSD cap delivers."""
 
     model: Literal["worst_case"] = "worst_case"
 

@@ -1,4 +1,4 @@
-"""A run in virtual time whose controller stands still for a while, as under SIGSTOP.
+"""A run in virtual time with a controller that stands still for a while, as under SIGSTOP.
 
 ``python -m tests.cosim.live.outage`` prints the table of docs/scenarios.md.
 """
@@ -31,7 +31,7 @@ CASES = (
 
 
 class Frozen:
-    """A machine that does nothing from one time to another, and then catches up.
+    """A machine that does nothing during an interval, and then catches up.
 
     Args:
         machine: the machine.
@@ -61,7 +61,7 @@ class Frozen:
 
 
 class Deaf:
-    """A machine to which some messages never come: lost in a socket, say.
+    """A machine that does not receive some messages, as if they were lost in a socket.
 
     Args:
         machine: the machine.
@@ -80,7 +80,7 @@ class Deaf:
 
 
 class Reborn:
-    """A machine that another takes the place of.
+    """A machine that is replaced by a restarted one.
 
     Args:
         machine: the one that dies.
@@ -112,7 +112,7 @@ def simulate_with(
     wrap: Callable[[Machine[Any]], Machine[Any]],
     network: Network | None = None,
 ) -> RunRecord:
-    """Simulate a scenario in which something befalls the machine of a role."""
+    """Simulate a scenario with the machine of one role replaced."""
     name = f"{role}_of"
     build = getattr(cosim.simulation.virtual_time, name)
     with patch.object(
@@ -128,7 +128,7 @@ def with_outage(resolved: Scenario, from_s: float, until_s: float) -> RunRecord:
 
 
 def at_the_end(name: str, mode: str, policy: str, lasts_s: float) -> float:
-    """‖x‖ at the end of an outage, root mean square over the times at which it begins."""
+    """‖x‖ at the end of an outage, root mean square over the start times of the outage."""
     squares = []
     for from_s in STARTS_S:
         chosen = "hold" if policy == NO_OUTAGE else policy

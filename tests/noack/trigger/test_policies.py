@@ -133,7 +133,7 @@ def silent(t_ms: int, since_ms: int) -> float:
     return 0.0
 
 
-def test_periodic_is_a_clock() -> None:
+def test_periodic_transmits_at_a_fixed_period() -> None:
     assert list(events_ms(PeriodicTrigger(70 * MS), growing)) == list(range(70, 1001, 70))
 
 
