@@ -111,7 +111,7 @@ def test_the_reverse_direction_has_its_own_impairments(family: int) -> None:
             _, stderr = ended(process)
     assert question == b"ask"
     assert answers == [b"1", b"3", b"5"]
-    assert re.search(r"dropped by loss +0 +3 *\n", stderr)
+    assert re.search(r"dropped by a loss model +0 +3 *\n", stderr)
 
 
 def test_several_links_are_read_from_a_file(tmp_path: Path) -> None:

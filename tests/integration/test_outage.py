@@ -48,10 +48,10 @@ def test_the_plant_applies_its_watchdog_policy_and_logs_it(start: Start) -> None
     trips = [one for one in record.notices if one["level"] == "watchdog"]
     assert trips[0]["t_ns"] == acted["t_ns"][0]
     said = [one for one in record.notices if one["level"] == "void"]
-    (watchdog,) = [one for one in said if "the watchdog's" in one["text"]]
+    (watchdog,) = [one for one in said if "the watchdog replaced" in one["text"]]
     assert watchdog["t_ns"] == acted["t_ns"][0]
     assert watchdog["text"].startswith(
-        f"void (assumption violated) from {first_s:.3f} s on: the input was "
+        f"void (assumption violated) from {first_s:.3f} s on: the watchdog replaced the input: "
     )
     # The age limit of a certificate is below the watchdog's timeout.
     void = [one for one in summary["claims"] if one["source"] == "certificate"]

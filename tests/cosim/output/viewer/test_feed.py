@@ -37,7 +37,7 @@ class Drawn:
         self.forced += list(zip(t_ns.tolist(), forced.tolist(), strict=True))
 
     def __getattr__(self, name: str) -> Any:
-        return lambda *arguments: None
+        return lambda *arguments, **options: None
 
 
 def ticks(first: int, count: int) -> np.ndarray:

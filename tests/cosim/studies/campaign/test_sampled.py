@@ -183,10 +183,10 @@ def test_delays_and_acknowledgements_are_permitted_in_sampled_campaigns(
 @pytest.mark.parametrize(
     ("setting", "says"),
     [
-        ({"network.protocol": "ack"}, r'protocol.*with time = "sampled" a campaign runs both'),
+        ({"network.protocol": "ack"}, r'protocol.*time = "sampled" takes both'),
         (
             {"network.impairments": [{"kind": "delay", "delay_s": 0.01}]},
-            r'delay.*or let time = "sampled"',
+            r'delay.*or use time = "sampled"',
         ),
     ],
 )
@@ -202,5 +202,5 @@ def test_continuous_time_refuses_settings_that_need_sampled_time(
 def test_an_axis_without_an_effect_is_refused(write: Callable[..., Path]) -> None:
     axis = {"name": "speed", "key": "speed", "values": [1.0, 2.0]}
     path = write(PLAN | {"axes": [axis]})
-    with pytest.raises(CallerError, match="makes no difference"):
+    with pytest.raises(CallerError, match="has no effect"):
         grid(load(path), path)
