@@ -118,7 +118,7 @@ def test_a_floor_may_begin_before_the_plant_feels_its_input(
 
 
 def test_an_event_of_the_start_may_be_missing_long_after() -> None:
-    """The error at the first event comes from the start, is far above the threshold, and stays."""
+    """The error at the first event, from the start, is far above the threshold; it is lost."""
     system = late_start(mansd=3)
     for floor in (0.999, 0.99, 0.9, 0.5):
         certificate = certify(scenario(system, trigger={"floor": floor}), system.conditions)

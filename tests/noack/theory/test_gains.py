@@ -76,7 +76,7 @@ def test_missing_events_count_what_they_may_have_grown_to(
 @settings(SEARCH)
 @given(systems(), st.floats(0.01, 3.0))
 def test_an_input_that_is_not_of_now_is_wrong_by_no_more(system: System, reach: float) -> None:
-    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: inputs older than x_c or, at a late plant, newer."""
+    """‖K(e^{−Hσ} − I + Hσ) W⁻¹‖ for |σ| ≤ hold: inputs older or, if the plant is late, newer."""
     error, _ = gains(system)
     hold_s = reach / float(np.linalg.norm(system.H, 2))
     ages_s = np.linspace(-hold_s, hold_s, 81)

@@ -113,7 +113,7 @@ def test_dynamic_waits_longer_than_static_from_the_same_state() -> None:
 
 
 def events_ms(policy: Policy, error: Callable[[int, int], float]) -> Iterator[int]:
-    """Events in the first second, tested every ms; the error depends on the time since the event."""
+    """Events in the first second, tested every ms; the error depends on the last event's age."""
     trigger, last = Trigger(policy), 0
     trigger.start(0, np.ones(2))
     for t_ms in range(1, 1001):
