@@ -47,7 +47,7 @@ def lateness(record: RunRecord, role: str) -> LatenessPart:
 
 
 def latency_us(record: RunRecord) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Wall time from the sensor's event to the controller's update, one way.
+    """Return the wall time from the sensor's event to the controller's update, one way.
 
     Returns:
         Event times in ns (d,) and latencies in µs (d,), of the delivered updates.

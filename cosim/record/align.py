@@ -6,7 +6,7 @@ At each measurement time t:
   measured or estimated by the sensor. With noise or an observer it is not the plant's state, and
   e_c is the controller's error relative to this x. :mod:`cosim.record.estimation_error` computes
   the difference between this x and the plant's state;
-* x_c(t) is the controller's last state whose model time is at most t, propagated by e^{H(t−t')}.
+* x_c(t) is the controller's last state with a model time t' ≤ t, propagated by e^{H(t−t')}.
 
 If a controller dies, there is no x_c until the restarted controller has its first update.
 """

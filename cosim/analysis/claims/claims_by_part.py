@@ -1,4 +1,4 @@
-"""The claims about a run whose settings change during the run.
+"""The claims about a run with changes of settings.
 
 The claims at the start end at the first change. The part after a change is checked as a separate
 run, in deviations from the set-point. Its time 0 is the first event after the change whose update

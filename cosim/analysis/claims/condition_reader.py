@@ -250,7 +250,7 @@ class _Inputs:
         self._ticked = _NEVER if ended else ticked
 
     def classified(self, *, ended: bool) -> tuple[SampledSeries, SampledSeries, SampledSeries]:
-        """Classify the steps whose input is known.
+        """Classify the steps with a known input.
 
         Returns:
             Ages of inputs; ages of actuations that the watchdog replaced; sizes of safe inputs.
@@ -273,7 +273,7 @@ class _Inputs:
             self._latched = int(highest[-1])
         if not self.started and controlled.any():
             self.started, self.start_ns = True, int(t_ns[np.argmax(controlled)])
-        # A late plant may latch an input whose model time is ahead of the step.
+        # A late plant step may apply an input with a model time after the step's nominal time.
         age_ns = np.maximum(t_ns + self._period_ns - model_ns, model_ns - t_ns)
         replaced = controlled & self._replaces & too_old(t_ns, model_ns, self._timeout_ns)
         # Until the first input with a state, the certificates assume that the input is 0.
